@@ -1,0 +1,57 @@
+"""Exceptions of tensorsim and the input checks that every stage shares.
+
+The checks compile under TorchScript, so a scripted graph refuses the same inputs with the same words.
+"""
+
+import torch
+from torch import Tensor
+
+
+class TensorsimError(ValueError):
+    """Input that tensorsim refuses; the message says what came and what was expected."""
+
+
+class TensorsimWarning(UserWarning):
+    """A result is returned, but the caller should know something about it."""
+
+
+def check_floating(x: Tensor, name: str) -> None:
+    """Refuse an integer, boolean or complex tensor."""
+    if not x.is_floating_point():
+        raise TensorsimError(f"{name}: got dtype {x.dtype}, expected a real floating point tensor")
+
+
+def check_min_rank(x: Tensor, rank: int, name: str, layout: str) -> None:
+    """Refuse a tensor with fewer than ``rank`` dimensions; ``layout`` names the expected ones."""
+    if x.dim() < rank:
+        raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
+
+
+def check_rank(x: Tensor, rank: int, name: str, layout: str) -> None:
+    """Refuse a tensor without exactly ``rank`` dimensions; ``layout`` names the expected ones."""
+    if x.dim() != rank:
+        raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
+
+
+def check_size(x: Tensor, dim: int, size: int, name: str, layout: str) -> None:
+    """Refuse a tensor whose dimension ``dim`` is not ``size`` long."""
+    if x.shape[dim] != size:
+        raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
+
+
+def check_not_empty(x: Tensor, name: str) -> None:
+    """Refuse a tensor without elements."""
+    if x.numel() == 0:
+        raise TensorsimError(f"{name}: got an empty tensor of shape {list(x.shape)}, expected at least one element")
+
+
+def check_finite(x: Tensor, name: str) -> None:
+    """Refuse NaN and infinity."""
+    if not bool(torch.isfinite(x).all()):
+        raise TensorsimError(f"{name}: got NaN or infinite values, expected finite numbers")
+
+
+def check_positive(value: float, name: str) -> None:
+    """Refuse a number that is not finite and above zero."""
+    if not (value > 0.0 and value < float("inf")):
+        raise TensorsimError(f"{name}: got {value}, expected a positive finite number")

@@ -1,0 +1,105 @@
+"""What stages hand to each other: NamedTuples of padded, batched tensors, and the table of their shapes.
+
+Letters used in every docstring:
+
+=====  ==========================================================================================
+``B``  clips in a batch
+``T``  video frames
+``P``  people, padded to one count per batch (``valid`` says which are real)
+``K``  detections of a frame, padded likewise; in Doppler-time maps, frames of the STFT
+``J``  joints: 17 of COCO in the image, 14 of the radar body in metres
+``S``  scatterers
+``M``  pulses (slow time)
+``N``  samples of a pulse (fast time)
+``R``  range bins
+``F``  Doppler bins
+=====  ==========================================================================================
+"""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Detections(NamedTuple):
+    """People (or other classes) found in images, best first, padded to one count.
+
+    Attributes:
+        boxes: (..., K, 4) ``xyxy`` pixels of the input image; zeros where not valid.
+        scores: (..., K) in [0, 1]; zeros where not valid.
+        labels: (..., K) int64 class index; 0 is the person class of COCO and of one-class models.
+        valid: (..., K) bool.
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    labels: Tensor
+    valid: Tensor
+
+
+class Tracks(NamedTuple):
+    """People followed through clips.
+
+    Attributes:
+        boxes: (B, P, T, 4) ``xyxy`` pixels; zeros where not valid.
+        valid: (B, P, T) bool, true from a track's first to its last matched frame, coasted frames included.
+        matched: (B, P, T) bool, true where a detection was assigned in that frame.
+    """
+
+    boxes: Tensor
+    valid: Tensor
+    matched: Tensor
+
+
+class Pose(NamedTuple):
+    """People of clips with their joints.
+
+    Attributes:
+        boxes: (B, P, T, 4) ``xyxy`` pixels.
+        keypoints: (B, P, T, 17, 2) COCO-17 ``uv`` pixels.
+        keypoint_scores: (B, P, T, 17).
+        joints: (B, P, T, 14, 3) world metres in the order of ``tensorsim.JOINTS``; finite everywhere.
+        valid: (B, P, T) bool, whether the person is in the scene.
+    """
+
+    boxes: Tensor
+    keypoints: Tensor
+    keypoint_scores: Tensor
+    joints: Tensor
+    valid: Tensor
+
+
+class RadarMaps(NamedTuple):
+    """What a radar shows of a scene. Magnitudes are linear, not dB.
+
+    Attributes:
+        range_time: (..., R, M) magnitude of the range profiles.
+        range_time_mti: (..., R, M') the same after the moving target indicator (M' = M - 1 for two-pulse).
+        doppler_time: (..., F, K) magnitude, Doppler ascending, positive = approaching.
+        ridges: (..., C, K) int64 Doppler bin of each of C ridges.
+        ridge_magnitudes: (..., C, K).
+        snr_db: (...) realised signal-to-noise ratio per IF sample; +inf without noise.
+    """
+
+    range_time: Tensor
+    range_time_mti: Tensor
+    doppler_time: Tensor
+    ridges: Tensor
+    ridge_magnitudes: Tensor
+    snr_db: Tensor
+
+
+class Simulation(NamedTuple):
+    """Everything :class:`tensorsim.VideoToDoppler` makes of clips: the fields of Pose, then of RadarMaps."""
+
+    boxes: Tensor
+    keypoints: Tensor
+    keypoint_scores: Tensor
+    joints: Tensor
+    valid: Tensor
+    range_time: Tensor
+    range_time_mti: Tensor
+    doppler_time: Tensor
+    ridges: Tensor
+    ridge_magnitudes: Tensor
+    snr_db: Tensor
