@@ -1,0 +1,252 @@
+"""The command line: ``tensorsim simulate`` and ``tensorsim check``."""
+
+import math
+import os
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from tensorsim.errors import TensorsimError
+
+EXAMPLES = """
+examples:
+  tensorsim simulate clip.mp4 --out out/ --detector rtmdet_nano_person.onnx --pose simplepose_coco17_256x192.onnx
+  tensorsim simulate clip.mp4 --out out/ --scene through-wall --person-height 1.75
+  tensorsim simulate clip.mp4 --out out/ --start 2 --end 6 --initial-distance 4.0 --seed 7
+  tensorsim check
+
+Networks can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE to their paths.
+"""
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Turn a video into what a radar would have seen.
+
+    Writes maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
+    """
+
+    video: tyro.conf.Positional[Path]
+    """Any video that OpenCV decodes."""
+    out: Path
+    """Folder for the results; its files appear together, when all are complete."""
+    detector: Path | None = None
+    """Person detector: RTMDet as .pth, .safetensors or .onnx. Default: $TENSORSIM_DETECTOR."""
+    pose: Path | None = None
+    """COCO-17 heat-map network: HRNet as .pth or .safetensors, or any such network as .onnx. Default: $TENSORSIM_POSE."""
+    scene: Literal["free-space", "through-wall"] = "free-space"
+    """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath."""
+    person_height: tuple[float, ...] = (1.80, 1.70)
+    """Body heights in metres in order of appearance; the last one serves the rest."""
+    initial_distance: tuple[float, ...] | None = None
+    """Distances of the people in metres when they first appear; calibrates the focal length."""
+    camera_fov: float = 60.0
+    """Horizontal field of view of the camera in degrees, when no initial distance is given."""
+    position: Literal["camera", "paper"] = "camera"
+    """Camera model, or the paper's pixel displacement (no motion along the optical axis)."""
+    motion: Literal["smooth", "paper"] = "smooth"
+    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay."""
+    integration: Literal["noncoherent", "paper"] = "noncoherent"
+    """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler."""
+    wall_paths: Literal["series", "paper"] = "series"
+    """Bounces inside the wall: complete to first order, or the paper's."""
+    multipath: bool | None = None
+    """Wall bounces; default on behind a wall."""
+    leakage: bool = False
+    """Direct signal from transmitter to receiver."""
+    wall_echo: bool = False
+    """Static mirror reflection of the wall."""
+    snr: float = 50.0
+    """Signal-to-noise ratio in dB of the people's echo, per IF sample."""
+    denoiser: Path | None = None
+    """DnCNN weights (.pth or .safetensors) to clean the shown maps."""
+    fps: float | None = None
+    """Frames per second, instead of what the file says."""
+    start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Where to start."""
+    end: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Where to stop."""
+    stride: int = 1
+    """Keep every n-th frame."""
+    seed: int = 0
+    """Seed of the noise."""
+    device: str = "auto"
+    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
+    quiet: bool = False
+    """No progress bars."""
+
+    def run(self) -> None:
+        """Do it."""
+        _check_numbers(self)
+        detector_path = _network_path(self.detector, "detector", "TENSORSIM_DETECTOR")
+        pose_path = _network_path(self.pose, "pose", "TENSORSIM_POSE")
+        if self.out.exists() and not self.out.is_dir():
+            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+
+        import torch
+
+        from tensorsim import run
+        from tensorsim.data.video import VideoReader
+        from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
+
+        device = _device(self.device)
+        with run.collected_warnings() as messages, torch.inference_mode():
+            reader = VideoReader(
+                self.video, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
+            )
+            people: VideoToPose = _video_to_pose(self, detector_path, pose_path).to(device).eval()
+            maps_stage: PoseToDoppler = _pose_to_doppler(self).to(device).eval()
+            with run.complete_or_nothing(self.out) as folder:
+                pose = run.pose_of_film(people, reader, device, self.quiet)
+                warn_of_empty_clips(pose.valid)
+                torch.manual_seed(self.seed)
+                maps, rate_hz = run.maps_of_pose(maps_stage, pose, reader.fps, device, self.quiet)
+                run.write_maps(folder, maps, run.axes_of(maps_stage, maps, rate_hz))
+                run.write_pose(folder, pose, reader.fps)
+                run.write_overlay(folder, reader, pose, people.metric_pose.keypoint_threshold, self.quiet)
+                config = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
+                config |= {"detector": str(detector_path), "pose": str(pose_path)}
+                snr_db = float(maps.snr_db)
+                run.write_summary(
+                    folder,
+                    {
+                        "people": run.people_of(pose, reader.fps),
+                        "frames": pose.valid.shape[2],
+                        "fps": reader.fps,
+                        "seed": self.seed,
+                        "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
+                        "radar": asdict(maps_stage.simulator.radar),
+                        "config": config,
+                        "warnings": messages,
+                    },
+                )
+        for message in messages:
+            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        print(f"{self.out}: {pose.valid.shape[1]} people in {pose.valid.shape[2]} frames")
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check the installation: libraries, shipped files, and a moving target through the radar chain."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.selfcheck import run_checks
+
+        if not run_checks():
+            raise TensorsimError("the installation is not in order, see above")
+
+
+def _check_numbers(options: Simulate) -> None:
+    for name, values in (("person-height", options.person_height), ("initial-distance", options.initial_distance)):
+        if values is not None and (len(values) == 0 or not all(math.isfinite(v) and v > 0 for v in values)):
+            raise TensorsimError(f"--{name}: got {values}, expected positive numbers of metres")
+    if not 0 < options.camera_fov < 180:
+        raise TensorsimError(f"--camera-fov: got {options.camera_fov}, expected degrees between 0 and 180")
+    if not math.isfinite(options.snr):
+        raise TensorsimError(f"--snr: got {options.snr}, expected a finite number of dB")
+    if options.position == "paper" and options.initial_distance is None:
+        raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
+
+
+def _network_path(path: Path | None, role: str, variable: str) -> Path:
+    if path is None and os.environ.get(variable):
+        path = Path(os.environ[variable])
+    if path is None:
+        raise TensorsimError(f"--{role}: got no weights, expected a path here or in ${variable} (none are shipped yet)")
+    if not path.is_file():
+        raise TensorsimError(f"--{role}: {path} is not a file")
+    return path
+
+
+def _device(name: str):  # type: ignore[no-untyped-def]  # torch is imported on use
+    import torch
+
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise TensorsimError(f"--device: {name!r} is not usable here: {str(error).splitlines()[0]}") from None
+    return torch.device(name)
+
+
+def _video_to_pose(options: Simulate, detector_path: Path, pose_path: Path):  # type: ignore[no-untyped-def]
+    from tensorsim.config import CameraConfig
+    from tensorsim.pipeline import VideoToPose
+    from tensorsim.vision.hrnet import HRNet
+    from tensorsim.vision.kalman import KalmanSmoother
+    from tensorsim.vision.metric_pose import MetricPose
+    from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
+    from tensorsim.vision.rtmdet import RTMDet
+
+    network = OnnxHeatmaps(pose_path) if pose_path.suffix == ".onnx" else HRNet.from_pretrained(pose_path)
+    return VideoToPose(
+        RTMDet.from_pretrained(detector_path),
+        network,
+        metric_pose=MetricPose(
+            CameraConfig(horizontal_fov_rad=math.radians(options.camera_fov)),
+            person_height_m=options.person_height,
+            initial_distance_m=options.initial_distance,
+            mode=options.position,
+        ),
+        smoother=KalmanSmoother(mode="forward" if options.motion == "paper" else "rts"),
+    )
+
+
+def _pose_to_doppler(options: Simulate):  # type: ignore[no-untyped-def]
+    from tensorsim.config import RadarConfig, WallConfig
+    from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
+    from tensorsim.motion.resample import PoseResampler
+    from tensorsim.motion.savgol import SavitzkyGolay
+    from tensorsim.pipeline import PoseToDoppler
+    from tensorsim.radar.simulator import RadarSimulator
+
+    behind_wall = options.scene == "through-wall"
+    radar = RadarConfig.through_wall() if behind_wall else RadarConfig.free_space()
+    simulator = RadarSimulator(
+        radar,
+        wall=WallConfig() if behind_wall else None,
+        multipath=behind_wall if options.multipath is None else options.multipath,
+        leakage=options.leakage,
+        wall_echo=options.wall_echo,
+        wall_paths=options.wall_paths,
+        snr_db=options.snr,
+        integration=options.integration,
+    )
+    denoiser = None if options.denoiser is None else MapDenoiser(DnCNN.from_pretrained(options.denoiser))
+    if options.motion == "paper":
+        # The panel's smoothing ratio of 0.25, read as a quarter of a second of pulses.
+        window = round(0.25 * radar.prf_hz) // 2 * 2 + 1
+        return PoseToDoppler(
+            simulator,
+            resampler=PoseResampler(radar.prf_hz, method="linear"),
+            pulse_smoother=SavitzkyGolay(window, 3),
+            denoiser=denoiser,
+        )
+    return PoseToDoppler(simulator, denoiser=denoiser)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the ``tensorsim`` command. Exit status: 0 done, 2 bad input, 130 interrupted."""
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"simulate": Simulate, "check": Check},
+        prog="tensorsim",
+        description=f"What a radar would have seen of the people in a video.\n{EXAMPLES}",
+        args=arguments,
+    )
+    try:
+        command.run()
+    except TensorsimError as error:
+        print(f"tensorsim: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("tensorsim: interrupted, nothing written", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""Out of Python: TorchScript files that run where tensorsim is not installed."""
+
+import os
+import tempfile
+import warnings
+from pathlib import Path
+
+import torch
+from torch import nn
+
+
+def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
+    """Script a stage or a whole pipeline in evaluation mode and save it.
+
+    The file loads with ``torch.jit.load`` in a process without tensorsim and takes other batch sizes, clip
+    lengths and people counts than any it has seen.
+
+    Args:
+        module: the module; its training mode is left as it was.
+        path: file to write; it appears only when complete.
+
+    Raises:
+        TensorsimError: the module holds an edge that is no graph node, such as ``OnnxHeatmaps``.
+    """
+    target = Path(path)
+    training = module.training
+    with warnings.catch_warnings():
+        # TorchScript is deprecated upstream; whoever calls this function asks for it nevertheless.
+        warnings.filterwarnings("ignore", message=r".*torch\.jit.*deprecated")
+        try:
+            scripted = torch.jit.script(module.eval())
+        finally:
+            module.train(training)
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".tmp")
+        os.close(handle)
+        try:
+            torch.jit.save(scripted, temporary)
+            os.replace(temporary, target)
+        except BaseException:
+            os.unlink(temporary)
+            raise

@@ -1,0 +1,228 @@
+"""Weight files: read what others publish without running what they pickled, and load it completely or not at all.
+
+A ``.pth`` file is a pickle, that is, a program. It is read here by an unpickler that knows how to build tensors
+and nothing else, so a published file is safe to open whoever made it.
+"""
+
+import functools
+import hashlib
+import io
+import os
+import pickle
+import re
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+
+PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
+
+# OpenMMLab and torch hub publish `...-HASH8.pth` or `...-HASH8_DATE.pth`, HASH8 the head of the file's SHA-256.
+_HASH_IN_NAME = re.compile(r"-([0-9a-f]{8})(?:_\d{8})?$")
+_DATE = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
+
+# What a file of weights is made of. Only these names of a pickle become the real thing.
+_TENSOR_PARTS = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("torch", "Size"): torch.Size,
+    ("torch", "device"): torch.device,
+    # Behind partial, so that a pickle cannot set attributes of torch's own functions.
+    ("torch._utils", "_rebuild_tensor_v2"): functools.partial(torch._utils._rebuild_tensor_v2),
+    ("torch._utils", "_rebuild_parameter"): functools.partial(torch._utils._rebuild_parameter),
+}
+
+# Training logs lie beside the weights in published checkpoints (mmengine's message hub, NumPy scalars). Their
+# objects are read as placeholders that do nothing; a name from anywhere else is refused.
+_LOG_PACKAGES = ("mmengine", "mmcv", "numpy", "collections", "datetime", "_codecs")
+_LOG_BUILTINS = ("getattr", "set", "frozenset", "slice", "range", "complex", "bytearray")
+
+
+class _Placeholder:
+    """Stands for an object that is not part of the weights: accepts whatever a pickle does to it, does nothing."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        pass
+
+    def __call__(self, *args: Any, **kwargs: Any) -> "_Placeholder":
+        return self
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        pass
+
+    def append(self, value: Any) -> None:
+        pass
+
+    def extend(self, values: Any) -> None:
+        pass
+
+    def add(self, value: Any) -> None:
+        pass
+
+
+class _TensorUnpickler(pickle.Unpickler):
+    """An unpickler that builds tensors and containers, and imports nothing."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _TENSOR_PARTS:
+            return _TENSOR_PARTS[module, name]
+        if module == "torch" and isinstance(getattr(torch, name, None), torch.dtype):
+            return getattr(torch, name)
+        package = module.partition(".")[0]
+        if package in _LOG_PACKAGES or (module in ("builtins", "__builtin__") and name in _LOG_BUILTINS):
+            return type(name, (_Placeholder,), {})
+        raise TensorsimError(
+            f"it refers to {module}.{name}, which is code and not weights; nothing of it was run"
+        )
+
+
+def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Read the tensors of a weight file, on the CPU.
+
+    Args:
+        path: ``.pth``, ``.pt`` or ``.bin`` (torch's zip format or its older one; a bare state dict or a container
+            with a ``state_dict``), or ``.safetensors``. If the name ends in eight hexadecimal digits as published
+            files do (``-HASH8.pth``, ``-HASH8_DATE.pth``), they must begin the file's SHA-256.
+
+    Returns:
+        Tensors by name, without the ``data_preprocessor.*`` entries that OpenMMLab stores beside the weights.
+
+    Raises:
+        TensorsimError: no such file, another suffix, a wrong hash, a damaged file, a pickle that asks for anything
+            but tensors (it is not run), or a file without tensors.
+    """
+    path = Path(path)
+    if path.suffix not in (*PICKLE_SUFFIXES, ".safetensors"):
+        expected = ", ".join((*PICKLE_SUFFIXES, ".safetensors"))
+        raise TensorsimError(f"{path}: got the suffix {path.suffix!r}, expected a weight file ({expected})")
+    if not path.is_file():
+        raise TensorsimError(f"{path}: no such file, expected weights")
+    # One read serves hash and tensors, so that what was verified is what is loaded.
+    data = path.read_bytes()
+    _verify_hash_in_name(path, data)
+    content = _read_safetensors(path, data) if path.suffix == ".safetensors" else _read_pickle(path, data)
+
+    if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
+        content = content["state_dict"]
+    if not isinstance(content, dict):
+        raise TensorsimError(
+            f"{path}: got a {type(content).__name__}, expected a state dict (tensors by name)"
+        )
+    tensors: dict[str, Tensor] = {}
+    for key, value in content.items():
+        if not isinstance(key, str) or not isinstance(value, Tensor):
+            raise TensorsimError(
+                f"{path}: got a {type(value).__name__} under {key!r}, expected tensors by name"
+            )
+        if not key.startswith("data_preprocessor."):
+            tensors[key] = value.detach()
+    if not tensors:
+        raise TensorsimError(f"{path}: got no tensors, expected weights")
+    return tensors
+
+
+def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | os.PathLike[str]) -> None:
+    """Copy weights into a module, or refuse and leave it as it was.
+
+    Every key and shape must match. A tensor that a module lists under several names (a shared convolution) may come
+    under one of them, as safetensors stores it, or under all with equal values.
+
+    Args:
+        module: receives the weights.
+        state_dict: tensors by name.
+        source: where they come from, for the message.
+
+    Raises:
+        TensorsimError: names what is missing, unexpected or of another shape.
+    """
+    expected = module.state_dict(keep_vars=True)
+    aliases: dict[int, list[str]] = {}
+    for key, tensor in expected.items():
+        aliases.setdefault(id(tensor), []).append(key)
+
+    problems = []
+    missing = [keys[0] for keys in aliases.values() if not any(key in state_dict for key in keys)]
+    unexpected = [key for key in state_dict if key not in expected]
+    for title, keys in (("missing", missing), ("unexpected", unexpected)):
+        if keys:
+            problems.append(f"{len(keys)} {title} ({_some(keys)})")
+    common = [key for key in expected if key in state_dict]
+    differ = [key for key in common if state_dict[key].shape != expected[key].shape]
+    if differ:
+        shapes = [f"{key}: {list(state_dict[key].shape)} for {list(expected[key].shape)}" for key in differ]
+        problems.append(f"{len(differ)} of another shape ({_some(shapes)})")
+    kinds = [k for k in common if state_dict[k].is_floating_point() != expected[k].is_floating_point()]
+    if kinds:
+        dtypes = [f"{key}: {state_dict[key].dtype} for {expected[key].dtype}" for key in kinds]
+        problems.append(f"{len(kinds)} of another kind ({_some(dtypes)})")
+    shared = [[key for key in keys if key in state_dict] for keys in aliases.values() if len(keys) > 1]
+    unequal = [keys[0] for keys in shared if any(not _equal(state_dict, keys[0], key) for key in keys[1:])]
+    if unequal:
+        problems.append(f"{len(unequal)} shared with unequal values ({_some(unequal)})")
+    if problems:
+        raise TensorsimError(
+            f"{source}: not the weights of this {type(module).__name__}: " + ", ".join(problems)
+        )
+    # Not strict: names that alias a tensor already given may be absent.
+    module.load_state_dict(state_dict, strict=False)
+
+
+def _equal(state_dict: dict[str, Tensor], first: str, second: str) -> bool:
+    a, b = state_dict[first], state_dict[second]
+    return a.data_ptr() == b.data_ptr() or torch.equal(a, b)
+
+
+def _some(items: list[str], count: int = 3) -> str:
+    return ", ".join(items[:count]) + (", ..." if len(items) > count else "")
+
+
+def _verify_hash_in_name(path: Path, data: bytes) -> None:
+    found = _HASH_IN_NAME.search(path.stem)
+    if found is None or _DATE.fullmatch(found[1]):
+        return
+    digest = hashlib.sha256(data).hexdigest()
+    if not digest.startswith(found[1]):
+        raise TensorsimError(
+            f"{path}: its SHA-256 begins with {digest[:8]}, expected {found[1]} as its name says; "
+            "the file is damaged or was changed, download it again"
+        )
+
+
+def _read_safetensors(path: Path, data: bytes) -> dict[str, Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        return load(data)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise TensorsimError(f"{path}: damaged or not a safetensors file ({error})") from error
+
+
+def _read_pickle(path: Path, data: bytes) -> Any:
+    reader = SimpleNamespace(
+        __name__="tensorsim.weights",
+        Unpickler=_TensorUnpickler,
+        load=lambda file, **options: _TensorUnpickler(file, **options).load(),
+    )
+    try:
+        if zipfile.is_zipfile(io.BytesIO(data)):
+            # torch.load would hand a TorchScript archive, which is a program too, to torch.jit.load.
+            names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+            if any(name.endswith("/constants.pkl") for name in names):
+                raise TensorsimError("it is a TorchScript program, expected a file of weights")
+        return torch.load(io.BytesIO(data), map_location="cpu", pickle_module=reader, weights_only=False)
+    except TensorsimError as error:
+        raise TensorsimError(f"{path}: {error}") from None
+    except Exception as error:  # a damaged pickle can raise anything
+        summary = (str(error).strip() or "no details").splitlines()[0]
+        raise TensorsimError(
+            f"{path}: damaged or not a file of weights ({type(error).__name__}: {summary})"
+        ) from error
