@@ -22,6 +22,11 @@ Networks can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_PO
 """
 
 
+#: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
+FULL_RATE_PULSES = 1 << 17
+DISPLAY_RATE_HZ = 256.0
+
+
 @dataclass(frozen=True)
 class Simulate:
     """Turn a video into what a radar would have seen.
@@ -98,13 +103,14 @@ class Simulate:
                 self.video, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
             )
             people: VideoToPose = _video_to_pose(self, detector_path, pose_path).to(device).eval()
-            maps_stage: PoseToDoppler = _pose_to_doppler(self).to(device).eval()
+            length_s = 0.0 if reader.frame_count is None else reader.frame_count / reader.fps
+            maps_stage: PoseToDoppler = _pose_to_doppler(self, length_s).to(device).eval()
             with run.complete_or_nothing(self.out) as folder:
                 pose = run.pose_of_film(people, reader, device, self.quiet)
                 warn_of_empty_clips(pose.valid)
                 torch.manual_seed(self.seed)
-                maps, rate_hz = run.maps_of_pose(maps_stage, pose, reader.fps, device, self.quiet)
-                run.write_maps(folder, maps, run.axes_of(maps_stage, maps, rate_hz))
+                maps = run.maps_of_pose(maps_stage, pose, reader.fps, device, self.quiet)
+                run.write_maps(folder, maps, run.axes_of(maps_stage, maps))
                 run.write_pose(folder, pose, reader.fps)
                 run.write_overlay(folder, reader, pose, people.metric_pose.keypoint_threshold, self.quiet)
                 config = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
@@ -183,9 +189,10 @@ def _video_to_pose(options: Simulate, detector_path: Path, pose_path: Path):  # 
     from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
     from tensorsim.vision.rtmdet import RTMDet
 
+    detector = RTMDet.from_pretrained(detector_path)
     network = OnnxHeatmaps(pose_path) if pose_path.suffix == ".onnx" else HRNet.from_pretrained(pose_path)
     return VideoToPose(
-        RTMDet.from_pretrained(detector_path),
+        detector,
         network,
         metric_pose=MetricPose(
             CameraConfig(horizontal_fov_rad=math.radians(options.camera_fov)),
@@ -197,7 +204,7 @@ def _video_to_pose(options: Simulate, detector_path: Path, pose_path: Path):  # 
     )
 
 
-def _pose_to_doppler(options: Simulate):  # type: ignore[no-untyped-def]
+def _pose_to_doppler(options: Simulate, length_s: float):  # type: ignore[no-untyped-def]
     from tensorsim.config import RadarConfig, WallConfig
     from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
     from tensorsim.motion.resample import PoseResampler
@@ -216,6 +223,7 @@ def _pose_to_doppler(options: Simulate):  # type: ignore[no-untyped-def]
         wall_paths=options.wall_paths,
         snr_db=options.snr,
         integration=options.integration,
+        display_rate_hz=DISPLAY_RATE_HZ if length_s * radar.prf_hz > FULL_RATE_PULSES else None,
     )
     denoiser = None if options.denoiser is None else MapDenoiser(DnCNN.from_pretrained(options.denoiser))
     if options.motion == "paper":

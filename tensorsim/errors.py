@@ -42,12 +42,21 @@ def check_size(x: Tensor, dim: int, size: int, name: str, layout: str) -> None:
 def check_not_empty(x: Tensor, name: str) -> None:
     """Refuse a tensor without elements."""
     if x.numel() == 0:
-        raise TensorsimError(f"{name}: got an empty tensor of shape {list(x.shape)}, expected at least one element")
+        raise TensorsimError(
+            f"{name}: got an empty tensor of shape {list(x.shape)}, expected at least one element"
+        )
+
+
+def is_exporting() -> bool:
+    """Whether torch.export is tracing: values are unknown then, so whatever reads them has to rest."""
+    if not torch.jit.is_scripting():
+        return torch.compiler.is_exporting()
+    return False
 
 
 def check_finite(x: Tensor, name: str) -> None:
-    """Refuse NaN and infinity."""
-    if not bool(torch.isfinite(x).all()):
+    """Refuse NaN and infinity (not while torch.export traces, which cannot look at values)."""
+    if not is_exporting() and not bool(torch.isfinite(x).all()):
         raise TensorsimError(f"{name}: got NaN or infinite values, expected finite numbers")
 
 

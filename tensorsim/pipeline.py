@@ -115,7 +115,8 @@ class VideoToPose(nn.Module):
             return (index >= 0).expand(clips, frames)
         check_rank(lengths, 1, "lengths", "(B,)")
         if lengths.shape[0] != clips or bool((lengths < 1).any()) or bool((lengths > frames).any()):
-            raise TensorsimError(f"lengths: got {lengths.tolist()}, expected {clips} counts from 1 to {frames}")
+            counts: list[int] = lengths.tolist()
+            raise TensorsimError(f"lengths: got {counts}, expected {clips} counts from 1 to {frames}")
         return index < lengths.to(device).unsqueeze(-1)
 
     def observed_frames(self, present: Tensor) -> Tensor:
@@ -157,8 +158,12 @@ class VideoToPose(nn.Module):
             labels.unflatten(0, [clips, frames]),
             valid.unflatten(0, [clips, frames]),
         )
-        tracks: Tracks = self.tracker(whole, observed)
-        return tracks
+        tracks = self.tracker(whole, observed)
+        # The last frame of a clip is observed, so what follows the last observed frame is padding.
+        within = (observed.flip(-1).cumsum(-1).flip(-1) > 0).unsqueeze(1)
+        return Tracks(
+            tracks.boxes * within.unsqueeze(-1), tracks.valid & within, tracks.matched & within
+        )
 
     def estimate(self, frames: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (n, P, 17, 2) and scores (n, P, 17) of boxes (n, P, 4) in frames (n, 3, H, W)."""
@@ -176,7 +181,8 @@ class VideoToPose(nn.Module):
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
         body, body_scores = coco_to_body(keypoints, scores)
-        body_scores = body_scores * tracks.valid.unsqueeze(-1)
+        # A network's score is the height of its heat map and may fall below zero; a weight may not.
+        body_scores = body_scores.clamp(min=0.0) * tracks.valid.unsqueeze(-1)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, tracks.valid, height, width, fps)
         joints = self.smoother(joints, seen, fps)

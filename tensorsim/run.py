@@ -22,10 +22,6 @@ from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps
 
-#: Above this many pulses the range-time maps are kept at a display rate instead of every pulse.
-FULL_RATE_PULSES = 1 << 17
-DISPLAY_RATE_HZ = 256.0
-
 
 def _bar(iterable: Any, name: str, total: int | None, quiet: bool) -> Any:
     return tqdm(iterable, desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
@@ -81,17 +77,10 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
 
 def maps_of_pose(
     stage: PoseToDoppler, pose: Pose, fps: float, device: torch.device, quiet: bool = False
-) -> tuple[RadarMaps, float]:
-    """Maps of the first clip of ``pose``, streamed over pulses.
-
-    Returns:
-        The maps on the CPU, and the rate in Hz of the columns of its range-time maps: the PRF, or
-        ``DISPLAY_RATE_HZ`` for films of more than ``FULL_RATE_PULSES`` pulses.
-    """
-    prf_hz = stage.resampler.prf_hz
+) -> RadarMaps:
+    """Maps (on the CPU, without a batch dimension) of the first clip of ``pose``, streamed over pulses."""
     joints, valid = pose.joints[:1].to(device), pose.valid[:1].to(device)
     pulses = stage.resampler.pulses(joints.shape[2], fps)
-    display_rate_hz = DISPLAY_RATE_HZ if pulses > FULL_RATE_PULSES and prf_hz > DISPLAY_RATE_HZ else None
     coefficients = stage.resampler.coefficients(joints, fps)
 
     with _bar(None, "radar", pulses, quiet) as bar:
@@ -102,8 +91,8 @@ def maps_of_pose(
             bar.update(max(0, stop - bar.n))
             return points[0], rcs[0]
 
-        maps = stage.simulator.stream(source, pulses, display_rate_hz)
-    return RadarMaps(*(field.cpu() for field in stage.denoise(maps))), display_rate_hz or prf_hz
+        maps = stage.simulator.stream(source, pulses)
+    return RadarMaps(*(field.cpu() for field in stage.denoise(maps)))
 
 
 @contextmanager
@@ -139,15 +128,18 @@ class Axes:
     speed_per_hz: float
 
 
-def axes_of(stage: PoseToDoppler, maps: RadarMaps, range_time_rate_hz: float) -> Axes:
+def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
     """Axes of the maps that this stage made."""
     simulator = stage.simulator
     doppler = simulator.doppler
+    pulses = doppler.length + (maps.doppler_time.shape[-1] - 1) * doppler.hop
+    # What the two-pulse canceller gives lies between the two pulses that it subtracts.
+    delay_s = simulator.mti.lost_pulses / 2 / simulator.radar.prf_hz
     return Axes(
         range_m=simulator.range_profile.range_m.cpu().numpy(),
         doppler_hz=doppler.doppler_hz.cpu().numpy(),
-        time_s=doppler.time_s(maps.doppler_time.shape[-1]).cpu().numpy(),
-        range_time_rate_hz=range_time_rate_hz,
+        time_s=doppler.frame_times_s(pulses).cpu().numpy() + delay_s,
+        range_time_rate_hz=simulator.radar.prf_hz / simulator.range_time_block,
         speed_per_hz=simulator.radar.doppler_wavelength_m / 2,
     )
 
@@ -172,7 +164,7 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
         ("range_time", "range-time map", range_time),
         ("range_time_mti", "range-time map after moving target indication", mti),
     ):
-        # A column of the two-pulse canceller lies between the two pulses it subtracts.
+        # The same half pulse as above; none is left at a display rate.
         offset = (range_time.shape[1] - magnitude.shape[1]) / 2
         time_s = (np.arange(magnitude.shape[1]) + offset) / axes.range_time_rate_hz
         plot.save_figure(

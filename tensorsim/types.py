@@ -42,13 +42,32 @@ class Tracks(NamedTuple):
 
     Attributes:
         boxes: (B, P, T, 4) ``xyxy`` pixels; zeros where not valid.
-        valid: (B, P, T) bool, true from a track's first to its last matched frame, coasted frames included.
+        valid: (B, P, T) bool, true from a track's first to its last matched frame, coasted frames included, and
+            in frames next to these in which the detector was not run.
         matched: (B, P, T) bool, true where a detection was assigned in that frame.
     """
 
     boxes: Tensor
     valid: Tensor
     matched: Tensor
+
+
+class Lifted(NamedTuple):
+    """3D poses found for 2D joints, one per frame.
+
+    Attributes:
+        depth: (..., T, 14) body heights along the line of sight from the middle of the hips, positive = further away.
+        scale: (..., T) pixels that the standing body height would take at the person's distance, whatever the pose.
+        keypoints: (..., T, 14, 2) pixels, the found pose placed in the image: stands in for joints that are not seen.
+        index: (..., T) int64 of the best match, ``pose * yaws + heading``.
+        distance: (..., T) its weighted squared error, relative to the spread of the joints; 0 is a perfect fit.
+    """
+
+    depth: Tensor
+    scale: Tensor
+    keypoints: Tensor
+    index: Tensor
+    distance: Tensor
 
 
 class Pose(NamedTuple):

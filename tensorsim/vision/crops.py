@@ -1,0 +1,146 @@
+"""Crops of people: an upright affine warp of each box, as top-down pose networks expect it, and the way back.
+
+Pixel centres are at integers, in images and in crops. The crop of a box with centre c keeps the aspect ratio
+of the crop size (W, H): the padded box is enlarged along its short side to (s W, s H), and crop pixel x'
+shows
+
+    x = s (x' - (W, H) / 2) + c
+
+which is the transform of the simple-baselines, HRNet and DARK code ("plain", as against UDP's).
+"""
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_min_rank,
+    check_positive,
+    check_rank,
+    check_size,
+    is_exporting,
+)
+
+
+def crop_transform(boxes: Tensor, height: int, width: int, padding: float) -> tuple[Tensor, Tensor]:
+    """Scale and offset of the crops of boxes: image point = scale * crop point + offset.
+
+    Args:
+        boxes: (..., 4) ``xyxy`` pixels.
+        height: of the crop.
+        width: of the crop.
+        padding: the box is enlarged by this factor about its centre first.
+
+    Returns:
+        scale (..., 1), image pixels per crop pixel, and offset (..., 2), the image point of crop point (0,
+        0).
+    """
+    low, high = boxes[..., :2], boxes[..., 2:]
+    crop_size = torch.tensor([width, height], dtype=boxes.dtype, device=boxes.device)
+    scale = padding * ((high - low) / crop_size).amax(-1, keepdim=True)
+    return scale, (low + high) / 2 - scale * crop_size / 2
+
+
+def crop_to_image(points: Tensor, boxes: Tensor, height: int, width: int, padding: float) -> Tensor:
+    """Points (N, J, 2) of crops to pixels of the image, for the boxes (N, 4) of :func:`crop_transform`."""
+    scale, offset = crop_transform(boxes, height, width, padding)
+    return scale.unsqueeze(-2) * points + offset.unsqueeze(-2)
+
+
+def sample_bilinear(images: Tensor, index: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Bilinear samples of images on one rectangular grid per index, black outside, as ``cv2.warpAffine``.
+
+    Only the four neighbours of each sample are read: neither an image per grid nor a float copy of integer
+    images is made.
+
+    Args:
+        images: (B, C, H, W), of any number type.
+        index: (N,) int64, the image of each grid.
+        u: (N, w) horizontal positions in pixels, floating point.
+        v: (N, h) vertical positions.
+
+    Returns:
+        (N, C, h, w) in the type of ``u``, laid out channels last.
+    """
+    pixels = images.permute(0, 2, 3, 1)
+    left, top = u.floor(), v.floor()
+    out = torch.zeros(1, 1, 1, 1, dtype=u.dtype, device=u.device)
+    for down in range(2):
+        row = top + down
+        row_weight = (1 - (v - row).abs()) * ((row >= 0) & (row < images.shape[2]))
+        row = row.clamp(0, images.shape[2] - 1).long()
+        for right in range(2):
+            column = left + right
+            column_weight = (1 - (u - column).abs()) * ((column >= 0) & (column < images.shape[3]))
+            column = column.clamp(0, images.shape[3] - 1).long()
+            corner = pixels[index[:, None, None], row[:, :, None], column[:, None, :]]
+            weight = row_weight[:, :, None] * column_weight[:, None, :]
+            out = out + weight.unsqueeze(-1) * corner
+    return out.permute(0, 3, 1, 2)
+
+
+class BoxCrop(nn.Module):
+    """Crops of boxes in a batch of images.
+
+    ``uint8`` images become [0, 1] floats. Differentiable by float images and by boxes. Samples are bilinear
+    without a low-pass filter, as in the pipelines that pose networks were trained with, so large boxes alias.
+
+    Args:
+        size: (H, W) of the crops.
+        padding: boxes are enlarged by this factor first.
+
+    Raises:
+        TensorsimError: a size or padding that is not positive; ranks that do not fit, images of
+            another integer type or without pixels, boxes that are not finite or have no area.
+    """
+
+    def __init__(self, size: tuple[int, int] = (256, 192), padding: float = 1.25) -> None:
+        super().__init__()
+        if len(size) != 2 or min(size) < 1:
+            raise TensorsimError(f"BoxCrop: got size {size}, expected (H, W), both positive")
+        check_positive(padding, "BoxCrop padding")
+        self.height, self.width = size
+        self.padding = padding
+
+    def forward(self, images: Tensor, boxes: Tensor, index: Tensor) -> Tensor:
+        """Crop each box from its image.
+
+        Args:
+            images: (B, C, H, W), floats or ``uint8``.
+            boxes: (N, 4) ``xyxy`` pixels.
+            index: (N,) int64, the image of each box.
+
+        Returns:
+            (N, C, h, w) in the type of float images, for ``uint8`` in that of the boxes; channels last in
+            memory.
+        """
+        check_rank(images, 4, "BoxCrop images", "(B, C, H, W)")
+        if images.shape[2] == 0 or images.shape[3] == 0:
+            raise TensorsimError(f"BoxCrop images: got shape {list(images.shape)}, expected some pixels")
+        if not (images.is_floating_point() or images.dtype == torch.uint8):
+            raise TensorsimError(f"BoxCrop images: got dtype {images.dtype}, expected floats or uint8")
+        check_boxes(boxes, "BoxCrop boxes")
+        check_rank(boxes, 2, "BoxCrop boxes", "(N, 4)")
+        if index.dim() != 1 or index.shape[0] != boxes.shape[0]:
+            raise TensorsimError(
+                f"BoxCrop index: got shape {list(index.shape)}, expected ({boxes.shape[0]},), one per box"
+            )
+        if not is_exporting() and not bool(((index >= 0) & (index < images.shape[0])).all()):
+            raise TensorsimError(
+                f"BoxCrop index: got a number of no image, expected 0 to {images.shape[0] - 1}"
+            )
+        scale, offset = crop_transform(boxes, self.height, self.width, self.padding)
+        u = scale * torch.arange(self.width, dtype=boxes.dtype, device=boxes.device) + offset[:, 0:1]
+        v = scale * torch.arange(self.height, dtype=boxes.dtype, device=boxes.device) + offset[:, 1:2]
+        crops = sample_bilinear(images, index, u, v)
+        return crops.to(images.dtype) if images.is_floating_point() else crops / 255
+
+
+def check_boxes(boxes: Tensor, name: str) -> None:
+    """Refuse anything but finite ``xyxy`` boxes (..., 4) with an area."""
+    check_min_rank(boxes, 1, name, "(..., 4) xyxy")
+    check_size(boxes, -1, 4, name, "(..., 4) xyxy")
+    check_finite(boxes, name)
+    if not is_exporting() and not bool((boxes[..., 2:] > boxes[..., :2]).all()):
+        raise TensorsimError(f"{name}: got a box without area, expected xyxy with x1 < x2 and y1 < y2")

@@ -1,0 +1,133 @@
+"""Heat maps to points: the highest pixel of each map, refined below the pixel.
+
+Pixel centres are at integers, and pixel (u, v) of a map stands for pixel (4u, 4v) of the crop: a network
+trained on Gaussians drawn at keypoint / 4 is decoded without bias by multiplying with 4.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tensorsim.errors import TensorsimError, check_floating, check_min_rank
+
+
+def peak(maps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Highest pixel of each map (..., h, w): column u and row v, int64, and its value, each (...)."""
+    score, flat = maps.flatten(-2).max(-1)
+    return flat % maps.shape[-1], flat // maps.shape[-1], score
+
+
+def pixel(maps: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Values (...) of maps (..., h, w) at columns u and rows v, the nearest pixel where outside."""
+    height, width = maps.shape[-2], maps.shape[-1]
+    flat = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
+    return maps.flatten(-2).gather(-1, flat.unsqueeze(-1)).squeeze(-1)
+
+
+def decode_quarter(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Highest pixel, moved a quarter pixel towards its higher neighbour in each direction.
+
+    A direction is left alone at the border: u needs 1 < u < w - 1 and v > 0, v likewise (the gates of
+    mmpose).
+
+    Args:
+        maps: (..., h, w).
+
+    Returns:
+        Points (..., 2), ``uv`` in heat-map pixels, and scores (...), the heights of the peaks. Only the
+        scores are differentiable.
+    """
+    height, width = maps.shape[-2], maps.shape[-1]
+    u, v, score = peak(maps)
+    du = (pixel(maps, u + 1, v) - pixel(maps, u - 1, v)).sign() * ((u > 1) & (u < width - 1) & (v > 0))
+    dv = (pixel(maps, u, v + 1) - pixel(maps, u, v - 1)).sign() * ((v > 1) & (v < height - 1) & (u > 0))
+    return torch.stack([u + 0.25 * du, v + 0.25 * dv], -1), score
+
+
+def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
+    """Highest pixel p, moved to the peak of the Gaussian that the map is taken for: p - H^-1 g.
+
+    g and H are gradient and Hessian of the log of the smoothed map at p, by central differences (F. Zhang et
+    al., "Distribution-Aware Coordinate Representation for Human Pose Estimation", CVPR 2020, eq. 9). The step
+    is left out two pixels from the border and where H is singular.
+
+    Args:
+        maps: (..., h, w).
+        kernel: (k,) smoothing kernel of each direction, k odd; maps count as zero outside.
+
+    Returns:
+        Points (..., 2), ``uv`` in heat-map pixels, and scores (...), the heights of the peaks. Both are
+        differentiable by the maps, with the highest pixel held fixed.
+    """
+    height, width = maps.shape[-2], maps.shape[-1]
+    u, v, score = peak(maps)
+
+    half = kernel.shape[0] // 2
+    smooth = maps.reshape(-1, 1, height, width)
+    smooth = F.conv2d(smooth, kernel.view(1, 1, -1, 1), padding=[half, 0])
+    smooth = F.conv2d(smooth, kernel.view(1, 1, 1, -1), padding=[0, half]).view(maps.shape)
+    # Back to the height it had, which matters to the floor under the logarithm alone.
+    tiny = 1e-10
+    smooth = smooth * (score / smooth.amax((-2, -1)).clamp_min(tiny)).unsqueeze(-1).unsqueeze(-1)
+    f = smooth.clamp_min(tiny).log()
+
+    centre = pixel(f, u, v)
+    gu = (pixel(f, u + 1, v) - pixel(f, u - 1, v)) / 2
+    gv = (pixel(f, u, v + 1) - pixel(f, u, v - 1)) / 2
+    huu = (pixel(f, u + 2, v) - 2 * centre + pixel(f, u - 2, v)) / 4
+    hvv = (pixel(f, u, v + 2) - 2 * centre + pixel(f, u, v - 2)) / 4
+    huv = pixel(f, u + 1, v + 1) - pixel(f, u - 1, v + 1) - pixel(f, u + 1, v - 1) + pixel(f, u - 1, v - 1)
+    huv = huv / 4
+    determinant = huu * hvv - huv * huv
+    refined = (u > 1) & (u < width - 2) & (v > 1) & (v < height - 2) & (determinant != 0)
+    determinant = torch.where(refined, determinant, torch.ones_like(determinant))
+    step = torch.stack([hvv * gu - huv * gv, huu * gv - huv * gu], -1) / determinant.unsqueeze(-1)
+    return torch.stack([u, v], -1) - step * refined.unsqueeze(-1), score
+
+
+class HeatmapDecoder(nn.Module):
+    """Heat maps (..., h, w) to points of the crop, ``uv`` in crop pixels (..., 2), and scores (...).
+
+    A map without a positive value still gives its highest pixel; its score tells.
+
+    Args:
+        method: ``"dark"`` (:func:`decode_dark`, differentiable) or ``"quarter"`` (:func:`decode_quarter`).
+        kernel_size: k of the Gaussian that DARK smooths with, odd; sigma is 0.3 ((k - 1) / 2 - 1) + 0.8, that
+            is 2 for 11.
+        stride: how many crop pixels one heat-map pixel is wide.
+
+    Raises:
+        TensorsimError: another method, an even kernel, a stride below 1, integer or empty maps.
+    """
+
+    kernel: Tensor
+
+    def __init__(self, method: str = "dark", kernel_size: int = 11, stride: int = 4) -> None:
+        super().__init__()
+        if method not in ("dark", "quarter"):
+            raise TensorsimError(f"HeatmapDecoder: got method {method!r}, expected 'dark' or 'quarter'")
+        if kernel_size < 1 or kernel_size % 2 == 0:
+            raise TensorsimError(
+                f"HeatmapDecoder: got kernel_size {kernel_size}, expected a positive odd number"
+            )
+        if stride < 1:
+            raise TensorsimError(f"HeatmapDecoder: got stride {stride}, expected at least 1")
+        self.method = method
+        self.stride = stride
+        sigma = 0.3 * ((kernel_size - 1) / 2 - 1) + 0.8
+        kernel = torch.signal.windows.gaussian(kernel_size, std=sigma, dtype=torch.float64)
+        self.register_buffer("kernel", (kernel / kernel.sum()).float(), persistent=False)
+
+    def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., h, w) -> points (..., 2) in crop pixels and scores (...)."""
+        check_floating(maps, "HeatmapDecoder maps")
+        check_min_rank(maps, 2, "HeatmapDecoder maps", "(..., h, w)")
+        if maps.shape[-1] == 0 or maps.shape[-2] == 0:
+            raise TensorsimError(
+                f"HeatmapDecoder maps: got shape {list(maps.shape)}, expected (..., h, w) with pixels"
+            )
+        if self.method == "dark":
+            points, scores = decode_dark(maps, self.kernel)
+        else:
+            points, scores = decode_quarter(maps)
+        return self.stride * points, scores
