@@ -16,6 +16,9 @@ COCO_BONES = ((0, 1), (0, 2), (1, 3), (2, 4), (5, 6), (5, 7), (7, 9), (6, 8), (8
 #: One colour per person, RGB.
 PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (23, 190, 207))
 
+#: Pictures show this much below the peak.
+DYNAMIC_RANGE_DB = 50.0
+
 _MAX_COLUMNS = 2000
 
 
@@ -55,7 +58,7 @@ def map_figure(
     axis_label: str,
     ridges: np.ndarray | None = None,
     speed_per_axis: float | None = None,
-    dynamic_range_db: float = 50.0,
+    dynamic_range_db: float = DYNAMIC_RANGE_DB,
 ) -> Figure:
     """Draw a map (rows, columns) in dB below its peak.
 

@@ -149,6 +149,8 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
     range_time, mti = maps.range_time.numpy(), maps.range_time_mti.numpy()
     doppler_time = maps.doppler_time.numpy()
     ridges_hz = axes.doppler_hz[maps.ridges.numpy()]
+    # In the picture a ridge ends where it is no more than noise at the floor of the colours.
+    strong = maps.ridge_magnitudes.numpy() > doppler_time.max(initial=0.0) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
     np.savez(
         folder / "maps.npz",
         range_time=range_time,
@@ -177,7 +179,7 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
             axes.doppler_hz,
             "Doppler-time map",
             "Doppler in Hz, positive = approaching",
-            ridges=ridges_hz,
+            ridges=np.where(strong, ridges_hz, np.nan),
             speed_per_axis=axes.speed_per_hz,
         ),
         folder / "doppler_time.png",

@@ -1,9 +1,13 @@
 """Fixtures shared by all tests."""
 
+import os
 from pathlib import Path
 
 import pytest
 import torch
+
+# FFmpeg reads its log level when OpenCV first uses it, which is often a test that writes a film, not the reader.
+os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
 
 #: Real videos, networks and motion beside the checkout; tests that read it skip where it is missing.
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -1,0 +1,185 @@
+"""DnCNN: a chain of convolutions that predicts the noise of an image; what is left is the clean image.
+
+Source: K. Zhang, W. Zuo, Y. Chen, D. Meng, L. Zhang, "Beyond a Gaussian denoiser: residual learning of deep
+CNN for image denoising", IEEE Transactions on Image Processing 26 (2017).
+"""
+
+import os
+import re
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_weights
+
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_not_empty
+
+
+class DnCNN(nn.Module):
+    """Noisy images in [0, 1] -> clean images ``x - Q(x)``, Q the noise that the network sees.
+
+    ``depth`` convolutions of 3x3: the first and the last alone, those between with batch normalisation. The
+    state dict has the names of the authors' PyTorch code: ``model.{3i-1}`` and ``model.{3i}`` for convolution
+    i and its normalisation, ``model.{2i}`` for convolution i when normalisation is folded into it.
+
+    Args:
+        depth: number of convolutions, also the reach of an output pixel in pixels.
+        channels: width of the network.
+        batch_norm: False builds the network without normalisation, as released weights are.
+
+    Example:
+        >>> DnCNN.from_pretrained("dncnn_gray_blind.pth")(images)  # (..., H, W) -> (..., H, W)
+
+    Raises:
+        TensorsimError: a depth below 2 or a width below 1.
+    """
+
+    def __init__(self, depth: int = 20, channels: int = 64, batch_norm: bool = True) -> None:
+        super().__init__()
+        if depth < 2 or channels < 1:
+            raise TensorsimError(
+                f"DnCNN: got depth {depth} and {channels} channels, expected at least 2 and at least 1"
+            )
+        self.depth = depth
+        self.channels = channels
+        self.batch_norm = batch_norm
+        layers: list[nn.Module] = [_convolution(1, channels), nn.ReLU(inplace=True)]
+        for _ in range(depth - 2):
+            layers.append(_convolution(channels, channels))
+            if batch_norm:
+                layers.append(nn.BatchNorm2d(channels, eps=1e-4))
+            layers.append(nn.ReLU(inplace=True))
+        layers.append(_convolution(channels, 1))
+        self.model = nn.Sequential(*layers)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Clean images (..., H, W) in [0, 1]; the output is not clipped.
+
+        Raises:
+            TensorsimError: see :meth:`noise`.
+        """
+        return images - self.noise(images)
+
+    @torch.jit.export
+    def noise(self, images: Tensor) -> Tensor:
+        """Q, the noise of images (..., H, W) in [0, 1].
+
+        Raises:
+            TensorsimError: not real, fewer than two dimensions, or empty.
+        """
+        check_floating(images, "DnCNN")
+        check_min_rank(images, 2, "DnCNN", "(..., H, W)")
+        check_not_empty(images, "DnCNN")
+        noise: Tensor = self.model(images.reshape(-1, 1, images.shape[-2], images.shape[-1]))
+        return noise.reshape(images.shape)
+
+    def folded(self) -> "DnCNN":
+        """The network with normalisation folded into the convolutions: in evaluation the same, and faster."""
+        if not self.batch_norm:
+            return self
+        convolutions = [layer for layer in self.model if isinstance(layer, nn.Conv2d)]
+        norms = [layer for layer in self.model if isinstance(layer, nn.BatchNorm2d)]
+        folded = DnCNN(self.depth, self.channels, batch_norm=False).to(convolutions[0].weight)
+        for i, (conv, norm) in enumerate(zip(convolutions, [None, *norms, None], strict=True)):
+            weight, bias = conv.weight, conv.bias
+            if norm is not None:
+                mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
+                weight, bias = fuse_conv_bn_weights(
+                    weight, bias, mean, variance, norm.eps, norm.weight, norm.bias
+                )
+            folded.model[2 * i].load_state_dict({"weight": weight, "bias": bias})
+        return folded.train(self.training)
+
+    @classmethod
+    def from_pretrained(cls, path: str | os.PathLike[str]) -> "DnCNN":
+        """Build the network that a weight file holds, in evaluation mode.
+
+        Args:
+            path: ``.pth`` or ``.safetensors`` with the names ``conv{i}`` (folded), those of the authors'
+                PyTorch code, folded or not, or a state dict of this class, which are the same.
+
+        Raises:
+            TensorsimError: no such file, a file that is not safe or not whole, or weights of another network.
+        """
+        from tensorsim.weights import load_state_dict, load_strict
+
+        weights = load_state_dict(path)
+        state = {
+            re.sub(r"^conv(\d+)\.", lambda m: f"model.{2 * int(m[1])}.", k): w for k, w in weights.items()
+        }
+        first = state.get("model.0.weight")
+        if first is None or first.dim() != 4 or first.shape[1:] != (1, 3, 3):
+            raise TensorsimError(
+                f"{path}: got the weights {', '.join(sorted(weights)[:3])}, ..., expected those of a grey "
+                f"DnCNN (model.0.weight or conv0.weight with shape (channels, 1, 3, 3))"
+            )
+        depth = sum(w.dim() == 4 for w in state.values())
+        batch_norm = any(key.endswith("running_mean") for key in state)
+        network = cls(max(depth, 2), first.shape[0], batch_norm)
+        load_strict(network, state, path)
+        return network.eval()
+
+
+def _convolution(in_channels: int, out_channels: int) -> nn.Conv2d:
+    """3x3 with the paper's initial weights (He)."""
+    convolution = nn.Conv2d(in_channels, out_channels, 3, padding=1)
+    nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+    nn.init.constant_(convolution.get_parameter("bias"), 0.0)
+    return convolution
+
+
+class MapDenoiser(nn.Module):
+    """Denoise magnitude maps with a network for images: scale each map to [0, 1], clean it, scale back.
+
+    Maps are cleaned in tiles of columns that overlap by the reach of the network, so the result is that of
+    the whole map and memory does not grow with its length.
+
+    Args:
+        network: noisy images in [0, 1] -> clean ones, see :class:`DnCNN`.
+        tile: columns (time) cleaned at once.
+
+    Raises:
+        TensorsimError: a tile without columns.
+    """
+
+    def __init__(self, network: DnCNN, tile: int = 1024) -> None:
+        super().__init__()
+        if tile < 1:
+            raise TensorsimError(f"MapDenoiser.tile: got {tile} columns, expected at least 1")
+        self.network = network
+        self.tile = tile
+        self.reach = network.depth
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Clean magnitude maps (..., H, W), each on its own scale.
+
+        Differentiable, except where the clean map would lie below the smallest value of the map and is held
+        there.
+
+        Returns:
+            Tensor of the shape of ``maps``, not below each map's minimum: magnitudes stay magnitudes.
+
+        Raises:
+            TensorsimError: not real, fewer than two dimensions, empty, or NaN.
+        """
+        check_floating(maps, "MapDenoiser")
+        check_min_rank(maps, 2, "MapDenoiser", "(..., H, W)")
+        check_not_empty(maps, "MapDenoiser")
+        check_finite(maps, "MapDenoiser")
+        low, high = maps.amin(dim=(-2, -1), keepdim=True), maps.amax(dim=(-2, -1), keepdim=True)
+        span = high - low
+        images = ((maps - low) / torch.where(span > 0, span, torch.ones_like(span))).reshape(
+            -1, maps.shape[-2], maps.shape[-1]
+        )
+        clean = torch.stack([self.clean_in_tiles(image) for image in images.unbind(0)]).reshape(maps.shape)
+        return clean.clamp(min=0.0) * span + low
+
+    def clean_in_tiles(self, image: Tensor) -> Tensor:
+        """Clean one image (H, W) in [0, 1], tile after tile."""
+        width = image.shape[-1]
+        tiles: list[Tensor] = []
+        for start in range(0, width, self.tile):
+            first = max(0, start - self.reach)
+            count = min(self.tile, width - start)
+            last = min(width, start + count + self.reach)
+            tiles.append(self.network(image[:, first:last])[:, start - first : start - first + count])
+        return torch.cat(tiles, dim=-1)

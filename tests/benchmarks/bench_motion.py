@@ -1,0 +1,62 @@
+"""Motion stages against SciPy in the same run, one thread each.
+
+``OMP_NUM_THREADS=1 python tests/benchmarks/bench_motion.py``
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+
+from tensorsim.motion.resample import PoseResampler
+from tensorsim.motion.savgol import SavitzkyGolay
+
+ROUNDS = 15
+
+
+def compare(name: str, ours: Callable[[], object], peer: Callable[[], object]) -> None:
+    """Median of each, taken in turn, and how many times faster ours is."""
+    times: tuple[list[float], list[float]] = ([], [])
+    for _ in range(ROUNDS + 1):
+        for function, column in zip((ours, peer), times, strict=True):
+            start = time.perf_counter()
+            function()
+            column.append(time.perf_counter() - start)
+    own, other = (statistics.median(column[1:]) * 1e3 for column in times)  # the first round warms up
+    print(f"{name:<58} {own:9.3f} ms   SciPy {other:9.3f} ms   ratio {other / own:6.2f}")
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+    clip = torch.randn(120, 14, 3, dtype=torch.float64).cumsum(0)
+    batch = torch.randn(64, 120, 14, 3, dtype=torch.float64).cumsum(1)
+    pulses = torch.randn(32768, 14, 3, dtype=torch.float64).cumsum(0)
+
+    for name, x, window in (
+        ("SavitzkyGolay(11, 3), one clip of 120 frames", clip, 11),
+        ("SavitzkyGolay(11, 3), 64 clips of 120 frames", batch, 11),
+        ("SavitzkyGolay(2049, 3), 32768 pulses (as in the paper)", pulses, 2049),
+    ):
+        stage, array = SavitzkyGolay(window, 3), x.numpy()
+        compare(name, lambda: stage(x), lambda: savgol_filter(array, window, 3, axis=-3))  # noqa: B023
+
+    for prf_hz in (8192.0, 128.0):
+        resampler = PoseResampler(prf_hz)
+        frame_s, pulse_s = np.arange(120) / 30, np.arange(resampler.pulses(120, 30.0)) / prf_hz
+        for name, x in (("one clip", clip), ("64 clips", batch)):
+            if prf_hz > 1000 and x is batch:
+                continue  # 700 MB of pulses
+            compare(
+                f"PoseResampler({prf_hz:g}), {name} of 120 frames to {len(pulse_s)} pulses",
+                lambda: resampler(x, 30.0),  # noqa: B023
+                lambda: CubicSpline(frame_s, x.numpy(), axis=-3, bc_type="natural")(pulse_s),  # noqa: B023
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,361 @@
+import os
+import struct
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.data import video
+from tensorsim.data.video import VideoReader, write_video
+from tensorsim.errors import TensorsimError, TensorsimWarning
+
+HEIGHT, WIDTH, SIDE = 48, 64, 12
+BACKGROUND, SQUARE = (30, 60, 200), (230, 120, 20)  # RGB
+
+
+def picture(index: int) -> np.ndarray:
+    """A square that moves two pixels right per frame, 16 pixels below the top."""
+    frame = np.empty((HEIGHT, WIDTH, 3), np.uint8)
+    frame[:] = BACKGROUND
+    frame[16 : 16 + SIDE, 2 * index : 2 * index + SIDE] = SQUARE
+    return frame
+
+
+def write_clip(path: Path, frames: int = 20, fps: float = 25.0) -> Path:
+    if path.suffix == ".gif":
+        image = pytest.importorskip("PIL.Image")
+        pictures = [image.fromarray(picture(i)) for i in range(frames)]
+        pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps))
+        return path
+    code = {".avi": "MJPG", ".mp4": "mp4v", ".mkv": "FFV1"}[path.suffix]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), fps, (WIDTH, HEIGHT))
+    assert writer.isOpened()
+    for i in range(frames):
+        writer.write(picture(i)[..., ::-1].copy())
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    return write_clip(tmp_path / "clip.mp4")
+
+
+def read(path: Path, size: int = 7, **arguments: float) -> torch.Tensor:
+    return torch.cat(list(VideoReader(path, **arguments).chunks(size)))  # type: ignore[arg-type]
+
+
+def square_of(frame: torch.Tensor) -> tuple[float, float]:
+    """Column and row of the middle of the square."""
+    rows, columns = np.nonzero(frame[0].numpy().astype(int) > 130)
+    return float(columns.mean()), float(rows.mean())
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi", ".gif", ".mkv"])
+def test_frames_in_order_upright_and_rgb(tmp_path: Path, suffix: str) -> None:
+    reader = VideoReader(write_clip(tmp_path / f"clip{suffix}"))
+    assert reader.fps == pytest.approx(25.0)
+    assert (reader.height, reader.width, reader.frame_count) == (HEIGHT, WIDTH, 20)
+    chunks = list(reader.chunks(8))
+    assert [c.shape[0] for c in chunks] == [8, 8, 4]
+    frames = torch.cat(chunks)
+    assert frames.dtype == torch.uint8
+    assert frames.shape == (20, 3, HEIGHT, WIDTH)
+    for i, frame in enumerate(frames):
+        column, row = square_of(frame)
+        assert column == pytest.approx(2 * i + (SIDE - 1) / 2, abs=0.3)
+        assert row == pytest.approx(16 + (SIDE - 1) / 2, abs=0.3)
+        assert frame[:, 22, 2 * i + 6].tolist() == pytest.approx(list(SQUARE), abs=12)
+        assert frame[:, 40, 40].tolist() == pytest.approx(list(BACKGROUND), abs=12)
+
+
+def test_lossless_frames_are_exact(tmp_path: Path) -> None:
+    frames = read(write_clip(tmp_path / "clip.gif"))
+    assert torch.equal(frames[5].permute(1, 2, 0), torch.from_numpy(picture(5)))
+
+
+def test_two_passes_are_equal_and_chunks_do_not_share_memory(clip: Path) -> None:
+    reader = VideoReader(clip)
+    first, second = list(reader.chunks(3)), list(reader.chunks(20))
+    assert torch.equal(torch.cat(first), torch.cat(second))
+
+
+def test_pass_may_be_left_early_and_passes_interleaved(clip: Path) -> None:
+    reader = VideoReader(clip)
+    next(reader.chunks(4))
+    for a, b in zip(reader.chunks(4), reader.chunks(4), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "indices"),
+    [
+        ({"start_s": 0.2}, range(5, 20)),
+        ({"start_s": 0.21}, range(6, 20)),
+        ({"end_s": 0.4}, range(10)),
+        ({"start_s": 0.2, "end_s": 0.41}, range(5, 11)),
+        ({"end_s": 60.0}, range(20)),
+        ({"end_s": float("inf")}, range(20)),
+        ({"stride": 3}, range(0, 20, 3)),
+        ({"stride": 50}, [0]),
+        ({"start_s": 0.08, "end_s": 0.6, "stride": 4}, range(2, 15, 4)),
+        ({"fps": 10.0, "start_s": 0.5, "stride": 2}, range(5, 20, 2)),
+    ],
+)
+def test_range_and_stride(clip: Path, arguments: dict[str, float], indices: range | list[int]) -> None:
+    """Frame k is at k / fps; the start belongs to the range, the end does not."""
+    reader = VideoReader(clip, **arguments)  # type: ignore[arg-type]
+    assert reader.fps == pytest.approx(arguments.get("fps", 25.0) / arguments.get("stride", 1))
+    assert reader.frame_count == len(indices)
+    frames = torch.cat(list(reader.chunks(4)))
+    assert torch.equal(frames, read(clip)[list(indices)])
+
+
+def test_rotation_flag_of_a_telephone(tmp_path: Path) -> None:
+    """A film stored lying, with the matrix that says: turn by 90 degrees clockwise."""
+    path = write_clip(tmp_path / "clip.mp4")
+    data = bytearray(path.read_bytes())
+    matrix = data.index(b"tkhd") + 4 + 40
+    one = 1 << 16
+    assert struct.unpack_from(">9i", data, matrix) == (one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
+    struct.pack_into(">9i", data, matrix, 0, one, 0, -one, 0, 0, HEIGHT * one, 0, 1 << 30)
+    upright = read(path)
+    path.write_bytes(data)
+    reader = VideoReader(path)
+    assert (reader.height, reader.width) == (WIDTH, HEIGHT)
+    assert torch.equal(read(path), torch.rot90(upright, -1, (2, 3)))
+
+
+def test_fps_given_replaces_that_of_the_file(clip: Path) -> None:
+    reader = VideoReader(clip, fps=12.5)
+    assert reader.fps == 12.5
+    assert len(read(clip, fps=12.5)) == 20
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf"), 1000.0, 90000.0])
+def test_refuses_absurd_fps_unless_one_is_given(
+    clip: Path, monkeypatch: pytest.MonkeyPatch, fps: float
+) -> None:
+    monkeypatch.setattr(video, "_properties", lambda capture: (fps, 20))
+    with pytest.raises(
+        TensorsimError, match=f"the file announces {fps} frames per second.*give the frame rate"
+    ):
+        VideoReader(clip)
+    assert VideoReader(clip, fps=25.0).fps == 25.0
+
+
+def test_reads_the_rate_of_a_file_with_a_broken_header(tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "clip.avi")
+    data = bytearray(path.read_bytes())
+    scale_and_rate = data.index(b"strh") + 8 + 20
+    struct.pack_into("<2I", data, scale_and_rate, 1, 90000)
+    path.write_bytes(data)
+    with pytest.raises(TensorsimError, match="90000"):
+        VideoReader(path)
+    assert VideoReader(path, fps=25.0).fps == 25.0
+
+
+def test_film_that_does_not_say_how_long_it_is(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "_properties", lambda capture: (25.0, None))
+    reader = VideoReader(clip)
+    assert reader.frame_count is None
+    assert sum(c.shape[0] for c in reader.chunks(6)) == 20
+
+
+@pytest.mark.parametrize("count", [-1, 0, 1e18])
+def test_frame_counts_that_are_none(count: float) -> None:
+    class Capture:
+        def get(self, name: int) -> float:
+            return count if name == cv2.CAP_PROP_FRAME_COUNT else 25.0
+
+    assert video._properties(Capture()) == (25.0, None)
+
+
+def test_cut_off_film_gives_what_is_there(tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "clip.avi", frames=30)
+    whole = read(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    reader = VideoReader(path)
+    with pytest.warns(TensorsimWarning, match=r"got \d+ frames, expected 30 as the file announces"):
+        frames = torch.cat(list(reader.chunks(8)))
+    assert 5 < len(frames) < 25
+    assert torch.equal(frames, whole[: len(frames)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(read(path, end_s=0.12)) == 3  # what was asked for is there
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fps": 0.0}, "fps: got 0.0, expected a positive finite number"),
+        ({"fps": float("nan")}, "fps: got nan"),
+        ({"stride": 0}, "stride: got 0, expected 1 or more"),
+        ({"start_s": -1.0}, "start_s: got -1.0"),
+        ({"start_s": float("nan")}, "start_s: got nan"),
+        ({"end_s": 0.0}, "end_s: got 0.0, expected a number of seconds above the start, 0.0"),
+        ({"start_s": 0.5, "end_s": 0.5}, "end_s: got 0.5"),
+        ({"end_s": float("nan")}, "end_s: got nan"),
+        (
+            {"start_s": 0.8},
+            r"got a start of 0.8 s, expected less than its length of 0.800 s \(20 frames at 25",
+        ),
+        ({"start_s": 100.0}, r"got a start of 100.0 s, expected less than its length of 0.800 s"),
+        ({"start_s": 0.21, "end_s": 0.22}, "no frame lies between 0.21 and 0.22 s"),
+    ],
+)
+def test_refuses_impossible_ranges(clip: Path, arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        VideoReader(clip, **arguments)  # type: ignore[arg-type]
+
+
+def test_refuses_chunks_of_nothing(clip: Path) -> None:
+    with pytest.raises(TensorsimError, match="got a size of 0 frames"):
+        VideoReader(clip).chunks(0)
+
+
+def test_refuses_what_is_no_film(tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="no such file"):
+        VideoReader(tmp_path / "missing.mp4")
+    with pytest.raises(TensorsimError, match="got a folder"):
+        VideoReader(tmp_path)
+    for name, content in (
+        ("text.mp4", b"to whom it may concern\n" * 50),
+        ("empty.avi", b""),
+        ("zeros.mp4", bytes(4096)),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(TensorsimError, match=f"{name}: OpenCV cannot read this, expected a video"):
+            VideoReader(tmp_path / name)
+    # A header, and not one frame behind it.
+    path = write_clip(tmp_path / "head.avi")
+    data = path.read_bytes()
+    path.write_bytes(data[: data.index(b"movi") + 4])
+    with pytest.raises(TensorsimError, match=r"head\.avi: .*expected a video"):
+        VideoReader(path)
+
+
+def test_says_it_on_one_line_and_leaves_no_trace_of_ffmpeg(tmp_path: Path) -> None:
+    """In a process of its own: FFmpeg is told to be quiet before it starts."""
+    (tmp_path / "text.mp4").write_bytes(b"to whom it may concern\n" * 50)
+    cut = write_clip(tmp_path / "cut.mp4")
+    cut.write_bytes(cut.read_bytes()[:-600])
+    program = (
+        "import sys\nfrom tensorsim.data.video import VideoReader\n"
+        "for path in sys.argv[1:]:\n"
+        "    try:\n        VideoReader(path)\n"
+        "    except ValueError as error:\n        print(error)\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("OPENCV_")} | {
+        "PYTHONPATH": str(root)
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "text.mp4"), str(cut)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
+    )
+    assert done.stderr == ""
+    assert len(done.stdout.splitlines()) == 2
+
+
+def test_log_level_of_opencv_comes_back(clip: Path) -> None:
+    from cv2.utils import logging
+
+    before = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_WARNING)
+    try:
+        with pytest.raises(TensorsimError):
+            VideoReader(clip, start_s=100.0)
+        assert logging.getLogLevel() == logging.LOG_LEVEL_WARNING
+    finally:
+        logging.setLogLevel(before)
+
+
+@pytest.mark.parametrize(
+    ("name", "height", "width", "frames", "fps"),
+    [
+        ("juggle_kick_1person_24fps.mp4", 720, 1280, 247, 24.0),
+        ("walk_away_1person_16fps.gif", 270, 480, 71, 16.67),
+        ("walk_across_1person_30fps.mp4", 352, 640, 145, 29.76),
+        ("hug_2people_28fps.mp4", 1080, 1920, 72, 28.05),
+        ("drink_standing_1person_30fps.avi", 1080, 1920, 103, 30.0),
+    ],
+)
+def test_real_films(shared_data: Path, name: str, height: int, width: int, frames: int, fps: float) -> None:
+    reader = VideoReader(shared_data / "video" / name)
+    assert (reader.height, reader.width, reader.frame_count) == (height, width, frames)
+    assert reader.fps == pytest.approx(fps, abs=0.01)
+    assert sum(chunk.shape[0] for chunk in reader.chunks(16)) == frames
+
+
+# ---- write_video -----------------------------------------------------------------------------------------
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    write_video(tmp_path / "out.mp4", (picture(i) for i in range(12)), 24.0)
+    reader = VideoReader(tmp_path / "out.mp4")
+    assert (reader.fps, reader.frame_count) == (24.0, 12)
+    for i, frame in enumerate(torch.cat(list(reader.chunks(5)))):
+        assert square_of(frame)[0] == pytest.approx(2 * i + (SIDE - 1) / 2, abs=0.3)
+        assert frame[:, 40, 40].tolist() == pytest.approx(list(BACKGROUND), abs=12)
+    assert [p.name for p in tmp_path.iterdir()] == ["out.mp4"]
+
+
+def test_odd_sizes_grow_by_a_pixel(tmp_path: Path) -> None:
+    write_video(tmp_path / "out.mp4", [picture(i)[:-1, :-1] for i in range(3)], 24.0)
+    reader = VideoReader(tmp_path / "out.mp4")
+    assert (reader.height, reader.width) == (HEIGHT, WIDTH)
+
+
+def frames_until(error: Callable[[], BaseException]) -> Iterator[np.ndarray]:
+    yield picture(0)
+    yield picture(1)
+    raise error()
+
+
+def test_nothing_half_written_stays(tmp_path: Path) -> None:
+    path = tmp_path / "out.mp4"
+    for error in (KeyboardInterrupt, ZeroDivisionError):
+        with pytest.raises(error):
+            write_video(path, frames_until(error), 24.0)
+        assert list(tmp_path.iterdir()) == []
+    write_video(path, [picture(0)], 24.0)
+    before = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt):
+        write_video(path, frames_until(KeyboardInterrupt), 24.0)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "fps", "message"),
+    [
+        ("out.mp4", [], 24.0, "got no frames"),
+        ("out.mp4", [picture(0)], 0.0, "fps: got 0.0"),
+        (
+            "out.mp4",
+            [picture(0)[..., 0]],
+            24.0,
+            r"got a frame of uint8 \(48, 64\), expected uint8 \(H, W, 3\)",
+        ),
+        ("out.mp4", [picture(0).astype(float)], 24.0, "got a frame of float64"),
+        ("out.mp4", [picture(0), picture(1)[1:]], 24.0, r"\(47, 64, 3\), expected uint8 \(48, 64, 3\)"),
+        ("out.txt", [picture(0)], 24.0, "out.txt: OpenCV cannot write this file"),
+        ("missing/out.mp4", [picture(0)], 24.0, "no such folder"),
+    ],
+)
+def test_refuses_to_write(
+    tmp_path: Path, name: str, frames: list[np.ndarray], fps: float, message: str
+) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        write_video(tmp_path / name, frames, fps)
+    assert list(tmp_path.iterdir()) == []
