@@ -1,7 +1,7 @@
-"""Weight files: read what others publish without running what they pickled, and load it completely or not at all.
+"""Weight files: read what others publish without running it, and load it completely or not at all.
 
-A ``.pth`` file is a pickle, that is, a program. It is read here by an unpickler that knows how to build tensors
-and nothing else, so a published file is safe to open whoever made it.
+A ``.pth`` file is a pickle, that is, a program. It is read here by an unpickler that knows how to build
+tensors and nothing else, so a published file is safe to open whoever made it.
 """
 
 import functools
@@ -10,7 +10,6 @@ import io
 import os
 import pickle
 import re
-import zipfile
 from collections import OrderedDict
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from tensorsim.errors import TensorsimError
 
 PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
 
-# OpenMMLab and torch hub publish `...-HASH8.pth` or `...-HASH8_DATE.pth`, HASH8 the head of the file's SHA-256.
+# Published files are called `...-HASH8.pth` or `...-HASH8_DATE.pth`, HASH8 the head of their SHA-256.
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8})(?:_\d{8})?$")
 _DATE = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 
@@ -44,7 +43,7 @@ _LOG_BUILTINS = ("getattr", "set", "frozenset", "slice", "range", "complex", "by
 
 
 class _Placeholder:
-    """Stands for an object that is not part of the weights: accepts whatever a pickle does to it, does nothing."""
+    """Stands for an object beside the weights: accepts whatever a pickle does to it and does nothing."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
@@ -79,25 +78,24 @@ class _TensorUnpickler(pickle.Unpickler):
         package = module.partition(".")[0]
         if package in _LOG_PACKAGES or (module in ("builtins", "__builtin__") and name in _LOG_BUILTINS):
             return type(name, (_Placeholder,), {})
-        raise TensorsimError(
-            f"it refers to {module}.{name}, which is code and not weights; nothing of it was run"
-        )
+        raise TensorsimError(f"it refers to {module}.{name}, which is code and not weights; it was not run")
 
 
 def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     """Read the tensors of a weight file, on the CPU.
 
     Args:
-        path: ``.pth``, ``.pt`` or ``.bin`` (torch's zip format or its older one; a bare state dict or a container
-            with a ``state_dict``), or ``.safetensors``. If the name ends in eight hexadecimal digits as published
-            files do (``-HASH8.pth``, ``-HASH8_DATE.pth``), they must begin the file's SHA-256.
+        path: ``.pth``, ``.pt`` or ``.bin`` (torch's zip format or its older one; a bare state dict or a
+            container with a ``state_dict``), or ``.safetensors``. If the name ends in eight hexadecimal
+            digits as published files do (``-HASH8.pth``, ``-HASH8_DATE.pth``), the file's SHA-256 must
+            begin with them.
 
     Returns:
         Tensors by name, without the ``data_preprocessor.*`` entries that OpenMMLab stores beside the weights.
 
     Raises:
-        TensorsimError: no such file, another suffix, a wrong hash, a damaged file, a pickle that asks for anything
-            but tensors (it is not run), or a file without tensors.
+        TensorsimError: no such file, another suffix, a wrong hash, a damaged file, a pickle that asks for
+            anything but tensors (it is not run), or a file without tensors.
     """
     path = Path(path)
     if path.suffix not in (*PICKLE_SUFFIXES, ".safetensors"):
@@ -113,9 +111,7 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
     if not isinstance(content, dict):
-        raise TensorsimError(
-            f"{path}: got a {type(content).__name__}, expected a state dict (tensors by name)"
-        )
+        raise TensorsimError(f"{path}: got a {type(content).__name__}, expected a dict of tensors by name")
     tensors: dict[str, Tensor] = {}
     for key, value in content.items():
         if not isinstance(key, str) or not isinstance(value, Tensor):
@@ -132,8 +128,8 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | os.PathLike[str]) -> None:
     """Copy weights into a module, or refuse and leave it as it was.
 
-    Every key and shape must match. A tensor that a module lists under several names (a shared convolution) may come
-    under one of them, as safetensors stores it, or under all with equal values.
+    Every key and shape must match. A tensor that a module lists under several names (a shared convolution)
+    may come under one of them, as safetensors stores it, or under all with equal values.
 
     Args:
         module: receives the weights.
@@ -213,10 +209,10 @@ def _read_pickle(path: Path, data: bytes) -> Any:
         load=lambda file, **options: _TensorUnpickler(file, **options).load(),
     )
     try:
-        if zipfile.is_zipfile(io.BytesIO(data)):
-            # torch.load would hand a TorchScript archive, which is a program too, to torch.jit.load.
-            names = zipfile.ZipFile(io.BytesIO(data)).namelist()
-            if any(name.endswith("/constants.pkl") for name in names):
+        # torch.load would hand a TorchScript archive, which is a program too, to torch.jit.load.
+        if data.startswith(b"PK\x03\x04"):
+            records = torch._C.PyTorchFileReader(io.BytesIO(data)).get_all_records()
+            if "constants.pkl" in records:
                 raise TensorsimError("it is a TorchScript program, expected a file of weights")
         return torch.load(io.BytesIO(data), map_location="cpu", pickle_module=reader, weights_only=False)
     except TensorsimError as error:
