@@ -56,17 +56,18 @@ class Lifted(NamedTuple):
     """3D poses found for 2D joints, one per frame.
 
     Attributes:
-        depth: (..., T, 14) body heights along the line of sight from the middle of the hips, positive = further away.
-        scale: (..., T) pixels that the standing body height would take at the person's distance, whatever the pose.
-        keypoints: (..., T, 14, 2) pixels, the found pose placed in the image: stands in for joints that are not seen.
-        index: (..., T) int64 of the best match, ``pose * yaws + heading``.
-        distance: (..., T) its weighted squared error, relative to the spread of the joints; 0 is a perfect fit.
+        depth: (..., T, 14) body heights along the line of sight from the middle of the hips, positive =
+            further away.
+        scale: (..., T) pixels that the standing body would be high at its distance, whatever its pose.
+        keypoints: (..., T, 14, 2) pixels, the found pose placed in the image: stands in for hidden joints.
+        nearest: (..., T) int64 of the best match, ``pose * yaws + heading``.
+        distance: (..., T) its weighted squared error over the spread of the joints; 0 is a perfect fit.
     """
 
     depth: Tensor
     scale: Tensor
     keypoints: Tensor
-    index: Tensor
+    nearest: Tensor
     distance: Tensor
 
 

@@ -1,1 +1,23 @@
-"""Stages."""
+"""Frames -> metric 3D joints at video rate."""
+
+from tensorsim.vision.hrnet import HRNet
+from tensorsim.vision.kalman import KalmanSmoother
+from tensorsim.vision.lifter import NearestPoseLifter
+from tensorsim.vision.metric_pose import MetricPose
+from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.rtmdet import RTMDet
+from tensorsim.vision.skeleton import coco_to_body
+from tensorsim.vision.topdown import TopDownPose
+from tensorsim.vision.tracker import GNNTracker
+
+__all__ = [
+    "GNNTracker",
+    "HRNet",
+    "KalmanSmoother",
+    "MetricPose",
+    "NearestPoseLifter",
+    "OnnxHeatmaps",
+    "RTMDet",
+    "TopDownPose",
+    "coco_to_body",
+]

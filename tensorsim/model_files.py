@@ -1,0 +1,36 @@
+"""Where the shipped weights and pools lie."""
+
+from pathlib import Path
+
+from tensorsim.errors import TensorsimError
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def models_dir() -> Path:
+    """The folder of shipped models: inside an installed package, or beside it in a checkout.
+
+    Raises:
+        TensorsimError: neither holds a ``manifest.json``.
+    """
+    folders = (_PACKAGE / "_models", _PACKAGE.parent / "models")
+    for folder in folders:
+        if (folder / "manifest.json").is_file():
+            return folder
+    raise TensorsimError(
+        f"shipped models: no manifest.json in {folders[0]} nor in {folders[1]}; reinstall tensorsim"
+    )
+
+
+def model_path(file: str) -> Path:
+    """Path of a shipped file by its name, such as ``"pose_library_small.safetensors"``.
+
+    Raises:
+        TensorsimError: no such file; the message lists what there is.
+    """
+    folder = models_dir()
+    path = folder / file
+    if not path.is_file():
+        there = ", ".join(sorted(p.name for p in folder.glob("*.safetensors"))) or "none"
+        raise TensorsimError(f"shipped model: got {file!r}, expected one of: {there}")
+    return path

@@ -1,0 +1,104 @@
+"""Filters along the time of tracks: filling gaps, smoothing with outliers, a running low quantile."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def nearest_valid(valid: Tensor) -> Tensor:
+    """For every frame the index of the nearest valid one, itself if valid: (..., T) bool -> (..., T) int64.
+
+    Without any valid frame every frame is its own.
+    """
+    frames = valid.shape[-1]
+    time = torch.arange(frames, device=valid.device).expand(valid.shape)
+    before = torch.where(valid, time, torch.full_like(time, -frames)).cummax(dim=-1)[0]
+    after = torch.where(valid, time, torch.full_like(time, 2 * frames)).flip(-1).cummin(dim=-1)[0].flip(-1)
+    nearest = torch.where(time - before <= after - time, before, after)
+    return torch.where(valid.any(dim=-1, keepdim=True), nearest, time)
+
+
+def fill_gaps(x: Tensor, valid: Tensor) -> Tensor:
+    """Values (..., T) where ``valid`` (..., T), elsewhere those of the nearest valid frame."""
+    return x.gather(-1, nearest_valid(valid))
+
+
+def local_linear(x: Tensor, weights: Tensor, sigma: float) -> Tensor:
+    """Local linear regression along time with a Gaussian kernel (Fan and Gijbels, 1996, section 3.1).
+
+    Reproduces straight lines exactly, up to the ends, whatever the weights. The kernel is cut at 4 sigma;
+    where it sees no weight at all, the result is the value itself.
+
+    Args:
+        x: (..., T) values.
+        weights: (..., T) >= 0.
+        sigma: standard deviation of the kernel in frames.
+
+    Returns:
+        (..., T). Differentiable.
+    """
+    frames = x.shape[-1]
+    radius = min(int(4.0 * sigma) + 1, frames - 1)
+    offset = torch.arange(-radius, radius + 1, dtype=x.dtype, device=x.device)
+    kernel = torch.exp(-0.5 * (offset / sigma).square())
+    moments = torch.stack([kernel, kernel * offset, kernel * offset.square()])[:, None]
+    flat, w = x.reshape(-1, 1, frames), weights.reshape(-1, 1, frames)
+    s = F.conv1d(w, moments, padding=radius)
+    t = F.conv1d(w * flat, moments[:2], padding=radius)
+    total = s[:, 0].clamp(min=1e-12)
+    where, mean = s[:, 1] / total, t[:, 0] / total  # centres of gravity in time and value
+    spread = s[:, 2] / total - where.square()
+    # Ridge: a kernel that sees one frame only has no slope.
+    slope = (t[:, 1] / total - where * mean) / (spread.clamp(min=0.0) + 1e-6 * sigma**2)
+    return torch.where(s[:, 0] > 1e-12, mean - slope * where, flat[:, 0]).reshape(x.shape)
+
+
+def masked_median(x: Tensor, valid: Tensor) -> Tensor:
+    """Median (lower) of the valid values along the last dimension, kept with size one; 0 without any."""
+    ordered = torch.where(valid, x, torch.full_like(x, float("inf"))).sort(dim=-1)[0]
+    middle = ((valid.sum(dim=-1, keepdim=True) - 1) // 2).clamp(min=0)
+    return torch.where(
+        valid.any(dim=-1, keepdim=True), ordered.gather(-1, middle), torch.zeros_like(x[..., :1])
+    )
+
+
+def robust_smooth(x: Tensor, valid: Tensor, sigma: float, rounds: int = 3) -> Tensor:
+    """Local linear smoothing that outliers do not bend (lowess: Cleveland, 1979, with bisquare weights).
+
+    Args:
+        x: (..., T) values; those of invalid frames do not matter but must be finite.
+        valid: (..., T) bool.
+        sigma: standard deviation of the kernel in frames.
+        rounds: how often residuals are weighed anew.
+
+    Returns:
+        (..., T), continued over invalid frames. Differentiable.
+    """
+    x = fill_gaps(x, valid)
+    # A filled gap weighs next to nothing, but is there to be smoothed where a gap is longer than the kernel.
+    base = valid.to(x.dtype) + 1e-4
+    smooth = local_linear(x, base, sigma)
+    for _ in range(rounds):
+        residual = (x - smooth).abs()
+        spread = 6.0 * masked_median(residual.detach(), valid)
+        bisquare = (1.0 - (residual / spread.clamp(min=1e-9)).clamp(max=1.0).square()).square()
+        smooth = local_linear(x, base * (bisquare + 1e-4), sigma)
+    return smooth
+
+
+def running_quantile(x: Tensor, window: int, quantile: float) -> Tensor:
+    """Low (or any) quantile of a centred window of frames; the window is cut short at the ends.
+
+    Args:
+        x: (..., T) values.
+        window: frames, made odd.
+        quantile: 0 is the running minimum, 1 the maximum.
+
+    Returns:
+        (..., T). Differentiable where it takes a value.
+    """
+    half = min(window // 2, x.shape[-1] - 1)
+    padded = F.pad(x, [half, half], value=float("inf"))
+    inside = F.pad(torch.ones_like(x), [half, half]).unfold(-1, 2 * half + 1, 1).sum(dim=-1)
+    rank = (quantile * (inside - 1.0)).round().long()
+    return padded.unfold(-1, 2 * half + 1, 1).sort(dim=-1)[0].gather(-1, rank[..., None])[..., 0]

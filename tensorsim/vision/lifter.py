@@ -1,0 +1,249 @@
+"""Nearest-match lifting: 3D poses for 2D joints, from a pool of 3D poses projected along depth.
+
+Every pose of the pool is projected along depth and compared with the joints in the image after both are
+centred and brought to unit scale, as the paper does; here with a weight per joint, so that hidden joints do
+not count.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+    check_size,
+    is_exporting,
+)
+from tensorsim.types import Lifted
+from tensorsim.vision.along_time import nearest_valid
+from tensorsim.vision.pose_library import all_headings, load_pose_library, standardise_poses, turn
+
+
+def normalise_weights(weights: Tensor) -> Tensor:
+    """Weights (..., J) summing to one over the joints; all zero stays all zero."""
+    return weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+
+
+def nearest_poses(
+    keypoints: Tensor, weights: Tensor, library: Tensor, yaws: int, neighbours: int, chunk: int
+) -> Tensor:
+    """Exact search for the library poses whose projections fit best.
+
+    A pose p fits key points k with scale a > 0 and translation b by ``min sum_j w_j |k_j - a p_j - b|^2``,
+    which is ``Skk - Skp^2 / Spp`` with weighted, centred sums; poses that only fit mirrored (Skp <= 0) do not
+    count. With equal weights the order is that of the distances between centred poses of unit norm. Every sum
+    is a matrix product, evaluated ``chunk`` frame-pose pairs at a time with a running top k, which bounds the
+    memory to about 24 bytes a pair.
+
+    Args:
+        keypoints: (N, 14, 2) pixels, v down.
+        weights: (N, 14), not negative.
+        library: (L, 14, 3) standardised poses.
+        yaws: headings at which each is tried.
+        neighbours: how many to return.
+        chunk: frame-pose pairs evaluated at once.
+
+    Returns:
+        (N, neighbours) int64 indices into ``all_headings(library, yaws)``, best first. Not differentiable.
+    """
+    frames = 256
+    step = max(chunk // (frames * yaws), 1)
+    w = normalise_weights(weights)
+    centred = (keypoints - (w[..., None] * keypoints).sum(dim=-2, keepdim=True)) * w[..., None]
+    # Unit norm of the key points keeps float32 in range; it does not change the order.
+    centred = centred / (centred.square().sum(dim=(-2, -1), keepdim=True) + 1e-12).sqrt()
+    flat = torch.cat([centred[..., 0], centred[..., 1]], dim=-1)
+
+    best_gain = torch.full(
+        (keypoints.shape[0], neighbours), -1.0, dtype=keypoints.dtype, device=keypoints.device
+    )
+    best = torch.zeros((keypoints.shape[0], neighbours), dtype=torch.int64, device=keypoints.device)
+    for start in range(0, library.shape[0], step):
+        poses = all_headings(library[start : start + step].to(keypoints.dtype), yaws)
+        x, v = poses[..., 0].t(), -poses[..., 2].t()
+        xv, square = torch.cat([x, v]), x.square() + v.square()
+        count = min(neighbours, poses.shape[0])
+        for row in range(0, keypoints.shape[0], frames):
+            part = w[row : row + frames]
+            cross = torch.mm(flat[row : row + frames], xv).clamp_(min=0.0)
+            spread = (
+                torch.mm(part, square).sub_(torch.mm(part, x).square_()).sub_(torch.mm(part, v).square_())
+            )
+            gain, index = cross.square_().div_(spread.clamp_(min=1e-6)).topk(count, dim=-1)
+            gain = torch.cat([best_gain[row : row + frames], gain], dim=-1)
+            index = torch.cat([best[row : row + frames], index + start * yaws], dim=-1)
+            gain, keep = gain.topk(neighbours, dim=-1)
+            best_gain[row : row + frames] = gain
+            best[row : row + frames] = index.gather(-1, keep)
+    return best
+
+
+def fit_poses(keypoints: Tensor, weights: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Scale and translation that place poses in the image, and how well they then fit.
+
+    Args:
+        keypoints: (..., 14, 2) pixels.
+        weights: (..., 14), not negative.
+        poses: (..., 14, 3) body heights; leading dimensions broadcast.
+
+    Returns:
+        scale (...) pixels per body height, the placed joints (..., 14, 2) pixels, and the distance (...): the
+        weighted squared error over that of the best single point, 0 for a perfect fit, 1 for none.
+    """
+    w = normalise_weights(weights)[..., None]
+    projected = torch.stack([poses[..., 0], -poses[..., 2]], dim=-1)
+    centre, middle = (w * keypoints).sum(dim=-2, keepdim=True), (w * projected).sum(dim=-2, keepdim=True)
+    k, p = keypoints - centre, projected - middle
+    kk, pp = (w * k.square()).sum(dim=(-2, -1)), (w * p.square()).sum(dim=(-2, -1)).clamp(min=1e-6)
+    scale = (w * k * p).sum(dim=(-2, -1)).clamp(min=0.0) / pp
+    placed = centre + scale[..., None, None] * p
+    distance = (w * (keypoints - placed).square()).sum(dim=(-2, -1)) / kk.clamp(min=1e-12)
+    return scale, placed, distance
+
+
+def smooth_assignment(emission: Tensor, transition: Tensor) -> Tensor:
+    """Posterior of a hidden Markov chain over candidates (forward-backward in logarithms).
+
+    Args:
+        emission: (S, T, K) log-likelihood of candidate k in frame t.
+        transition: (S, T - 1, K, K) log-likelihood of going from candidate i in frame t to j in t + 1.
+
+    Returns:
+        (S, T, K) probabilities, summing to one over K (Rabiner, "A tutorial on hidden Markov models", 1989).
+        Differentiable.
+    """
+    forward = [emission[:, 0]]
+    backward = [torch.zeros_like(emission[:, 0])]
+    frames = emission.shape[1]
+    for t in range(frames - 1):
+        forward.append(
+            torch.logsumexp(forward[-1][:, :, None] + transition[:, t], dim=1) + emission[:, t + 1]
+        )
+        later = frames - 2 - t
+        onward = (backward[-1] + emission[:, later + 1])[:, None, :]
+        backward.append(torch.logsumexp(transition[:, later] + onward, dim=2))
+    backward.reverse()
+    return torch.softmax(torch.stack(forward, dim=1) + torch.stack(backward, dim=1), dim=-1)
+
+
+class NearestPoseLifter(nn.Module):
+    """3D poses for the joints of tracked people, from the nearest poses of a pool.
+
+    Each frame takes the ``neighbours`` best matches of :func:`nearest_poses`, weighted by how well they fit
+    and, with ``temporal`` > 0, by how well they agree with those of the frames before and after
+    (:func:`smooth_assignment`), so that depths do not flip between frames that look alike. ``neighbours=1``
+    is the paper's nearest match.
+
+    Args:
+        library: (L, 14, 3) poses in any unit of length (x right, y away, z up); None is the shipped pool.
+        yaws: headings at which each pose of the pool is tried; 1 for a pool that has all headings already.
+        neighbours: candidates per frame.
+        tolerance: relative error (square root of ``distance``) at which a candidate loses its weight.
+        temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
+            body heights; 0 treats frames alone.
+        chunk: frame-pose pairs compared at once, which bounds the memory: about 24 bytes a pair.
+
+    Shape:
+        joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
+        :class:`tensorsim.types.Lifted`. A frame with fewer than two weighted joints takes the nearest other
+        frame. Differentiable by joints and weights through the fit and the shares of the candidates; the
+        search that finds the candidates is not.
+
+    Raises:
+        TensorsimError: other shapes, NaN, negative weights, or no frames.
+    """
+
+    library: Tensor
+
+    def __init__(
+        self,
+        library: Tensor | None = None,
+        yaws: int = 24,
+        neighbours: int = 32,
+        tolerance: float = 0.05,
+        temporal: float = 1.0,
+        chunk: int = 2**22,
+    ) -> None:
+        super().__init__()
+        poses = load_pose_library() if library is None else standardise_poses(library)
+        for name, value in (("yaws", yaws), ("neighbours", neighbours), ("chunk", chunk)):
+            if value < 1:
+                raise TensorsimError(f"NearestPoseLifter.{name}: got {value}, expected at least 1")
+        if neighbours > poses.shape[0] * yaws:
+            raise TensorsimError(
+                f"NearestPoseLifter.neighbours: got {neighbours}, expected at most "
+                f"{poses.shape[0] * yaws}, the library's {poses.shape[0]} poses at {yaws} headings"
+            )
+        check_positive(tolerance, "NearestPoseLifter.tolerance")
+        if not 0 <= temporal < float("inf"):
+            raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
+        self.yaws, self.neighbours, self.tolerance = yaws, neighbours, tolerance
+        self.temporal, self.chunk = temporal, chunk
+        self.change = 0.03  # body heights per frame: a limb that moves at 1.6 m/s, 30 frames a second
+        self.register_buffer("library", poses, persistent=False)
+
+    def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
+        """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
+        layout = "(..., T, 14, 2) joints in pixels"
+        check_floating(keypoints, "keypoints")
+        check_min_rank(keypoints, 3, "keypoints", layout)
+        check_size(keypoints, -2, 14, "keypoints", layout)
+        check_size(keypoints, -1, 2, "keypoints", layout)
+        if weights.shape != keypoints.shape[:-1]:
+            raise TensorsimError(
+                f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
+            )
+        if keypoints.shape[-3] < 1:
+            raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
+        check_finite(keypoints, "keypoints")
+        check_finite(weights, "weights")
+        if not is_exporting() and bool((weights < 0).any()):
+            raise TensorsimError("weights: got negative values, expected weights >= 0")
+        shape, frames = keypoints.shape, keypoints.shape[-3]
+        tracks = keypoints[..., 0, 0, 0].numel()
+        keypoints, weights = keypoints.reshape(tracks, frames, 14, 2), weights.reshape(tracks, frames, 14)
+        source = nearest_valid((weights > 0).sum(dim=-1) >= 2)
+        keypoints = keypoints.gather(1, source[..., None, None].expand_as(keypoints))
+        weights = weights.gather(1, source[..., None].expand_as(weights)).to(keypoints.dtype)
+
+        with torch.no_grad():
+            index = nearest_poses(
+                keypoints.flatten(0, 1),
+                weights.flatten(0, 1),
+                self.library,
+                self.yaws,
+                self.neighbours,
+                self.chunk,
+            ).reshape(tracks, frames, self.neighbours)
+        base = self.library[torch.div(index, self.yaws, rounding_mode="floor")].to(keypoints.dtype)
+        poses = turn(base, (index % self.yaws).to(keypoints.dtype) * (2 * math.pi / self.yaws))
+        scale, placed, distance = fit_poses(keypoints[:, :, None], weights[:, :, None], poses)
+
+        share = self._share(poses, scale, distance)
+        return Lifted(
+            depth=(share[..., None] * poses[..., 1]).sum(dim=2).reshape(shape[:-1]),
+            scale=(share * scale).sum(dim=2).reshape(shape[:-2]),
+            keypoints=(share[..., None, None] * placed).sum(dim=2).reshape(shape),
+            nearest=index[..., 0].reshape(shape[:-2]),
+            distance=distance[..., 0].reshape(shape[:-2]),
+        )
+
+    def _share(self, poses: Tensor, scale: Tensor, distance: Tensor) -> Tensor:
+        """Weight of each candidate, (S, T, K) summing to one."""
+        emission = -0.5 / self.tolerance**2 * distance
+        if self.temporal == 0.0 or self.neighbours == 1:
+            return torch.softmax(emission, dim=-1)
+        # What changes from frame to frame: the pose (rms over joints) and the logarithm of the size.
+        size = scale.clamp(min=1e-6).log()[..., None]
+        state = torch.cat([poses.flatten(-2) / math.sqrt(14.0), size], dim=-1)
+        # |a - b|^2 by a matrix product keeps its digits only if a and b are small.
+        middle = state[:, :-1].mean(dim=2, keepdim=True)
+        a, b = state[:, :-1] - middle, state[:, 1:] - middle
+        product = torch.matmul(a, b.transpose(-1, -2))
+        change = a.square().sum(dim=-1)[..., None] + b.square().sum(dim=-1)[:, :, None, :] - 2.0 * product
+        return smooth_assignment(emission, -0.5 * self.temporal / self.change**2 * change.clamp(min=0.0))

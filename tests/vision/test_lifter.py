@@ -1,0 +1,340 @@
+"""Nearest-match lifting, against brute force in NumPy, closed-form fits and real motion."""
+
+import itertools
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import JOINTS
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.body import BodyPose, forward_kinematics, mirror
+from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.types import Lifted
+from tensorsim.vision.along_time import nearest_valid
+from tensorsim.vision.lifter import NearestPoseLifter, fit_poses, nearest_poses, smooth_assignment
+from tensorsim.vision.pose_library import (
+    all_headings,
+    body_height,
+    load_pose_library,
+    mid_hip,
+    standardise_poses,
+)
+from tests.stage import StageTester
+
+LIBRARY = sample_poses(60, seed=1)
+
+
+def projected(poses: Tensor, scale: float = 170.0) -> Tensor:
+    """Poses (..., 14, 3) seen along y, in pixels with v down."""
+    return scale * torch.stack([poses[..., 0], -poses[..., 2]], dim=-1) + 200.0
+
+
+class TestNearestPoseLifter(StageTester):
+    batched_arguments = (0, 1)
+    gradient_arguments = (0, 1)
+
+    def make(self) -> nn.Module:
+        return NearestPoseLifter(LIBRARY, yaws=6, neighbours=5)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        generator = torch.Generator().manual_seed(0)
+        poses = sample_poses(20, seed=2)[torch.randint(0, 20, (*batch, 6), generator=generator)]
+        keypoints = projected(poses) + 4 * torch.randn(*batch, 6, 14, 2, generator=generator, dtype=dtype)
+        weights = 0.2 + 0.8 * torch.rand(*batch, 6, 14, generator=generator, dtype=dtype)
+        if dtype == torch.float32:
+            weights[..., 2, :] = 0.0  # not where differences are taken: weights below 0 are refused
+        return keypoints.to(dtype), weights
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        k, w = torch.zeros(4, 14, 2), torch.ones(4, 14)
+        return [
+            ((torch.zeros(4, 17, 2), torch.ones(4, 17)), r"expected \(\.\.\., T, 14, 2\)"),
+            ((torch.zeros(14, 2), torch.ones(14)), r"expected \(\.\.\., T, 14, 2\)"),
+            ((torch.zeros(4, 14, 3), w), r"expected \(\.\.\., T, 14, 2\)"),
+            ((k, torch.ones(4, 13)), r"weights: got shape \[4, 13\], expected \[4, 14\]"),
+            ((k * float("nan"), w), "keypoints: got NaN"),
+            ((k, w * float("nan")), "weights: got NaN"),
+            ((k, -w), "weights: got negative"),
+            ((k[:0], w[:0]), "at least 1 frame"),
+            ((k.long(), w), "dtype"),
+        ]
+
+    def test_scripted_refuses_bad_input(self) -> None:
+        scripted = torch.jit.script(self.make())
+        with pytest.raises(Exception, match="weights: got negative"):
+            scripted(torch.zeros(4, 14, 2), -torch.ones(4, 14))
+
+    def test_no_people_give_nothing(self) -> None:
+        lifted = self.make()(torch.zeros(2, 0, 5, 14, 2), torch.zeros(2, 0, 5, 14))
+        assert lifted.depth.shape == (2, 0, 5, 14)
+        assert lifted.scale.shape == (2, 0, 5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"library": torch.zeros(0, 14, 3)}, "library"),
+        ({"library": LIBRARY, "yaws": 0}, "yaws: got 0"),
+        ({"library": LIBRARY, "neighbours": 0}, "neighbours: got 0"),
+        ({"library": LIBRARY, "yaws": 1, "neighbours": 61}, "neighbours: got 61, expected at most 60"),
+        ({"library": LIBRARY, "tolerance": 0.0}, "tolerance"),
+        ({"library": LIBRARY, "temporal": -1.0}, "temporal"),
+        ({"library": LIBRARY, "chunk": 0}, "chunk"),
+    ],
+)
+def test_refuses_bad_settings(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        NearestPoseLifter(**options)
+
+
+# ---- the search ----------------------------------------------------------------------------------------
+
+
+def brute_force(keypoints: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """The paper in NumPy: project along depth, centre, unit scale, Euclidean distance. (frames, poses)."""
+
+    def normalised(x: np.ndarray) -> np.ndarray:
+        x = x - x.mean(axis=1, keepdims=True)
+        return (x / np.linalg.norm(x, axis=(1, 2), keepdims=True)).reshape(len(x), -1)
+
+    k, p = normalised(keypoints), normalised(np.stack([poses[..., 0], -poses[..., 2]], axis=-1))
+    return np.linalg.norm(k[:, None] - p[None], axis=-1)
+
+
+@pytest.mark.parametrize("chunk", [1, 1000, 2**22])
+def test_equal_weights_give_the_nearest_neighbour_of_normalised_poses(chunk: int) -> None:
+    library = standardise_poses(sample_poses(300, seed=4))
+    keypoints = projected(sample_poses(40, seed=5)) + 5 * torch.randn(40, 14, 2, dtype=torch.float64)
+    index = nearest_poses(keypoints, torch.ones(40, 14, dtype=torch.float64), library, 8, 3, chunk)
+    distance = brute_force(keypoints.numpy(), all_headings(library, 8).numpy())
+    assert np.array_equal(index.numpy(), np.argsort(distance, axis=1)[:, :3])
+
+
+def test_weights_count_exactly_as_in_weighted_least_squares() -> None:
+    library = standardise_poses(sample_poses(100, seed=4))
+    generator = torch.Generator().manual_seed(3)
+    keypoints = projected(sample_poses(13, seed=6)) + 5 * torch.randn(
+        13, 14, 2, generator=generator, dtype=torch.float64
+    )
+    weights = torch.rand(13, 14, generator=generator, dtype=torch.float64)
+    weights[:, 4:7] = 0.0  # hidden, and wherever they are must not matter
+    index = nearest_poses(keypoints, weights, library, 4, 1, 5000)[:, 0]
+    elsewhere = keypoints.clone()
+    elsewhere[:, 4:7] = 1e4
+    assert torch.equal(nearest_poses(elsewhere, weights, library, 4, 1, 5000)[:, 0], index)
+
+    poses = all_headings(library, 4).numpy()
+    for frame in range(13):
+        errors = []
+        root = np.sqrt(np.repeat(weights[frame].numpy(), 2))
+        for pose in poses:
+            p = np.stack([pose[:, 0], -pose[:, 2]], axis=-1)
+            a = np.stack([p.ravel(), np.tile([1.0, 0.0], 14), np.tile([0.0, 1.0], 14)], axis=1)
+            b = keypoints[frame].numpy().ravel()
+            solution = np.linalg.lstsq(root[:, None] * a, root * b, rcond=None)[0]
+            errors.append(np.sum((root * (b - a @ solution)) ** 2) if solution[0] > 0 else np.inf)
+        assert int(np.argmin(errors)) == int(index[frame])
+
+
+def test_a_pose_that_fits_only_upside_down_is_no_match() -> None:
+    library = standardise_poses(sample_poses(400, seed=8))
+    upside_down = projected(library[:1]) * -1.0
+    index = nearest_poses(upside_down, torch.ones(1, 14, dtype=torch.float64), library, 1, 1, 1000)
+    scale, _, distance = fit_poses(upside_down, torch.ones(1, 14, dtype=torch.float64), library[:1])
+    assert int(index) != 0
+    assert float(scale) == 0.0
+    assert float(distance) == pytest.approx(1.0)
+
+
+def test_fit_is_the_closed_form_similarity() -> None:
+    pose = standardise_poses(sample_poses(13, seed=8))
+    shifted = 120.0 * torch.stack([pose[..., 0], -pose[..., 2]], dim=-1) + torch.tensor([30.0, -70.0])
+    weights = torch.rand(13, 14, dtype=torch.float64)
+    scale, placed, distance = fit_poses(shifted, weights, pose)
+    torch.testing.assert_close(scale, torch.full((13,), 120.0, dtype=torch.float64))
+    torch.testing.assert_close(placed, shifted)
+    assert float(distance.max()) < 1e-12
+
+
+@pytest.mark.slow
+def test_a_large_library_is_searched_in_bounded_memory() -> None:
+    library = torch.randn(1_877_420, 14, 3) * 0.2
+    keypoints, weights = torch.randn(120, 14, 2), torch.rand(120, 14)
+
+    def largest(chunk: int) -> int:
+        with torch.profiler.profile(profile_memory=True) as profile:
+            nearest_poses(keypoints, weights, library[:60_000], 1, 8, chunk)
+        held = peak = 0
+        for event in profile.profiler.kineto_results.events():
+            if event.name() == "[memory]":
+                held += event.nbytes()
+                peak = max(peak, held)
+        return peak
+
+    assert largest(2**20) < 24 * 2**20 + 32 * 2**20
+    index = nearest_poses(keypoints, weights, library, 1, 1, 2**22)[:, 0]
+    assert index.shape == (120,)
+    rows = torch.arange(0, len(library), 97)  # spot check: nothing in a sample is better
+    best = fit_poses(keypoints, weights, library[index])[2]
+    for frame in range(0, 120, 40):
+        others = fit_poses(keypoints[frame], weights[frame], library[rows])[2]
+        assert float(best[frame]) <= float(others.min()) + 1e-6
+
+
+# ---- conventions ---------------------------------------------------------------------------------------
+
+
+def test_depth_is_positive_away_from_the_camera_in_body_heights() -> None:
+    pose = BodyPose.standing()
+    hip = pose.hip.clone()
+    hip[0, 0] = math.pi / 4  # the right leg goes forward; the body faces +y, away from the camera
+    pose = pose._replace(hip=hip)
+    library = torch.cat([forward_kinematics(pose, 1.75)[None], 1.75 * LIBRARY])
+    image = projected(forward_kinematics(pose)[None])
+    lifted = NearestPoseLifter(library, yaws=1, neighbours=1)(image, torch.ones(1, 14, dtype=torch.float64))
+    assert int(lifted.nearest) == 0
+    expected = forward_kinematics(pose)[None, :, 1]
+    torch.testing.assert_close(lifted.depth, expected, atol=1e-9, rtol=0)
+    assert float(lifted.depth[0, JOINTS.index("right_ankle")]) > 0.2
+
+
+def test_scale_is_pixels_per_standing_body_height_in_any_pose() -> None:
+    folded = sample_poses(200, seed=1)
+    lifter = NearestPoseLifter(folded, yaws=4, neighbours=1)
+    lifted = lifter(projected(folded, 300.0), torch.ones(200, 14, dtype=torch.float64))
+    own = lifted.nearest // 4 == torch.arange(200)
+    assert float(own.double().mean()) > 0.95
+    torch.testing.assert_close(
+        lifted.scale[own], torch.full_like(lifted.scale[own], 300.0), rtol=1e-6, atol=0
+    )
+
+
+def test_index_counts_headings_within_poses() -> None:
+    library = standardise_poses(sample_poses(30, seed=9))
+    turned = all_headings(library, 5)
+    lifted = NearestPoseLifter(library, yaws=5, neighbours=1)(
+        projected(turned[[17 * 5 + 3]]), torch.ones(1, 14, dtype=torch.float64)
+    )
+    assert int(lifted.nearest) == 17 * 5 + 3
+
+
+def test_hidden_joints_get_a_place_from_the_found_pose() -> None:
+    image = projected(LIBRARY)
+    weights = torch.ones(60, 14, dtype=torch.float64)
+    weights[:, JOINTS.index("left_wrist")] = 0.0
+    garbled = image.clone()
+    garbled[:, JOINTS.index("left_wrist")] = 0.0
+    lifted = NearestPoseLifter(LIBRARY, yaws=1, neighbours=1)(garbled, weights)
+    own = lifted.nearest == torch.arange(60)
+    assert float(own.double().mean()) > 0.9
+    torch.testing.assert_close(lifted.keypoints[own], image[own], atol=1e-6, rtol=0)
+
+
+# ---- neighbours and time -------------------------------------------------------------------------------
+
+
+def test_posterior_is_that_of_all_paths() -> None:
+    generator = torch.Generator().manual_seed(1)
+    emission = torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
+    transition = torch.randn(2, 3, 3, 3, generator=generator, dtype=torch.float64)
+    expected = torch.zeros(2, 4, 3, dtype=torch.float64)
+    for s in range(2):
+        for path in itertools.product(range(3), repeat=4):
+            log = sum(emission[s, t, k] for t, k in enumerate(path))
+            log = log + sum(transition[s, t, path[t], path[t + 1]] for t in range(3))
+            for t, k in enumerate(path):
+                expected[s, t, k] += torch.exp(log)
+    expected /= expected.sum(dim=-1, keepdim=True)
+    torch.testing.assert_close(smooth_assignment(emission, transition), expected)
+
+
+def test_one_frame_and_no_temporal_weight_are_the_same() -> None:
+    image = projected(sample_poses(20, seed=3))[:1]
+    weights = torch.ones(1, 14, dtype=torch.float64)
+    with_time = NearestPoseLifter(LIBRARY, neighbours=7)(image, weights)
+    without = NearestPoseLifter(LIBRARY, neighbours=7, temporal=0.0)(image, weights)
+    torch.testing.assert_close(with_time.depth, without.depth)
+
+
+def test_temporal_weight_keeps_depths_from_flipping() -> None:
+    """A straight leg seen from the front swings forward or backward: the picture hardly says which."""
+    swing = 0.5 * torch.sin(torch.linspace(0, 6, 60, dtype=torch.float64))
+    hip = torch.zeros(60, 2, 2, dtype=torch.float64)
+    hip[:, 0, 0] = swing
+    true = forward_kinematics(BodyPose.standing((60,))._replace(hip=hip))
+    ambiguous = torch.cat([true, true * torch.tensor([1.0, -1.0, 1.0])])  # every pose and its depth mirror
+    image = projected(true)
+    image = image + 1.0 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0)).double()
+    weights = torch.ones(60, 14, dtype=torch.float64)
+
+    def jumps(**options: Any) -> float:
+        depth = NearestPoseLifter(ambiguous, yaws=1, **options)(image, weights).depth
+        return float((depth[1:] - depth[:-1]).abs().amax(dim=-1).mean())
+
+    nearest, smooth = jumps(neighbours=1), jumps(neighbours=24)
+    assert nearest > 0.05  # body heights: it does flip
+    assert smooth < 0.3 * nearest
+
+
+def test_frames_without_joints_take_their_neighbours() -> None:
+    image = projected(sample_poses(20, seed=3))[:6]
+    weights = torch.ones(6, 14, dtype=torch.float64)
+    weights[2:4] = 0.0
+    lifted = NearestPoseLifter(LIBRARY, neighbours=1)(image, weights)
+    assert torch.equal(lifted.nearest[2], lifted.nearest[1])
+    assert torch.equal(lifted.nearest[3], lifted.nearest[4])
+    for field in NearestPoseLifter(LIBRARY)(image, 0 * weights):
+        assert bool(torch.isfinite(field.double()).all())
+
+
+def test_nearest_valid_frame() -> None:
+    valid = torch.tensor([[0, 1, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0, 0]]) > 0
+    expected = [[1, 1, 1, 1, 5, 5, 5], [0, 1, 2, 3, 4, 5, 6]]
+    assert nearest_valid(valid).tolist() == expected
+
+
+# ---- real motion ---------------------------------------------------------------------------------------
+
+
+def film(joints: Tensor, yaw: float, noise_px: float) -> tuple[Tensor, Tensor]:
+    """Key points of a body of 1.75 m that stays 4 m in front of a pinhole camera, and its relative depths."""
+    body = 1.75 * (joints - mid_hip(joints)[:, None]) / body_height(joints).mean()
+    c, s = math.cos(yaw), math.sin(yaw)
+    x = c * body[..., 0] - s * body[..., 1]
+    y = s * body[..., 0] + c * body[..., 1]
+    image = 685.7 * torch.stack([x, -body[..., 2]], dim=-1) / (4.0 + y)[..., None]  # 300 px for 1.75 m
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=image.dtype)
+    return image + noise_px * noise, y
+
+
+def errors(lifted: Lifted, depth: Tensor) -> tuple[float, float]:
+    """Mean error of depth and of its change from frame to frame, in cm."""
+    wrong = 175 * lifted.depth - 100 * depth
+    return float(wrong.abs().mean()), float((wrong[1:] - wrong[:-1]).abs().mean())
+
+
+@pytest.mark.parametrize("pool", ["other clips", "shipped"])
+def test_lifts_motion_capture_that_it_has_not_seen(shared_data: Path, pool: str) -> None:
+    clips = np.load(shared_data / "mocap" / "cmu_14joints_120hz.npz")
+    thirty = {name: torch.tensor(clips[name][::4]) for name in clips.files}
+    totals = np.zeros((2, 2))
+    tried = ("walking_1", "running_3", "soccer_1")
+    for name in tried:
+        if pool == "shipped":
+            library = load_pose_library()
+        else:
+            library = torch.cat([standardise_poses(clip)[::3] for n, clip in thirty.items() if n != name])
+            library = torch.cat([library, mirror(library)])
+        image, depth = film(thirty[name][:90], yaw=2.5, noise_px=2.0)
+        for row, options in enumerate(({"neighbours": 1}, {})):
+            lifted = NearestPoseLifter(library, **options)(image, torch.ones(image.shape[:2]))
+            totals[row] += np.array(errors(lifted, depth)) / len(tried)
+    nearest, default = totals
+    assert default[0] < (9.0 if pool == "other clips" else 13.0)
+    assert default[0] < nearest[0]
+    assert default[1] < 0.6 * nearest[1]
