@@ -1,6 +1,47 @@
-"""tensorsim: what a radar would have seen of the people in a video."""
+"""tensorsim: what a radar would have seen of the people in a video.
 
-from tensorsim.config import ACTIVITIES, COCO_KEYPOINTS, JOINT_RCS_M2, JOINTS, CameraConfig, RadarConfig, WallConfig
+One graph of ``nn.Module`` stages on batched tensors: video -> people -> 2D joints -> 3D joints -> smooth motion ->
+FMCW echo -> range-time -> Doppler-time -> ridges. ``VideoToDoppler`` is the whole; ``vision``, ``motion``, ``radar``
+and ``enhance`` hold the stages.
+"""
+
+from tensorsim import enhance, export, motion, radar, vision
+from tensorsim.config import (
+    ACTIVITIES,
+    COCO_KEYPOINTS,
+    JOINT_RCS_M2,
+    JOINTS,
+    CameraConfig,
+    RadarConfig,
+    WallConfig,
+)
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.pipeline import PoseToDoppler, VideoToDoppler, VideoToPose
+from tensorsim.types import Detections, Pose, RadarMaps, Simulation, Tracks
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "ACTIVITIES",
+    "COCO_KEYPOINTS",
+    "JOINTS",
+    "JOINT_RCS_M2",
+    "CameraConfig",
+    "Detections",
+    "Pose",
+    "PoseToDoppler",
+    "RadarConfig",
+    "RadarMaps",
+    "Simulation",
+    "TensorsimError",
+    "TensorsimWarning",
+    "Tracks",
+    "VideoToDoppler",
+    "VideoToPose",
+    "WallConfig",
+    "enhance",
+    "export",
+    "motion",
+    "radar",
+    "vision",
+]

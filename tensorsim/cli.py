@@ -41,7 +41,7 @@ class Simulate:
     detector: Path | None = None
     """Person detector: RTMDet as .pth, .safetensors or .onnx. Default: $TENSORSIM_DETECTOR."""
     pose: Path | None = None
-    """COCO-17 heat-map network: HRNet as .pth or .safetensors, or any such network as .onnx. Default: $TENSORSIM_POSE."""
+    """COCO-17 heat maps: HRNet as .pth or .safetensors, or any such network as .onnx. Default: $TENSORSIM_POSE."""
     scene: Literal["free-space", "through-wall"] = "free-space"
     """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath."""
     person_height: tuple[float, ...] = (1.80, 1.70)
@@ -112,7 +112,7 @@ class Simulate:
                 maps = run.maps_of_pose(maps_stage, pose, reader.fps, device, self.quiet)
                 run.write_maps(folder, maps, run.axes_of(maps_stage, maps))
                 run.write_pose(folder, pose, reader.fps)
-                run.write_overlay(folder, reader, pose, people.metric_pose.keypoint_threshold, self.quiet)
+                run.write_overlay(folder, reader, pose, people.keypoint_threshold, self.quiet)
                 config = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
                 config |= {"detector": str(detector_path), "pose": str(pose_path)}
                 snr_db = float(maps.snr_db)
@@ -147,7 +147,10 @@ class Check:
 
 
 def _check_numbers(options: Simulate) -> None:
-    for name, values in (("person-height", options.person_height), ("initial-distance", options.initial_distance)):
+    for name, values in (
+        ("person-height", options.person_height),
+        ("initial-distance", options.initial_distance),
+    ):
         if values is not None and (len(values) == 0 or not all(math.isfinite(v) and v > 0 for v in values)):
             raise TensorsimError(f"--{name}: got {values}, expected positive numbers of metres")
     if not 0 < options.camera_fov < 180:
@@ -162,7 +165,9 @@ def _network_path(path: Path | None, role: str, variable: str) -> Path:
     if path is None and os.environ.get(variable):
         path = Path(os.environ[variable])
     if path is None:
-        raise TensorsimError(f"--{role}: got no weights, expected a path here or in ${variable} (none are shipped yet)")
+        raise TensorsimError(
+            f"--{role}: got no weights, expected a path here or in ${variable} (none are shipped yet)"
+        )
     if not path.is_file():
         raise TensorsimError(f"--{role}: {path} is not a file")
     return path

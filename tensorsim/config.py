@@ -80,7 +80,9 @@ def _require_positive(owner: str, **values: float) -> None:
 def _require_vector(owner: str, **values: Vector) -> None:
     for name, value in values.items():
         if len(value) != 3 or not all(math.isfinite(v) for v in value):
-            raise TensorsimError(f"{owner}.{name}: got {value}, expected three finite numbers (x, y, z) in metres")
+            raise TensorsimError(
+                f"{owner}.{name}: got {value}, expected three finite numbers (x, y, z) in metres"
+            )
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,9 @@ class RadarConfig:
         _require_vector("RadarConfig", tx_m=self.tx_m, rx_m=self.rx_m)
         for name in ("antenna_gain_dbi", "isolation_db"):
             if not math.isfinite(getattr(self, name)):
-                raise TensorsimError(f"RadarConfig.{name}: got {getattr(self, name)}, expected a finite number of dB")
+                raise TensorsimError(
+                    f"RadarConfig.{name}: got {getattr(self, name)}, expected a finite number of dB"
+                )
         if self.samples_per_chirp < 2:
             raise TensorsimError(
                 f"RadarConfig: {self.sample_rate_hz} Hz over a chirp of {self.chirp_s} s gives "
@@ -196,7 +200,9 @@ class WallConfig:
                 f"WallConfig.relative_permittivity: got {self.relative_permittivity}, expected a finite number >= 1"
             )
         if not (math.isfinite(self.loss_tangent) and self.loss_tangent >= 0):
-            raise TensorsimError(f"WallConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0")
+            raise TensorsimError(
+                f"WallConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0"
+            )
 
     @property
     def refractive_index(self) -> complex:
@@ -237,4 +243,6 @@ class CameraConfig:
         _require_vector("CameraConfig", position_m=self.position_m)
         for name in ("pitch_rad", "yaw_rad"):
             if not math.isfinite(getattr(self, name)):
-                raise TensorsimError(f"CameraConfig.{name}: got {getattr(self, name)}, expected finite radians")
+                raise TensorsimError(
+                    f"CameraConfig.{name}: got {getattr(self, name)}, expected finite radians"
+                )

@@ -17,12 +17,16 @@ from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import Detections, Pose, RadarMaps, Simulation, Tracks
+from tensorsim.vision.along_time import brief_gaps
 from tensorsim.vision.kalman import KalmanSmoother
 from tensorsim.vision.lifter import NearestPoseLifter
 from tensorsim.vision.metric_pose import MetricPose
 from tensorsim.vision.skeleton import coco_to_body
 from tensorsim.vision.topdown import TopDownPose
 from tensorsim.vision.tracker import GNNTracker
+
+#: Joints hidden for less than this coast.
+BRIEF_S = 0.25
 
 
 class VideoToPose(nn.Module):
@@ -37,6 +41,7 @@ class VideoToPose(nn.Module):
         person_height_m: body heights in metres by person (order of appearance); the last one serves the rest.
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
         camera: where the camera stands and its focal length.
+        keypoint_threshold: score from which a keypoint counts as seen.
         detection_interval: run the detector on every n-th frame (panel: 2).
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages.
@@ -52,6 +57,7 @@ class VideoToPose(nn.Module):
         person_height_m: tuple[float, ...] = (1.80, 1.70),
         initial_distance_m: tuple[float, ...] | None = None,
         camera: CameraConfig | None = None,
+        keypoint_threshold: float = 0.3,
         detection_interval: int = 2,
         frames_per_batch: int = 8,
         tracker: nn.Module | None = None,
@@ -60,7 +66,10 @@ class VideoToPose(nn.Module):
         smoother: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        for name, value in (("detection_interval", detection_interval), ("frames_per_batch", frames_per_batch)):
+        for name, value in (
+            ("detection_interval", detection_interval),
+            ("frames_per_batch", frames_per_batch),
+        ):
             if value < 1:
                 raise TensorsimError(f"{name}: got {value}, expected at least 1")
         self.detector = detector
@@ -70,9 +79,10 @@ class VideoToPose(nn.Module):
         self.metric_pose = (
             metric_pose
             if metric_pose is not None
-            else MetricPose(camera, person_height_m=person_height_m, initial_distance_m=initial_distance_m)
+            else MetricPose(camera, person_height_m, initial_distance_m, keypoint_threshold)
         )
         self.smoother = smoother if smoother is not None else KalmanSmoother()
+        self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
         self.frames_per_batch = frames_per_batch
 
@@ -92,7 +102,9 @@ class VideoToPose(nn.Module):
         check_positive(fps, "fps")
         b, t, height, width = video.shape[0], video.shape[1], video.shape[3], video.shape[4]
         if b == 0 or t < 2:
-            raise TensorsimError(f"video: got shape {list(video.shape)}, expected at least 1 clip of at least 2 frames")
+            raise TensorsimError(
+                f"video: got shape {list(video.shape)}, expected at least 1 clip of at least 2 frames"
+            )
         present = self.frames_present(b, t, lengths, video.device)
         observed = self.observed_frames(present)
 
@@ -161,9 +173,7 @@ class VideoToPose(nn.Module):
         tracks = self.tracker(whole, observed)
         # The last frame of a clip is observed, so what follows the last observed frame is padding.
         within = (observed.flip(-1).cumsum(-1).flip(-1) > 0).unsqueeze(1)
-        return Tracks(
-            tracks.boxes * within.unsqueeze(-1), tracks.valid & within, tracks.matched & within
-        )
+        return Tracks(tracks.boxes * within.unsqueeze(-1), tracks.valid & within, tracks.matched & within)
 
     def estimate(self, frames: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (n, P, 17, 2) and scores (n, P, 17) of boxes (n, P, 4) in frames (n, 3, H, W)."""
@@ -180,12 +190,16 @@ class VideoToPose(nn.Module):
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
-        body, body_scores = coco_to_body(keypoints, scores)
+        body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         # A network's score is the height of its heat map and may fall below zero; a weight may not.
         body_scores = body_scores.clamp(min=0.0) * tracks.valid.unsqueeze(-1)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, tracks.valid, height, width, fps)
-        joints = self.smoother(joints, seen, fps)
+        # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
+        # the pose that was found stands in for it, as long as the person is in the scene.
+        in_scene = tracks.valid.unsqueeze(-1).expand_as(seen)
+        coasting = brief_gaps(seen.transpose(-1, -2), int(BRIEF_S * fps)).transpose(-1, -2)
+        joints = self.smoother(joints, in_scene & ~coasting, fps)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid)
 
 

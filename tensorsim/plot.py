@@ -11,8 +11,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Bones of the 14-joint radar body and of COCO-17, as pairs of indices.
-BODY_BONES = ((0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (1, 8), (8, 9), (9, 10), (1, 11), (11, 12), (12, 13), (8, 11))
-COCO_BONES = ((0, 1), (0, 2), (1, 3), (2, 4), (5, 6), (5, 7), (7, 9), (6, 8), (8, 10), (5, 11), (6, 12), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16))  # fmt: skip
+# fmt: off
+BODY_BONES = (
+    (0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7),
+    (1, 8), (8, 9), (9, 10), (1, 11), (11, 12), (12, 13), (8, 11),
+)
+COCO_BONES = (
+    (0, 1), (0, 2), (1, 3), (2, 4), (5, 6), (5, 7), (7, 9), (6, 8), (8, 10),
+    (5, 11), (6, 12), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16),
+)
+# fmt: on
 #: One colour per person, RGB.
 PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (23, 190, 207))
 
@@ -58,6 +66,7 @@ def map_figure(
     axis_label: str,
     ridges: np.ndarray | None = None,
     speed_per_axis: float | None = None,
+    half_span: float | None = None,
     dynamic_range_db: float = DYNAMIC_RANGE_DB,
 ) -> Figure:
     """Draw a map (rows, columns) in dB below its peak.
@@ -68,6 +77,7 @@ def map_figure(
         axis: (R or F,) centre of each row in the units of ``axis_label``.
         ridges: (C, K) lines to draw over it in units of ``axis``; NaN is not drawn.
         speed_per_axis: m/s per unit of ``axis``, for a second scale on the right.
+        half_span: show rows from ``-half_span`` to ``half_span`` only.
         dynamic_range_db: what lies further below the peak has the colour of the floor.
     """
     figure = _figure()
@@ -91,12 +101,20 @@ def map_figure(
     )
     if ridges is not None:
         for i, ridge in enumerate(ridges):
-            axes.plot(time_s, ridge, ".", color="white", alpha=0.8 - 0.2 * i, markersize=2.0, label=f"ridge {i + 1}")
-        axes.set_ylim(float(axis[0]) - step / 2, float(axis[-1]) + step / 2)
+            axes.plot(
+                time_s, ridge, ".", color="white", alpha=0.8 - 0.2 * i, markersize=2.0, label=f"ridge {i + 1}"
+            )
         axes.legend(loc="upper right", fontsize="small", markerscale=3, labelcolor="white", framealpha=0.3)
+    low, high = float(axis[0]) - step / 2, float(axis[-1]) + step / 2
+    if half_span is not None:
+        low, high = max(low, -half_span), min(high, half_span)
+    axes.set_ylim(low, high)
     if speed_per_axis is not None:
         scale = speed_per_axis
-        right = axes.secondary_yaxis("right", functions=(lambda x: x * scale, lambda v: v / scale))
+        right = axes.secondary_yaxis(
+            "right",
+            functions=(lambda x: np.multiply(x, scale), lambda v: np.divide(v, scale)),  # type: ignore[arg-type]
+        )
         right.set_ylabel("radial speed in m/s, positive = approaching")
     axes.set_title(title)
     axes.set_xlabel("time in s")
@@ -124,14 +142,23 @@ def skeleton_figure(joints_m: np.ndarray, valid: np.ndarray, fps: float, poses: 
                 axes.plot(*zip(body[a], body[b], strict=True), color=colour, alpha=shade, linewidth=1.8)
             axes.text(*(body[0] + (0, 0, 0.15)), f"{frame / fps:.1f} s", color=colour, fontsize=7)
         track = joints_m[person, frames][:, (8, 11)].mean(axis=1)
-        axes.plot(track[:, 0], track[:, 1], 0 * track[:, 2], color=colour, linestyle=":", label=f"person {person + 1}")
+        axes.plot(
+            track[:, 0],
+            track[:, 1],
+            0 * track[:, 2],
+            color=colour,
+            linestyle=":",
+            label=f"person {person + 1}",
+        )
     axes.scatter([0], [0], [1.5], color="black", marker="^", s=50, label="radar")
     points = np.concatenate([*shown, np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 1.8]])])
     low, high = points.min(axis=0), points.max(axis=0)
     high[1:] = np.maximum(high[1:], (1.0, 2.0))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(0, high[2]))
     axes.set_box_aspect((high[0] - low[0], high[1] - low[1], high[2]))
-    axes.set(xlabel="x in m", ylabel="y (range) in m", zlabel="z in m", title="skeletons in the world of the radar")
+    axes.set(
+        xlabel="x in m", ylabel="y (range) in m", zlabel="z in m", title="skeletons in the world of the radar"
+    )
     axes.view_init(elev=20, azim=-60)
     axes.legend(loc="upper left")
     return figure
@@ -143,7 +170,12 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def draw_people(
-    image: np.ndarray, boxes: np.ndarray, keypoints: np.ndarray, scores: np.ndarray, valid: np.ndarray, threshold: float
+    image: np.ndarray,
+    boxes: np.ndarray,
+    keypoints: np.ndarray,
+    scores: np.ndarray,
+    valid: np.ndarray,
+    threshold: float,
 ) -> np.ndarray:
     """Draw boxes, ids and COCO skeletons of one frame.
 
@@ -166,7 +198,13 @@ def draw_people(
         x1, y1, x2, y2 = (round(float(v)) for v in boxes[person])
         cv2.rectangle(image, (x1, y1), (x2, y2), colour, stroke)
         cv2.putText(
-            image, f"{person + 1}", (x1, max(y1 - 4, 12)), cv2.FONT_HERSHEY_SIMPLEX, 0.35 * stroke + 0.2, colour, stroke
+            image,
+            f"{person + 1}",
+            (x1, max(y1 - 4, 12)),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.35 * stroke + 0.2,
+            colour,
+            stroke,
         )
         points = [(round(float(u)), round(float(v))) for u, v in keypoints[person]]
         for a, b in COCO_BONES:

@@ -50,7 +50,9 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
             bar.update(frames.shape[0])
         bar.total = count
     if count < 2:
-        raise TensorsimError(f"{reader.path}: got {count} frame, expected at least 2: motion needs two moments")
+        raise TensorsimError(
+            f"{reader.path}: got {count} frame, expected at least 2: motion needs two moments"
+        )
     if (count - 1) % interval:
         found.append(stage.detect(last.to(device)))
     whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
@@ -150,7 +152,9 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
     doppler_time = maps.doppler_time.numpy()
     ridges_hz = axes.doppler_hz[maps.ridges.numpy()]
     # In the picture a ridge ends where it is no more than noise at the floor of the colours.
-    strong = maps.ridge_magnitudes.numpy() > doppler_time.max(initial=0.0) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
+    strong = maps.ridge_magnitudes.numpy() > doppler_time.max(initial=0.0) * 10 ** (
+        -plot.DYNAMIC_RANGE_DB / 20
+    )
     np.savez(
         folder / "maps.npz",
         range_time=range_time,
@@ -172,6 +176,10 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
         plot.save_figure(
             plot.map_figure(magnitude, time_s, axes.range_m, title, "range in m"), folder / f"{name}.png"
         )
+    # Show the part of the Doppler axis that has something to show.
+    shown = np.abs(axes.doppler_hz)[
+        (plot.decibels(doppler_time, plot.DYNAMIC_RANGE_DB) > -plot.DYNAMIC_RANGE_DB).any(1)
+    ]
     plot.save_figure(
         plot.map_figure(
             doppler_time,
@@ -181,6 +189,7 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
             "Doppler in Hz, positive = approaching",
             ridges=np.where(strong, ridges_hz, np.nan),
             speed_per_axis=axes.speed_per_hz,
+            half_span=1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8)),
         ),
         folder / "doppler_time.png",
     )
@@ -201,7 +210,9 @@ def write_pose(folder: Path, pose: Pose, fps: float) -> None:
     plot.save_figure(plot.skeleton_figure(joints, valid, fps), folder / "skeleton.png")
 
 
-def write_overlay(folder: Path, reader: VideoReader, pose: Pose, threshold: float, quiet: bool = False) -> None:
+def write_overlay(
+    folder: Path, reader: VideoReader, pose: Pose, threshold: float, quiet: bool = False
+) -> None:
     """Write ``overlay.mp4``: the film with boxes, ids and skeletons."""
     boxes, keypoints = pose.boxes[0].numpy(), pose.keypoints[0].numpy()
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
@@ -212,7 +223,12 @@ def write_overlay(folder: Path, reader: VideoReader, pose: Pose, threshold: floa
             for frames in reader.chunks(8):
                 for frame in frames.permute(0, 2, 3, 1).numpy():
                     yield plot.draw_people(
-                        frame, boxes[:, index], keypoints[:, index], scores[:, index], valid[:, index], threshold
+                        frame,
+                        boxes[:, index],
+                        keypoints[:, index],
+                        scores[:, index],
+                        valid[:, index],
+                        threshold,
                     )
                     index += 1
                     bar.update(1)
@@ -260,4 +276,3 @@ def collected_warnings() -> Iterator[list[str]]:
         warnings.simplefilter("always", TensorsimWarning)
         warnings.showwarning = collect
         yield messages
-

@@ -9,7 +9,17 @@ import torch
 
 from tensorsim.config import RadarConfig
 
-_LIBRARIES = ("torch", "torchaudio", "kornia", "cv2", "onnx", "onnxruntime", "scipy", "safetensors", "matplotlib")
+_LIBRARIES = (
+    "torch",
+    "torchaudio",
+    "kornia",
+    "cv2",
+    "onnx",
+    "onnxruntime",
+    "scipy",
+    "safetensors",
+    "matplotlib",
+)
 
 
 def _libraries() -> str:
@@ -37,7 +47,9 @@ def _radar_chain() -> str:
 
     radar = RadarConfig.free_space()
     time_s = torch.arange(2048, dtype=torch.float64) / radar.prf_hz
-    position = torch.stack((0 * time_s, 3.0 - 2.0 * time_s, torch.full_like(time_s, 1.5)), dim=-1).unsqueeze(1)
+    position = torch.stack((0 * time_s, 3.0 - 2.0 * time_s, torch.full_like(time_s, 1.5)), dim=-1).unsqueeze(
+        1
+    )
     simulator = RadarSimulator(radar)
     maps = simulator(position, torch.ones(1, dtype=torch.float64))
     spectrum = maps.doppler_time.mean(dim=-1)

@@ -137,7 +137,9 @@ class StageTester:
             outputs = tensors_of(module(*inputs))
             return tuple(o for o in outputs if o.requires_grad)
 
-        assert torch.autograd.gradcheck(function, tuple(args), fast_mode=True, atol=self.gradient_atol, rtol=1e-3)
+        assert torch.autograd.gradcheck(
+            function, tuple(args), fast_mode=True, atol=self.gradient_atol, rtol=1e-3
+        )
 
     def test_exports(self) -> None:
         if not self.exports:

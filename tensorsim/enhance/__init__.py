@@ -1,1 +1,5 @@
-"""Stages."""
+"""Map -> cleaner map."""
+
+from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
+
+__all__ = ["DnCNN", "MapDenoiser"]

@@ -23,6 +23,16 @@ def fill_gaps(x: Tensor, valid: Tensor) -> Tensor:
     return x.gather(-1, nearest_valid(valid))
 
 
+def brief_gaps(seen: Tensor, longest: int) -> Tensor:
+    """Gaps (..., T) in ``seen`` (..., T) bool of at most ``longest`` frames, with seen frames on both sides."""
+    frames = seen.shape[-1]
+    time = torch.arange(frames, device=seen.device).expand(seen.shape)
+    never = torch.full_like(time, -frames)
+    before = torch.where(seen, time, never).cummax(dim=-1)[0]
+    after = torch.where(seen, time, -2 * never).flip(-1).cummin(dim=-1)[0].flip(-1)
+    return ~seen & (after - before - 1 <= longest) & (before >= 0) & (after < frames)
+
+
 def local_linear(x: Tensor, weights: Tensor, sigma: float) -> Tensor:
     """Local linear regression along time with a Gaussian kernel (Fan and Gijbels, 1996, section 3.1).
 

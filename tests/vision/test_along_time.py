@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tensorsim.vision.along_time import (
+    brief_gaps,
     fill_gaps,
     local_linear,
     masked_median,
@@ -68,3 +69,12 @@ def test_median_and_gaps_look_at_valid_frames_only() -> None:
     valid = torch.tensor([[False, True, True, False, True], [False] * 5])
     assert masked_median(x, valid).tolist() == [[2.0], [0.0]]
     assert fill_gaps(x, valid)[0].tolist() == [1.0, 1.0, 2.0, 2.0, 3.0]
+
+
+def test_brief_gaps_lie_between_seen_frames() -> None:
+    rows = ("..x.x...x..x.", ".............", "xxxxxxxxxxxxx")
+    brief = ("...b.....bb..", ".............", ".............")
+    seen = torch.tensor([[c == "x" for c in row] for row in rows])
+    expected = torch.tensor([[c == "b" for c in row] for row in brief])
+    assert torch.equal(brief_gaps(seen, 2), expected)
+    assert not brief_gaps(seen, 0).any()

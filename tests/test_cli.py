@@ -1,0 +1,179 @@
+"""The command line on a film: files, contents, repeatable noise, nothing half-written."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import tensorsim as ts
+from tensorsim import cli, run
+from tensorsim.data.video import VideoReader
+from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tests.film import RectangleDetector, StandingPose, film, walker
+from tests.stage import assert_same
+
+FPS = 10.0
+FILES = {
+    "maps.npz",
+    "pose.npz",
+    "summary.json",
+    "range_time.png",
+    "range_time_mti.png",
+    "doppler_time.png",
+    "skeleton.png",
+    "overlay.mp4",
+}
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A losslessly written film of somebody who walks away."""
+    path = tmp_path_factory.mktemp("film") / "walk.avi"
+    frames = film(*walker(25, FPS, 4.0, 1.2, 0.3)).permute(0, 2, 3, 1).numpy()
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter_fourcc(*"FFV1"), FPS, (frames.shape[2], frames.shape[1])
+    )
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def stand_ins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """Use the stand-in networks of tests/film.py behind the command line."""
+    weights = tmp_path / "w.onnx"
+    weights.write_text("")
+
+    def people(options: cli.Simulate, *_: Path) -> VideoToPose:
+        return VideoToPose(RectangleDetector(), StandingPose(), person_height_m=options.person_height)
+
+    monkeypatch.setattr(cli, "_video_to_pose", people)
+    return ["--detector", str(weights), "--pose", str(weights), "--scene", "through-wall", "--quiet"]
+
+
+def test_streaming_equals_the_graph(walk: Path) -> None:
+    reader = VideoReader(walk)
+    stage = VideoToPose(RectangleDetector(), StandingPose(), frames_per_batch=3)
+    whole = torch.cat(list(reader.chunks(100)))
+    with torch.no_grad():
+        streamed = run.pose_of_film(stage, reader, torch.device("cpu"), quiet=True)
+        assert_same(streamed, stage(whole.unsqueeze(0), reader.fps), atol=1e-5)
+        smoother = ts.motion.SavitzkyGolay(33, 3)
+        for options in (
+            {},
+            {"resampler": ts.motion.PoseResampler(128.0, "linear"), "pulse_smoother": smoother},
+        ):
+            radar = ts.radar.RadarSimulator(ts.RadarConfig.through_wall(), snr_db=None)
+            maps_stage = PoseToDoppler(radar, **options)  # type: ignore[arg-type]
+            maps = run.maps_of_pose(maps_stage, streamed, reader.fps, torch.device("cpu"), quiet=True)
+            expected = maps_stage(streamed.joints, streamed.valid, reader.fps)
+            assert_same(maps, [f[0] for f in expected], atol=1e-5)
+
+
+def test_simulate_writes_everything(
+    walk: Path, tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "out"
+    cli.main(["simulate", str(walk), "--out", str(out), "--person-height", "1.75", *stand_ins])
+    assert {p.name for p in out.iterdir()} == FILES
+    assert "1 people in 25 frames" in capsys.readouterr().out
+    maps, pose = np.load(out / "maps.npz"), np.load(out / "pose.npz")
+    assert maps["range_time"].shape == (200, 320)
+    assert maps["range_time_mti"].shape == (200, 319)
+    assert maps["doppler_time"].shape == (len(maps["doppler_hz"]), len(maps["time_s"]))
+    assert maps["ridges_hz"].shape == (3, len(maps["time_s"]))
+    assert np.all(np.diff(maps["doppler_hz"]) > 0)
+    assert maps["range_m"][1] == pytest.approx(ts.RadarConfig.through_wall().range_resolution_m)
+    line_m = maps["range_m"][maps["range_time"].argmax(axis=0)]
+    assert line_m[-1] - line_m[0] > 2.0, "walks away"
+    assert pose["joints_m"].shape == (1, 25, 14, 3)
+    assert pose["keypoints_px"].shape == (1, 25, 17, 2)
+    assert pose["keypoint_scores"].shape == (1, 25, 17)
+    assert pose["boxes_px"].shape == (1, 25, 4)
+    assert pose["valid"].shape == (1, 25)
+    assert float(pose["fps"]) == FPS
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["people"][0]["mean_approach_m_s"] == pytest.approx(-1.2, abs=0.15)
+    assert summary["realised_snr_db"] == pytest.approx(50, abs=0.5)
+    assert summary["seed"] == 0
+    overlay = VideoReader(out / "overlay.mp4")
+    assert (overlay.width, overlay.height) == (320, 240)
+    assert sum(chunk.shape[0] for chunk in overlay.chunks(8)) == 25
+
+
+def test_the_seed_repeats_the_noise(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
+    maps = []
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        cli.main(
+            ["simulate", str(walk), "--out", str(tmp_path / name), "--snr", "5", "--seed", seed, *stand_ins]
+        )
+        maps.append(np.load(tmp_path / name / "maps.npz")["doppler_time"])
+    assert np.array_equal(maps[0], maps[1])
+    assert not np.array_equal(maps[0], maps[2])
+
+
+@pytest.mark.parametrize("moment", ["pose_of_film", "maps_of_pose", "write_overlay"])
+def test_an_interrupt_leaves_nothing_half_written(
+    walk: Path,
+    tmp_path: Path,
+    stand_ins: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    moment: str,
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, moment, interrupt)
+    out = tmp_path / "results" / "out"
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["simulate", str(walk), "--out", str(out), *stand_ins])
+    assert exit_.value.code == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert not any(p.is_file() for p in (tmp_path / "results").rglob("*"))
+    assert not out.exists()
+
+
+def test_nobody_in_the_film_is_said(
+    tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "dark.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), FPS, (64, 48))
+    for _ in range(10):
+        writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    cli.main(["simulate", str(path), "--out", str(tmp_path / "out"), *stand_ins])
+    assert "no person found" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["people"] == []
+    assert any("no person found" in w for w in summary["warnings"])
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+
+
+def test_help_shows_examples() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tensorsim.cli", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "tensorsim simulate clip.mp4 --out out/ --scene through-wall" in done.stdout
+
+
+def test_check_passes_here(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["check"])
+    out = capsys.readouterr().out
+    assert "WRONG" not in out
+    assert "shows at 2.0" in out
+
+
+def test_importing_tensorsim_is_light() -> None:
+    code = (
+        "import sys, tensorsim; heavy = {'torchaudio', 'matplotlib', 'onnxruntime', 'onnx', 'cv2', 'scipy'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,74 @@
+"""Configurations: presets, derived numbers, refusals."""
+
+import dataclasses
+import math
+
+import pytest
+
+import tensorsim as ts
+
+
+def test_presets_are_the_panels() -> None:
+    free, wall = ts.RadarConfig.free_space(), ts.RadarConfig.through_wall()
+    assert free == ts.RadarConfig()
+    assert (free.carrier_hz, free.bandwidth_hz, free.prf_hz) == (77e9, 4e9, 8192)
+    assert (wall.carrier_hz, wall.bandwidth_hz, wall.prf_hz) == (2e9, 1e9, 128)
+    assert free.samples_per_chirp == 400
+    assert free.slope_hz_per_s == pytest.approx(1e14)
+    assert free.range_resolution_m == pytest.approx(0.0374741, abs=1e-6)
+    assert free.unambiguous_speed_m_s == pytest.approx(7.8, abs=0.05)
+    assert wall.unambiguous_speed_m_s == pytest.approx(3.8, abs=0.05)
+    assert ts.RadarConfig.through_wall(prf_hz=256.0).prf_hz == 256
+
+
+def test_refractive_index_of_a_lossy_wall() -> None:
+    n = ts.WallConfig().refractive_index
+    assert n.real == pytest.approx(2.4498, abs=1e-3)
+    assert n.imag < 0
+    assert (n**2).real == pytest.approx(6)
+    assert (n**2).imag == pytest.approx(-0.18)
+
+
+def test_configs_are_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        ts.RadarConfig().prf_hz = 1.0  # type: ignore[misc]
+
+
+def test_names() -> None:
+    assert len(ts.ACTIVITIES) == 12
+    assert ts.ACTIVITIES[0] == "S1 Empty"
+    assert ts.ACTIVITIES[-1] == "S12 Walking to Falling"
+    assert len(ts.JOINTS) == len(ts.JOINT_RCS_M2) == 14
+    assert [ts.JOINTS[i - 1] for i in (9, 12, 11, 14)] == [
+        "right_hip",
+        "left_hip",
+        "right_ankle",
+        "left_ankle",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ts.RadarConfig(carrier_hz=0), "carrier_hz: got 0"),
+        (lambda: ts.RadarConfig(bandwidth_hz=-1), "bandwidth_hz"),
+        (lambda: ts.RadarConfig(chirp_s=math.nan), "chirp_s: got nan"),
+        (lambda: ts.RadarConfig(prf_hz=math.inf), "prf_hz"),
+        (lambda: ts.RadarConfig(sample_rate_hz=1e3), "samples"),
+        (lambda: ts.RadarConfig(prf_hz=1e6), "does not fit the pulse interval"),
+        (lambda: ts.RadarConfig(tx_m=(0.0, 0.0)), "tx_m"),  # type: ignore[arg-type]
+        (lambda: ts.RadarConfig(rx_m=(0.0, math.nan, 0.0)), "rx_m"),
+        (lambda: ts.RadarConfig(antenna_gain_dbi=math.nan), "antenna_gain_dbi"),
+        (lambda: ts.WallConfig(size_m=(5, -0.1, 2.5)), "size_m"),
+        (lambda: ts.WallConfig(relative_permittivity=0.5), "relative_permittivity: got 0.5"),
+        (lambda: ts.WallConfig(loss_tangent=-1), "loss_tangent"),
+        (lambda: ts.WallConfig(center_m=(0, math.inf, 0)), "center_m"),
+        (lambda: ts.CameraConfig(focal_px=-5), "focal_px"),
+        (lambda: ts.CameraConfig(horizontal_fov_rad=60.0), "horizontal_fov_rad: got 60.0"),
+        (lambda: ts.CameraConfig(position_m=(math.nan, 0, 0)), "position_m"),
+        (lambda: ts.CameraConfig(pitch_rad=math.inf), "pitch_rad"),
+    ],
+)
+def test_refuses(make: object, message: str) -> None:
+    with pytest.raises(ts.TensorsimError, match=message):
+        make()  # type: ignore[operator]

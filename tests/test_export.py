@@ -1,0 +1,39 @@
+"""Export refuses edges, and leaves nothing half-written."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+import tensorsim as ts
+
+
+class Unscriptable(nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return globals()["torch"].sin(x)  # type: ignore[no-any-return]
+
+
+def test_writes_a_file_that_loads_and_keeps_the_mode(tmp_path: Path) -> None:
+    module = nn.Sequential(nn.Linear(3, 3), nn.Dropout()).train()
+    ts.export.to_torchscript(module, tmp_path / "m.pt")
+    assert module.training
+    loaded = torch.jit.load(tmp_path / "m.pt")
+    x = torch.randn(2, 3)
+    assert torch.equal(loaded(x), module.eval()(x)), "exported in evaluation mode"
+
+
+def test_leaves_nothing_behind_when_scripting_fails(tmp_path: Path) -> None:
+    (tmp_path / "m.pt").write_bytes(b"old")
+    with pytest.raises(Exception, match="globals"):
+        ts.export.to_torchscript(Unscriptable(), tmp_path / "m.pt")
+    assert [p.name for p in tmp_path.iterdir()] == ["m.pt"]
+    assert (tmp_path / "m.pt").read_bytes() == b"old"
+
+
+def test_an_onnx_network_is_an_edge_and_says_so(tmp_path: Path, shared_data: Path) -> None:
+    pose = ts.vision.OnnxHeatmaps(shared_data / "weights" / "simplepose_coco17_256x192.onnx")
+    sim = ts.VideoToDoppler(ts.vision.RTMDet("nano-person"), pose, radar=ts.RadarConfig.through_wall())
+    with pytest.raises(ts.TensorsimError, match="ONNX Runtime"):
+        ts.export.to_torchscript(sim, tmp_path / "sim.pt")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,235 @@
+"""The whole graph on a film whose truth is known, and scripted in a process that has no tensorsim."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import tensorsim as ts
+from tensorsim.pipeline import PoseToDoppler, VideoToDoppler, VideoToPose
+from tests.film import RectangleDetector, StandingPose, film, walker
+from tests.stage import assert_same
+
+FPS = 10.0
+RADAR = ts.RadarConfig.through_wall()  # 128 Hz: small maps
+
+
+def pipeline(**options: object) -> VideoToDoppler:
+    options = {"radar": RADAR, "snr_db": None, "person_height_m": (1.75,)} | options
+    return VideoToDoppler(RectangleDetector(), StandingPose(), **options).eval()  # type: ignore[arg-type]
+
+
+def two_clips() -> Tensor:
+    """One clip with one person, one with two: (2, 20, 3, H, W)."""
+    away, away_x = walker(20, FPS, 4.0, 1.2, -0.8)
+    near, near_x = walker(20, FPS, 7.0, -0.5, 1.2)
+    one = film(away, away_x)
+    two = film(torch.cat((away, near)), torch.cat((away_x, near_x)))
+    return torch.stack((one, two))
+
+
+def test_a_person_who_walks_away_is_where_they_are_and_recedes() -> None:
+    frames = 40
+    range_m, x_m = walker(frames, FPS, 4.0, 1.2, 0.5)
+    out = pipeline()(film(range_m, x_m).unsqueeze(0), FPS)
+    assert out.boxes.shape == (1, 1, frames, 4)
+    assert out.valid.all()
+    hips = out.joints[0, 0][:, [8, 11]].mean(dim=1)
+    assert torch.allclose(hips[:, 1], range_m[0], atol=0.35), "range"
+    assert torch.allclose(hips[:, 0], x_m[0], atol=0.1), "azimuth"
+    feet = out.joints[0, 0][:, [10, 13], 2]
+    assert feet.abs().max() < 0.15, "feet on the floor"
+    stage = pipeline()
+    doppler_hz = stage.pose_to_doppler.simulator.doppler.doppler_hz
+    middle = out.doppler_time[0][:, out.doppler_time.shape[-1] // 4 : -out.doppler_time.shape[-1] // 4]
+    peak_hz = float(doppler_hz[middle.square().mean(dim=-1).argmax()])
+    assert peak_hz == pytest.approx(-2 * 1.2 / RADAR.doppler_wavelength_m, abs=8.0), "receding is negative"
+
+
+def test_the_range_line_moves_with_the_person() -> None:
+    range_m, x_m = walker(40, FPS, 4.0, 1.2, 0.0)
+    out = pipeline()(film(range_m, x_m).unsqueeze(0), FPS)
+    line_m = out.range_time[0].argmax(dim=0) * RADAR.range_resolution_m
+    assert float(line_m[-1] - line_m[0]) == pytest.approx(1.2 * 3.9, abs=0.5)
+
+
+def test_two_people_are_one_scene() -> None:
+    out = pipeline()(two_clips()[1:], FPS)
+    assert out.boxes.shape[1] == 2
+    stage = pipeline()
+    maps = [
+        stage.pose_to_doppler(out.joints[:, p : p + 1], out.valid[:, p : p + 1], FPS).range_time
+        for p in range(2)
+    ]
+    lines = [m[0, :, 100].argmax() for m in maps]
+    assert abs(int(lines[0] - lines[1])) > 3
+    both = out.range_time[0, :, 100]
+    for own, line in zip(maps, lines, strict=True):
+        assert both[line] == pytest.approx(float(own[0, line, 100]), rel=0.35)
+
+
+def test_batch_equals_loop_with_people_padded() -> None:
+    stage, clips = pipeline(), two_clips()
+    both = stage(clips, FPS)
+    assert both.valid.shape == (2, 2, 20)
+    assert not both.valid[0, 1].any()
+    for i, people in enumerate((1, 2)):
+        single = stage(clips[i : i + 1], FPS)
+        assert single.boxes.shape[1] == people
+        assert_same([f[:, :people] for f in single[:5]], [f[i : i + 1, :people] for f in both[:5]], atol=1e-5)
+        assert_same(single[5:], [f[i : i + 1] for f in both[5:]], atol=1e-4)
+
+
+def test_padded_frames_do_not_count() -> None:
+    stage, clips = pipeline(), two_clips()
+    padded = clips.clone()
+    padded[0, 12:] = 255  # rubbish in the padding
+    out = stage(padded, FPS, torch.tensor([12, 20]))
+    alone = stage(clips[:1, :12], FPS)
+    assert not out.valid[0, :, 12:].any()
+    # Smoothing over time sees the held poses of the padding with a weight of next to nothing.
+    assert_same(out.joints[:1, :1, :12], alone.joints, atol=3e-3)
+    last = int((11 / FPS - 0.1) * RADAR.prf_hz)  # who leaves fades out over 0.1 s; a clip's end is no leaving
+    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.1)
+    assert float(out.range_time[0, :, -40:].abs().max()) < 1e-6 * float(out.range_time[0].max())
+    with pytest.raises(ts.TensorsimError, match="expected 2 counts from 1 to 20"):
+        stage(clips, FPS, torch.tensor([0, 20]))
+
+
+def test_a_clip_without_people_gives_the_empty_scene_and_says_so() -> None:
+    stage = pipeline(snr_db=30.0, leakage=True)
+    with pytest.warns(ts.TensorsimWarning, match="no person found in clip 0 of 1"):
+        out = stage(torch.zeros(1, 10, 3, 120, 160), FPS)
+    assert out.boxes.shape == (1, 0, 10, 4)
+    assert out.joints.shape == (1, 0, 10, 14, 3)
+    assert out.range_time.shape[-1] == 128
+    assert int(out.range_time[0].mean(dim=-1).argmax()) <= 1, "leakage"
+    assert torch.isfinite(out.doppler_time).all()
+    assert float(out.doppler_time.min()) > 0, "noise floor"
+
+
+def test_float_video_equals_uint8_video() -> None:
+    stage, clips = pipeline(), two_clips()[:1]
+    assert_same(stage(clips.float() / 255, FPS), stage(clips, FPS), atol=1e-4)
+
+
+def test_noise_repeats_with_the_seed() -> None:
+    stage, clips = pipeline(snr_db=10.0), two_clips()[:1]
+    outs = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        outs.append(stage(clips, FPS))
+    assert torch.equal(outs[0].range_time, outs[1].range_time)
+    assert not torch.equal(outs[0].range_time, outs[2].range_time)
+    assert float(outs[0].snr_db) == pytest.approx(10.0, abs=0.3)
+
+
+def test_gradients_flow_from_maps_to_joints() -> None:
+    stage = pipeline().pose_to_doppler.double()
+    t = torch.arange(12) / FPS
+    joints = torch.randn(1, 1, 1, 14, 3, dtype=torch.float64) * 0.2 + torch.tensor([0.0, 3.0, 1.0])
+    joints = (joints + torch.stack((0 * t, 0.3 * t, 0 * t), dim=-1)[:, None]).requires_grad_(True)
+    stage(joints, torch.ones(1, 1, 12, dtype=torch.bool), FPS).doppler_time.sum().backward()
+    assert joints.grad is not None
+    assert torch.isfinite(joints.grad).all()
+    assert bool((joints.grad != 0).any())
+
+
+@pytest.mark.parametrize(
+    ("video", "fps", "message"),
+    [
+        (torch.zeros(4, 3, 32, 32), 30.0, r"video: got shape \[4, 3, 32, 32\], expected \(B, T, 3, H, W\)"),
+        (torch.zeros(1, 4, 1, 32, 32), 30.0, r"expected \(B, T, 3, H, W\)"),
+        (torch.zeros(1, 1, 3, 32, 32), 30.0, "at least 2 frames"),
+        (torch.zeros(1, 0, 3, 32, 32), 30.0, "at least 2 frames"),
+        (torch.zeros(0, 4, 3, 32, 32), 30.0, "at least 1 clip"),
+        (torch.zeros(1, 4, 3, 32, 32), 0.0, "fps: got 0.0"),
+        (torch.zeros(1, 4, 3, 32, 32), float("nan"), "fps: got nan"),
+    ],
+)
+def test_refuses_bad_video(video: Tensor, fps: float, message: str) -> None:
+    with pytest.raises(ts.TensorsimError, match=message):
+        pipeline()(video, fps)
+
+
+def test_refuses_bad_intervals() -> None:
+    with pytest.raises(ts.TensorsimError, match="detection_interval: got 0"):
+        VideoToPose(RectangleDetector(), StandingPose(), detection_interval=0)
+
+
+# ---- TorchScript ---------------------------------------------------------------------------------------
+
+#: Runs where `import tensorsim` fails; loads the scripted graph and saves what it gives.
+LONELY = """
+import sys
+sys.modules["tensorsim"] = None
+import warnings; warnings.simplefilter("ignore")
+import torch
+graph, inputs, outputs = sys.argv[1:]
+arguments = torch.load(inputs)
+with torch.no_grad():
+    result = torch.jit.load(graph)(*arguments)
+torch.save(tuple(result), outputs)
+"""
+
+
+def run_without_tensorsim(graph: Path, arguments: tuple[object, ...], folder: Path) -> tuple[Tensor, ...]:
+    torch.save(arguments, folder / "in.pt")
+    command = [sys.executable, "-c", LONELY, str(graph), str(folder / "in.pt"), str(folder / "out.pt")]
+    subprocess.run(command, check=True, cwd=folder)
+    result: tuple[Tensor, ...] = torch.load(folder / "out.pt")
+    return result
+
+
+def test_scripted_graph_equals_eager_without_tensorsim(tmp_path: Path) -> None:
+    stage, clips = pipeline(multipath=True, wall=ts.WallConfig()), two_clips()
+    ts.export.to_torchscript(stage, tmp_path / "sim.pt")
+    assert [p.name for p in tmp_path.iterdir()] == ["sim.pt"]
+    for batch in (clips, clips[:1, :13]):  # other batch sizes, lengths and people counts
+        with torch.no_grad():
+            expected = stage(batch, FPS)
+        assert_same(run_without_tensorsim(tmp_path / "sim.pt", (batch, FPS), tmp_path), expected, atol=1e-4)
+
+
+def test_scripted_pose_to_doppler_with_every_option(tmp_path: Path) -> None:
+    simulator = ts.radar.RadarSimulator(
+        RADAR, wall=ts.WallConfig(), multipath=True, leakage=True, snr_db=None
+    )
+    stage = PoseToDoppler(
+        simulator,
+        resampler=ts.motion.PoseResampler(RADAR.prf_hz, method="linear"),
+        pulse_smoother=ts.motion.SavitzkyGolay(33, 3),
+        denoiser=ts.enhance.MapDenoiser(ts.enhance.DnCNN(depth=3, channels=4)),
+    ).eval()
+    ts.export.to_torchscript(stage, tmp_path / "maps.pt")
+    t = torch.arange(15) / FPS
+    joints = torch.randn(2, 1, 1, 14, 3) * 0.2 + torch.tensor([0.0, 3.0, 1.0])
+    joints = joints + torch.stack((0 * t, 0.4 * t, 0 * t), dim=-1)[:, None]
+    arguments = (joints, torch.ones(2, 1, 15, dtype=torch.bool), FPS)
+    with torch.no_grad():
+        expected = stage(*arguments)
+    assert_same(run_without_tensorsim(tmp_path / "maps.pt", arguments, tmp_path), expected, atol=1e-4)
+
+
+def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
+    from tensorsim.data.video import VideoReader
+
+    detector = ts.vision.RTMDet.from_pretrained(shared_data / "weights" / "rtmdet_nano_person.onnx")
+    network = ts.vision.HRNet(18).eval()
+    torch.nn.init.normal_(
+        network.final_layer.weight, std=0.3
+    )  # untrained: let some scores pass the threshold
+    stage = VideoToDoppler(detector, network, radar=RADAR, snr_db=None).eval()
+    ts.export.to_torchscript(stage, tmp_path / "sim.pt")
+    # Two people in one film and one person in another, at other lengths than each other.
+    for name, frames, size in (("hug_2people_28fps.mp4", 6, 1), ("walk_across_1person_30fps.mp4", 9, 1)):
+        reader = VideoReader(shared_data / "video" / name)
+        clip = next(iter(reader.chunks(frames))).unsqueeze(0).repeat(size, 1, 1, 1, 1)
+        with torch.no_grad():
+            expected = stage(clip, reader.fps)
+        result = run_without_tensorsim(tmp_path / "sim.pt", (clip, reader.fps), tmp_path)
+        assert_same(result, expected, atol=1e-4)
+        assert expected.valid.shape[1] >= 1

@@ -1,0 +1,60 @@
+"""What README says, works as it is written."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_python_without_files_runs() -> None:
+    (block,) = (b for b in blocks("python") if "torch.randn" in b)
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=True)
+    assert "torch.Size([4, 1024, " in done.stdout
+
+
+@pytest.mark.slow
+def test_commands_run_verbatim(tmp_path: Path, shared_data: Path) -> None:
+    import cv2
+
+    for name in ("rtmdet_nano_person.onnx", "simplepose_coco17_256x192.onnx"):
+        shutil.copy(shared_data / "weights" / name, tmp_path)
+    # Seven seconds, for the command that cuts out seconds 2 to 6.
+    reader = cv2.VideoCapture(str(shared_data / "video" / "juggle_kick_1person_24fps.mp4"))
+    writer = cv2.VideoWriter(str(tmp_path / "clip.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 24, (640, 360))
+    for _ in range(7 * 24):
+        writer.write(cv2.resize(reader.read()[1], (640, 360)))
+    writer.release()
+    environment = dict(
+        os.environ,
+        TENSORSIM_DETECTOR="rtmdet_nano_person.onnx",
+        TENSORSIM_POSE="simplepose_coco17_256x192.onnx",
+        PATH=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    )
+    commands = [
+        line.split("&&")[-1].strip()
+        for block in blocks("bash")
+        for line in block.splitlines()
+        if "tensorsim" in line and "git clone" not in line
+    ]
+    assert len(commands) >= 5
+    for command in commands:
+        subprocess.run(command, shell=True, check=True, cwd=tmp_path, env=environment)
+        if "simulate clip" in command:
+            assert len(list((tmp_path / "out").iterdir())) == 8
+            shutil.rmtree(tmp_path / "out")
+    block = blocks("python")[0] + "\nimport torch\nassert out.doppler_time.shape[0] == 1\n"
+    setup = (
+        "import torch\nfrom tensorsim.data.video import VideoReader\nreader = VideoReader('clip.mp4')\n"
+        "video, fps = next(reader.chunks(12)).unsqueeze(0), reader.fps\n"
+    )
+    subprocess.run([sys.executable, "-c", setup + block], check=True, cwd=tmp_path, env=environment)
