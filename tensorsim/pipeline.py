@@ -25,9 +25,6 @@ from tensorsim.vision.skeleton import coco_to_body
 from tensorsim.vision.topdown import TopDownPose
 from tensorsim.vision.tracker import GNNTracker
 
-#: Joints hidden for less than this coast.
-BRIEF_S = 0.25
-
 
 class VideoToPose(nn.Module):
     """Video -> people with metric 3D joints.
@@ -43,6 +40,7 @@ class VideoToPose(nn.Module):
         camera: where the camera stands and its focal length.
         keypoint_threshold: score from which a keypoint counts as seen.
         detection_interval: run the detector on every n-th frame (panel: 2).
+        brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages.
 
@@ -59,6 +57,7 @@ class VideoToPose(nn.Module):
         camera: CameraConfig | None = None,
         keypoint_threshold: float = 0.3,
         detection_interval: int = 2,
+        brief_gap_s: float = 0.25,
         frames_per_batch: int = 8,
         tracker: nn.Module | None = None,
         lifter: nn.Module | None = None,
@@ -84,6 +83,7 @@ class VideoToPose(nn.Module):
         self.smoother = smoother if smoother is not None else KalmanSmoother()
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
+        self.brief_gap_s = brief_gap_s
         self.frames_per_batch = frames_per_batch
 
     def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Pose:
@@ -191,14 +191,15 @@ class VideoToPose(nn.Module):
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
-        # A network's score is the height of its heat map and may fall below zero; a weight may not.
-        body_scores = body_scores.clamp(min=0.0) * tracks.valid.unsqueeze(-1)
+        # Joints below the threshold have no say in the match: the network guesses what it cannot see.
+        trusted = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
+        body_scores = body_scores * trusted
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, tracks.valid, height, width, fps)
         # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
         # the pose that was found stands in for it, as long as the person is in the scene.
         in_scene = tracks.valid.unsqueeze(-1).expand_as(seen)
-        coasting = brief_gaps(seen.transpose(-1, -2), int(BRIEF_S * fps)).transpose(-1, -2)
+        coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         joints = self.smoother(joints, in_scene & ~coasting, fps)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid)
 

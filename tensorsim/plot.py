@@ -113,7 +113,7 @@ def map_figure(
         scale = speed_per_axis
         right = axes.secondary_yaxis(
             "right",
-            functions=(lambda x: np.multiply(x, scale), lambda v: np.divide(v, scale)),  # type: ignore[arg-type]
+            functions=(lambda x: np.multiply(x, scale), lambda v: np.divide(v, scale)),
         )
         right.set_ylabel("radial speed in m/s, positive = approaching")
     axes.set_title(title)

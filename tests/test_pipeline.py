@@ -91,9 +91,9 @@ def test_padded_frames_do_not_count() -> None:
     alone = stage(clips[:1, :12], FPS)
     assert not out.valid[0, :, 12:].any()
     # Smoothing over time sees the held poses of the padding with a weight of next to nothing.
-    assert_same(out.joints[:1, :1, :12], alone.joints, atol=3e-3)
+    assert_same(out.joints[:1, :1, :12], alone.joints, atol=1e-3)
     last = int((11 / FPS - 0.1) * RADAR.prf_hz)  # who leaves fades out over 0.1 s; a clip's end is no leaving
-    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.1)
+    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.03)
     assert float(out.range_time[0, :, -40:].abs().max()) < 1e-6 * float(out.range_time[0].max())
     with pytest.raises(ts.TensorsimError, match="expected 2 counts from 1 to 20"):
         stage(clips, FPS, torch.tensor([0, 20]))
@@ -222,7 +222,8 @@ def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
     torch.nn.init.normal_(
         network.final_layer.weight, std=0.3
     )  # untrained: let some scores pass the threshold
-    stage = VideoToDoppler(detector, network, radar=RADAR, snr_db=None).eval()
+    radar = ts.RadarConfig.through_wall(prf_hz=4096.0)  # an untrained network makes people jump about
+    stage = VideoToDoppler(detector, network, radar=radar, snr_db=None).eval()
     ts.export.to_torchscript(stage, tmp_path / "sim.pt")
     # Two people in one film and one person in another, at other lengths than each other.
     for name, frames, size in (("hug_2people_28fps.mp4", 6, 1), ("walk_across_1person_30fps.mp4", 9, 1)):

@@ -90,7 +90,7 @@ def robust_smooth(x: Tensor, valid: Tensor, sigma: float, rounds: int = 3) -> Te
     smooth = local_linear(x, base, sigma)
     for _ in range(rounds):
         residual = (x - smooth).abs()
-        spread = 6.0 * masked_median(residual.detach(), valid)
+        spread = 6.0 * masked_median(residual, valid)
         bisquare = (1.0 - (residual / spread.clamp(min=1e-9)).clamp(max=1.0).square()).square()
         smooth = local_linear(x, base * (bisquare + 1e-4), sigma)
     return smooth

@@ -143,6 +143,7 @@ class NearestPoseLifter(nn.Module):
         library: (L, 14, 3) poses in any unit of length (x right, y away, z up); None is the shipped pool.
         yaws: headings at which each pose of the pool is tried; 1 for a pool that has all headings already.
         neighbours: candidates per frame.
+        search_joints: a frame with fewer joints takes its candidates from the nearest frame with as many.
         tolerance: relative error (square root of ``distance``) at which a candidate loses its weight.
         temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
             body heights; 0 treats frames alone.
@@ -165,6 +166,7 @@ class NearestPoseLifter(nn.Module):
         library: Tensor | None = None,
         yaws: int = 24,
         neighbours: int = 32,
+        search_joints: int = 8,
         tolerance: float = 0.05,
         temporal: float = 1.0,
         chunk: int = 2**22,
@@ -183,7 +185,7 @@ class NearestPoseLifter(nn.Module):
         if not 0 <= temporal < float("inf"):
             raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
         self.yaws, self.neighbours, self.tolerance = yaws, neighbours, tolerance
-        self.temporal, self.chunk = temporal, chunk
+        self.temporal, self.chunk, self.search_joints = temporal, chunk, search_joints
         self.change = 0.03  # body heights per frame: a limb that moves at 1.6 m/s, 30 frames a second
         self.register_buffer("library", poses, persistent=False)
 
@@ -207,7 +209,9 @@ class NearestPoseLifter(nn.Module):
         shape, frames = keypoints.shape, keypoints.shape[-3]
         tracks = keypoints[..., 0, 0, 0].numel()
         keypoints, weights = keypoints.reshape(tracks, frames, 14, 2), weights.reshape(tracks, frames, 14)
-        source = nearest_valid((weights > 0).sum(dim=-1) >= 2)
+        seen = (weights > 0).sum(dim=-1)
+        placeable = seen >= 2
+        source = nearest_valid(placeable)
         keypoints = keypoints.gather(1, source[..., None, None].expand_as(keypoints))
         weights = weights.gather(1, source[..., None].expand_as(weights)).to(keypoints.dtype)
 
@@ -220,11 +224,14 @@ class NearestPoseLifter(nn.Module):
                 self.neighbours,
                 self.chunk,
             ).reshape(tracks, frames, self.neighbours)
+            # A few joints fit many poses: such a frame chooses among those of the nearest better one.
+            known = nearest_valid(seen.gather(1, source) >= self.search_joints)
+            index = index.gather(1, known[..., None].expand_as(index))
         base = self.library[torch.div(index, self.yaws, rounding_mode="floor")].to(keypoints.dtype)
         poses = turn(base, (index % self.yaws).to(keypoints.dtype) * (2 * math.pi / self.yaws))
         scale, placed, distance = fit_poses(keypoints[:, :, None], weights[:, :, None], poses)
 
-        share = self._share(poses, scale, distance)
+        share = self._share(poses, scale, distance, placeable)
         return Lifted(
             depth=(share[..., None] * poses[..., 1]).sum(dim=2).reshape(shape[:-1]),
             scale=(share * scale).sum(dim=2).reshape(shape[:-2]),
@@ -233,8 +240,8 @@ class NearestPoseLifter(nn.Module):
             distance=distance[..., 0].reshape(shape[:-2]),
         )
 
-    def _share(self, poses: Tensor, scale: Tensor, distance: Tensor) -> Tensor:
-        """Weight of each candidate, (S, T, K) summing to one."""
+    def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:
+        """Weight of each candidate, (S, T, K) summing to one; frames (S, T) not ``placeable`` say nothing."""
         emission = -0.5 / self.tolerance**2 * distance
         if self.temporal == 0.0 or self.neighbours == 1:
             return torch.softmax(emission, dim=-1)
@@ -246,4 +253,12 @@ class NearestPoseLifter(nn.Module):
         a, b = state[:, :-1] - middle, state[:, 1:] - middle
         product = torch.matmul(a, b.transpose(-1, -2))
         change = a.square().sum(dim=-1)[..., None] + b.square().sum(dim=-1)[:, :, None, :] - 2.0 * product
-        return smooth_assignment(emission, -0.5 * self.temporal / self.change**2 * change.clamp(min=0.0))
+        transition = -0.5 * self.temporal / self.change**2 * change.clamp(min=0.0)
+        # A frame without a pose of its own has the candidates of its neighbour: it passes them on unchanged, so
+        # that empty frames before, between and after do not count as evidence.
+        same = torch.eye(self.neighbours, dtype=torch.bool, device=poses.device)
+        passed = torch.where(same, 0.0, -1e9).to(transition.dtype)
+        alone = placeable[:, :-1] & placeable[:, 1:]
+        borrowed = ~alone & (poses[:, :-1] == poses[:, 1:]).flatten(2).all(dim=-1)
+        transition = torch.where(borrowed[..., None, None], passed, transition)
+        return smooth_assignment(emission * placeable[..., None], transition)

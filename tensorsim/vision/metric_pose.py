@@ -147,6 +147,7 @@ class MetricPose(nn.Module):
         self.keypoint_threshold = keypoint_threshold
         self.range_smoothing_s = range_smoothing_s
         self.floor_window_s = floor_window_s
+        self.whole_body_joints = 10  # seen joints that make a body whole enough to tell its size
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
         camera = CameraConfig() if camera is None else camera
@@ -231,7 +232,10 @@ class MetricPose(nn.Module):
             focal = torch.full_like(scale, focal_px)
             if self.distance_gives_focal:
                 focal = self._focal_from(distance, height, scale, beyond, valid, fps)
-            root_range = height * robust_smooth(focal / scale - beyond, valid, self.range_smoothing_s * fps)
+            # The size of a body that is half out of the picture is a guess: those frames follow the others.
+            whole = valid & (seen.sum(dim=-1) >= self.whole_body_joints)
+            whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
+            root_range = height * robust_smooth(focal / scale - beyond, whole, self.range_smoothing_s * fps)
             reach = root_range[..., None] + height[..., None] * lifted.depth
             joints = back_project(image, reach, focal, torch.tensor(center).to(image), pose)
             joints = lowered(joints, self._floor(joints, valid, fps))

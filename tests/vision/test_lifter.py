@@ -281,6 +281,20 @@ def test_temporal_weight_keeps_depths_from_flipping() -> None:
     assert smooth < 0.3 * nearest
 
 
+def test_a_body_half_out_of_the_picture_keeps_the_pose_of_its_better_frames() -> None:
+    """From a head and two shoulders alone, anything could hang: somebody lying would fit as well."""
+    pose = sample_poses(2000)[1].float().expand(5, 14, 3)
+    keypoints, weights = projected(pose), torch.ones(5, 14)
+    weights[2, 3:] = 0.0
+    lifter = NearestPoseLifter(temporal=0.0)
+    lifted, whole = lifter(keypoints, weights), lifter(keypoints, torch.ones(5, 14))
+    assert torch.allclose(lifted.depth[[0, 1, 3, 4]], whole.depth[[0, 1, 3, 4]], atol=1e-5)
+    careless = NearestPoseLifter(temporal=0.0, search_joints=2)(keypoints, weights)
+    error, guess = ((x.depth[2] - whole.depth[2]).abs().max() for x in (lifted, careless))
+    assert error < 0.05
+    assert guess > 3 * error
+
+
 def test_frames_without_joints_take_their_neighbours() -> None:
     image = projected(sample_poses(20, seed=3))[:6]
     weights = torch.ones(6, 14, dtype=torch.float64)
