@@ -1,0 +1,121 @@
+"""Receiver noise: complex white Gaussian, set by a signal-to-noise ratio or by the noise temperature."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError, check_min_rank, check_positive
+
+BOLTZMANN_J_PER_K = 1.380649e-23
+REFERENCE_TEMPERATURE_K = 290.0
+
+
+def energy(signal: Tensor) -> Tensor:
+    """Sum of ``|IF|^2`` over pulses and samples: (..., M, N) complex -> (...)."""
+    parts = torch.view_as_real(signal).flatten(-3)
+    return torch.linalg.vecdot(parts, parts)
+
+
+def mean_power(signal: Tensor) -> Tensor:
+    """Mean of ``|IF|^2`` over pulses and samples: (..., M, N) complex -> (...)."""
+    return energy(signal) / (signal.shape[-2] * signal.shape[-1])
+
+
+def decibels(signal_power: Tensor, noise_power: Tensor) -> Tensor:
+    """``10 log10(signal / noise)``; +inf without noise, -inf without signal."""
+    ratio = 10.0 * torch.log10(signal_power / noise_power)
+    return torch.where(noise_power > 0, ratio, torch.full_like(ratio, float("inf")))
+
+
+class ReceiverNoise(nn.Module):
+    """Adds complex white Gaussian noise to IF samples. PyTorch's global generator draws it:
+    ``torch.manual_seed``.
+
+    Args:
+        snr_db: ratio of signal to noise per IF sample, both as mean over the clip; None adds no noise.
+        reference: what the signal is: ``"echo"``, the echo of the targets; ``"total"``, everything in the IF,
+            leakage and wall echo included; ``"absolute"`` sets the noise to ``k T0 B F / Pt`` instead (IF
+            samples are for transmit power 1) and leaves ``snr_db`` out.
+        empty_power: the signal power to assume in a clip whose signal is exactly zero, so that an empty scene
+            has a noise floor too.
+        bandwidth_hz: B for ``"absolute"``: the sample rate of the complex IF.
+        noise_figure_db: F for ``"absolute"``.
+        transmit_power_w: Pt for ``"absolute"``.
+
+    Shapes: IF (..., M, N) complex, optionally the target echo in it, likewise -> IF with noise. Without the
+        target echo
+    the whole IF counts as echo. One noise power per clip. Differentiable: noise scales with its reference.
+
+    Raises:
+        TensorsimError: unknown reference, numbers that are not finite or positive, a real IF, shapes that
+            differ.
+    """
+
+    def __init__(
+        self,
+        snr_db: float | None = 50.0,
+        reference: str = "echo",
+        empty_power: float = 0.0,
+        bandwidth_hz: float = 10e6,
+        noise_figure_db: float = 10.0,
+        transmit_power_w: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if reference not in ("echo", "total", "absolute"):
+            raise TensorsimError(f"reference: got {reference!r}, expected 'echo', 'total' or 'absolute'")
+        if snr_db is not None and not math.isfinite(snr_db):
+            raise TensorsimError(f"snr_db: got {snr_db}, expected a finite number of dB or None for no noise")
+        if not (math.isfinite(empty_power) and empty_power >= 0):
+            raise TensorsimError(f"empty_power: got {empty_power}, expected a finite power >= 0")
+        if not math.isfinite(noise_figure_db):
+            raise TensorsimError(f"noise_figure_db: got {noise_figure_db}, expected a finite number of dB")
+        check_positive(bandwidth_hz, "bandwidth_hz")
+        check_positive(transmit_power_w, "transmit_power_w")
+        thermal = BOLTZMANN_J_PER_K * REFERENCE_TEMPERATURE_K * bandwidth_hz * 10 ** (noise_figure_db / 10)
+        self.reference = reference
+        self.absolute_power = thermal / transmit_power_w
+        self.empty_power = float(empty_power)
+        self.noiseless = snr_db is None and reference != "absolute"
+        self.noise_per_signal = 0.0 if snr_db is None else 10 ** (-snr_db / 10)
+
+    @torch.jit.export
+    def noise_power(self, signal_power: Tensor) -> Tensor:
+        """Variance of the complex noise for this power of the reference signal, both (...)."""
+        if self.reference == "absolute":
+            return torch.full_like(signal_power, self.absolute_power)
+        return torch.where(signal_power > 0, signal_power, self.empty_power) * self.noise_per_signal
+
+    @torch.jit.export
+    def draw(self, like: Tensor, noise_power: Tensor) -> Tensor:
+        """Noise in the shape of ``like`` (..., M, N) with this variance (...)."""
+        parts = torch.view_as_real(torch.randn_like(like))
+        deviation = noise_power.to(parts.dtype).sqrt()[..., None, None, None]
+        return torch.view_as_complex(parts * deviation)
+
+    @torch.jit.export
+    def realised_snr_db(self, clean: Tensor, noisy: Tensor, target_echo: Tensor | None = None) -> Tensor:
+        """Ratio (...) in dB of the reference signal to the noise that was really drawn; +inf without
+        noise."""
+        signal = clean if target_echo is None or self.reference == "total" else target_echo
+        return decibels(mean_power(signal), mean_power(noisy - clean))
+
+    def forward(self, intermediate: Tensor, target_echo: Tensor | None = None) -> Tensor:
+        """IF (..., M, N) complex and the target echo in it to IF with noise."""
+        check_min_rank(intermediate, 2, "IF", "(..., pulses, samples)")
+        if not intermediate.is_complex():
+            raise TensorsimError(f"IF: got dtype {intermediate.dtype}, expected a complex tensor")
+        if intermediate.numel() == 0:
+            raise TensorsimError(f"IF: got an empty tensor of shape {list(intermediate.shape)}")
+        signal = intermediate
+        if target_echo is not None:
+            if target_echo.shape != intermediate.shape or target_echo.dtype != intermediate.dtype:
+                raise TensorsimError(
+                    f"target_echo: got {list(target_echo.shape)} {target_echo.dtype}, expected "
+                    f"{list(intermediate.shape)} {intermediate.dtype} like the IF"
+                )
+            if self.reference != "total":
+                signal = target_echo
+        if self.noiseless:
+            return intermediate
+        return intermediate + self.draw(intermediate, self.noise_power(mean_power(signal)))

@@ -1,0 +1,43 @@
+"""Scenes that the radar tests share: generated motion, and a recorded walk."""
+
+import numpy as np
+import torch
+
+from tensorsim.config import JOINT_RCS_M2, RadarConfig
+
+#: A radar small enough for finite differences: 24 samples a pulse, Doppler windows of 26 pulses.
+SMALL = RadarConfig(carrier_hz=2e9, bandwidth_hz=0.6e9, chirp_s=40e-6, sample_rate_hz=0.6e6, prf_hz=256.0)
+
+
+def swinging(pulses, scatterers, prf_hz, distance_m=3.0, speed_m_s=-1.0, seed=0):
+    """Positions (M, S, 3) float64, exact in float32: a cloud that walks and swings."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(pulses)[:, None] / prf_hz
+    rest = rng.uniform([-0.4, -0.2, 0.1], [0.4, 0.2, 1.8], (scatterers, 3))
+    swing = 0.2 * np.sin(2 * np.pi * (0.9 * t + rng.uniform(0, 1, scatterers)))
+    p = np.empty((pulses, scatterers, 3))
+    p[..., 0] = rest[:, 0]
+    p[..., 1] = rest[:, 1] + distance_m + speed_m_s * t + swing
+    p[..., 2] = rest[:, 2] + 0.05 * swing
+    return p.astype(np.float32).astype(np.float64)
+
+
+def recorded_walk(shared_data, prf_hz, seconds, distance_m=3.0):
+    """Positions (M, 14, 3) of a motion-captured walk, placed in front of the radar."""
+    from scipy.interpolate import CubicSpline
+
+    with np.load(shared_data / "mocap" / "cmu_14joints_120hz.npz") as clips:
+        joints = clips["walking_1"].astype(np.float64)[1:]  # the first frame is a calibration pose
+    joints = joints[: int(120 * seconds) + 2]
+    joints[..., :2] -= joints[0, :, :2].mean(0)
+    joints[..., 1] += distance_m
+    t = np.arange(round(prf_hz * seconds)) / prf_hz
+    return CubicSpline(np.arange(len(joints)) / 120, joints)(t)
+
+
+def joint_rcs():
+    return np.asarray(JOINT_RCS_M2)
+
+
+def tensors(positions, rcs, dtype=torch.float64):
+    return torch.as_tensor(positions, dtype=dtype), torch.as_tensor(rcs, dtype=dtype)

@@ -1,0 +1,150 @@
+"""The Doppler-time map against loops over frames, against SciPy, and its sign."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.config import SPEED_OF_LIGHT_M_S as C
+from tensorsim.config import RadarConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.radar.doppler import DopplerTimeMap
+from tensorsim.radar.echo import EchoSynthesizer
+from tensorsim.radar.mti import MovingTargetIndicator
+from tensorsim.radar.range_profile import RangeProfile
+from tests.radar import reference
+from tests.radar.scenes import SMALL
+from tests.stage import StageTester
+
+FREE = RadarConfig.free_space()
+THROUGH = RadarConfig.through_wall()
+
+
+def noise(*shape, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(2)
+    x = torch.randn(*shape, dtype=torch.complex64, generator=generator)
+    return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64)
+
+
+class TestDopplerTimeMap(StageTester):
+    def make(self):
+        return DopplerTimeMap(SMALL)
+
+    def inputs(self, batch, dtype):
+        return (noise(*batch, 40, 5, dtype=dtype),)
+
+    def bad_inputs(self):
+        x = self.inputs((), torch.float32)[0]
+        return [
+            ((x.real,), "profiles: got dtype"),
+            ((x[0],), "profiles: got shape"),
+            ((x[:25],), "got 25 pulses .* at least the 26"),
+            ((x[:, :0],), "profiles: got shape"),
+        ]
+
+
+class TestPaperIntegration(TestDopplerTimeMap):
+    def make(self):
+        return DopplerTimeMap(SMALL, integration="paper")
+
+
+@pytest.mark.parametrize("paper", [False, True])
+@pytest.mark.parametrize(
+    ("radar", "pulses", "frames"), [(FREE, 819 + 82 * 70, 71), (THROUGH, 300, 144), (FREE, 819, 1)]
+)
+def test_map_equals_loop_over_frames(radar, pulses, frames, paper):
+    x = noise(pulses, 7)
+    module = DopplerTimeMap(radar, integration="paper" if paper else "noncoherent")
+    expected, axis = reference.doppler_time(x.numpy().astype(complex), radar.prf_hz, paper=paper)
+    actual = module(x)
+    assert actual.shape == expected.shape == (module.bins, frames)
+    assert actual.dtype == torch.float32
+    assert reference.relative(actual, expected) < 1e-6
+    np.testing.assert_array_equal(module.doppler_hz, axis)
+
+
+def test_map_equals_scipy():
+    from scipy.signal import ShortTimeFFT
+    from scipy.signal.windows import hann
+
+    x = noise(3000, 4).numpy().astype(complex)
+    module = DopplerTimeMap(FREE)
+    stft = ShortTimeFFT(hann(819, sym=False), 82, 8192, fft_mode="centered", mfft=1024)
+    expected = stft.stft(x.conj().T, p0=stft.p_min, p1=stft.p_max(3000))  # (R, F, all frames)
+    first = -stft.p_min - 1
+    while stft.t(3000, p0=stft.p_min)[first] * 8192 < 819 // 2:  # its frames start outside the signal
+        first += 1
+    offset = round(stft.t(3000, p0=stft.p_min)[first] * 8192) - 819 // 2
+    expected = np.sqrt((np.abs(expected) ** 2).sum(0))[:, first:]
+    actual = module(torch.as_tensor(x[offset:]))
+    count = min(actual.shape[1], expected.shape[1])
+    assert count >= 25
+    np.testing.assert_allclose(actual[:, :count], expected[:, :count], rtol=1e-9, atol=1e-9)
+
+
+def test_settings_of_the_presets():
+    free, through = DopplerTimeMap(FREE), DopplerTimeMap(THROUGH)
+    assert (free.length, free.hop, free.bins) == (819, 82, 1024)
+    assert (through.length, through.hop, through.bins) == (13, 2, 256)
+
+
+@pytest.mark.parametrize("speed", [-2.0, -0.5, 1.0, 3.0])
+def test_approaching_is_positive_at_the_centre_of_the_sweep(speed):
+    """A point closing in at `speed` shows at +2 v (fc + B/2) / c."""
+    radar = RadarConfig(tx_m=(0, 0, 0), rx_m=(0, 0, 0))
+    t = torch.arange(1700).double() / radar.prf_hz
+    p = torch.stack((0 * t, 4.0 - speed * t, 0 * t), -1)[:, None]
+    module = DopplerTimeMap(radar)
+    maps = module(MovingTargetIndicator()(RangeProfile(radar)(EchoSynthesizer(radar)(p, torch.ones(1)))))
+    peak = module.doppler_hz[maps.argmax(0)]
+    expected = 2 * speed * 79e9 / C
+    assert torch.sign(peak).tolist() == [math.copysign(1, speed)] * peak.numel()
+    # Over a window a fast point moves through range bins, whose weight spreads over the sweep.
+    assert peak.tolist() == pytest.approx([expected] * peak.numel(), abs=8.0 + 0.01 * abs(expected))
+    power = maps.square().sum(1)
+    centroid = float((power * module.doppler_hz).sum() / power.sum())
+    assert centroid == pytest.approx(expected, rel=2e-3)  # fc alone would be 2.5 % off
+
+
+def test_printed_formula_loses_the_sign():
+    t = torch.arange(2000).double() / 8192
+    raw = torch.polar(torch.ones(2000).double(), 2 * math.pi * -790 * t)[:, None]
+    noncoherent = DopplerTimeMap(FREE)
+    assert float(noncoherent.doppler_hz[noncoherent(raw)[:, 0].argmax()]) == pytest.approx(790, abs=8)
+    paper = DopplerTimeMap(FREE, integration="paper")(raw + 0.1 * raw.square())
+    np.testing.assert_allclose(paper[1:], paper[1:].flip(0), atol=1e-9)  # as much left as right
+
+
+def test_frame_times_are_centres():
+    module = DopplerTimeMap(FREE)
+    x = torch.zeros(4000, 1, dtype=torch.complex64)
+    x[2000] = 1  # a click is loudest in the frame around it
+    times = module.frame_times_s(4000)
+    maps = module(x)
+    assert times.shape == (maps.shape[1],) == (module.frames(4000),)
+    assert float(times[maps[0].argmax()]) == pytest.approx(2000 / 8192, abs=41.5 / 8192)
+    assert float(times[0]) == pytest.approx(819 / 2 / 8192)
+    assert module.frames(818) == 0
+    assert module.frame_times_s(818).numel() == 0
+
+
+def test_gradient_at_silence_is_finite():
+    x = torch.zeros(40, 2, dtype=torch.complex128, requires_grad=True)
+    DopplerTimeMap(SMALL)(x).sum().backward()
+    assert torch.isfinite(x.grad.abs()).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"window_s": 0.0}, "window_s: got 0.0"),
+        ({"window_s": float("nan")}, "window_s: got nan"),
+        ({"overlap": 1.0}, "overlap: got 1.0"),
+        ({"overlap": -0.1}, "overlap: got -0.1"),
+        ({"integration": "coherent"}, "integration: got 'coherent'"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(TensorsimError, match=message):
+        DopplerTimeMap(FREE, **arguments)

@@ -1,0 +1,139 @@
+"""Range profiles and the moving target indicator."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.config import SPEED_OF_LIGHT_M_S as C
+from tensorsim.config import RadarConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.radar.echo import EchoSynthesizer
+from tensorsim.radar.mti import MovingTargetIndicator
+from tensorsim.radar.range_profile import RangeProfile
+from tests.radar import reference
+from tests.radar.scenes import SMALL
+from tests.stage import StageTester
+
+FREE = RadarConfig.free_space()
+
+
+def noise(*shape, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(1)
+    x = torch.randn(*shape, dtype=torch.complex64, generator=generator)
+    return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64)
+
+
+class TestRangeProfile(StageTester):
+    def make(self):
+        return RangeProfile(SMALL)
+
+    def inputs(self, batch, dtype):
+        return (noise(*batch, 5, 24, dtype=dtype),)
+
+    def bad_inputs(self):
+        x = self.inputs((), torch.float32)[0]
+        return [
+            ((x.real,), "IF: got dtype"),
+            ((x[0],), "IF: got shape"),
+            ((x[:, :20],), "24 samples"),
+            ((x[:, :0],), "IF: got shape"),
+        ]
+
+
+class TestTwoPulseCanceller(StageTester):
+    def make(self):
+        return MovingTargetIndicator("two-pulse")
+
+    def inputs(self, batch, dtype):
+        return (noise(*batch, 9, 6, dtype=dtype),)
+
+    def bad_inputs(self):
+        x = self.inputs((), torch.float32)[0]
+        return [
+            ((x.real,), "profiles: got dtype"),
+            ((x[:1],), "at least two pulses"),
+            ((x[0],), "profiles: got shape"),
+            ((x[:, :0],), "profiles: got shape"),
+        ]
+
+
+class TestMeanRemoval(TestTwoPulseCanceller):
+    def make(self):
+        return MovingTargetIndicator("mean")
+
+
+@pytest.mark.parametrize("window", ["hamming", None])
+def test_profile_equals_numpy(window):
+    x = noise(7, 400)
+    actual = RangeProfile(FREE, window)(x)
+    assert actual.shape == (7, 200)
+    assert actual.dtype == torch.complex64
+    assert reference.relative(actual, reference.profiles(x.numpy(), window)) < 1e-6
+
+
+@pytest.mark.parametrize("window", ["hamming", "hann", "blackman"])
+def test_windows_are_symmetric(window):
+    expected = {"hamming": np.hamming, "hann": np.hanning, "blackman": np.blackman}[window](400)
+    np.testing.assert_allclose(RangeProfile(FREE, window).window, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [0.75, 3.0, 6.1])
+def test_range_peak_is_at_half_the_path(distance):
+    radar = RadarConfig(tx_m=(0, 0, 0), rx_m=(0, 0, 0))
+    profile = RangeProfile(radar)
+    x = EchoSynthesizer(radar)(torch.tensor([[[0.0, distance, 0.0]]]), torch.ones(1))
+    peak = profile.range_m[profile(x).abs().argmax()]
+    assert float(peak) == pytest.approx(distance, abs=C / (4 * 4e9) * 1.001)  # half a bin
+
+
+def test_range_axis():
+    axis = RangeProfile(FREE).range_m
+    assert axis.shape == (200,)
+    assert float(axis[0]) == 0.0
+    assert float(axis[1]) == pytest.approx(C / 8e9, rel=1e-12)
+    assert float(axis[-1]) == pytest.approx(7.457, abs=1e-3)  # the panel shows 0 to 7.5 m
+
+
+def test_leakage_shows_at_its_delay():
+    """|Ptx - Prx| = 0.2 m of path is 0.1 m of range: bin 2.67 at 4 GHz."""
+    x = EchoSynthesizer(FREE, leakage=True).double()(torch.zeros(1, 0, 3), torch.zeros(0))[0]
+    step = float((x[1:] * x[:-1].conj()).angle().mean())
+    assert step / (2 * math.pi) * 400 == pytest.approx(2.67, abs=2e-3)
+    assert float(x.abs().mean()) == pytest.approx(0.1, rel=1e-12)
+    assert int(RangeProfile(FREE)(x[None]).abs().argmax()) == 3
+
+
+@pytest.mark.parametrize("doppler_hz", [0.0, 10.0, 263.0, 1024.0, 2048.0, 4096.0, -300.0])
+def test_two_pulse_response(doppler_hz):
+    m = torch.arange(50).double()
+    x = torch.polar(torch.ones(50).double(), 2 * math.pi * doppler_hz * m / 8192)[:, None]
+    response = MovingTargetIndicator()(x).abs()
+    assert response.shape == (49, 1)
+    np.testing.assert_allclose(response, abs(2 * math.sin(math.pi * doppler_hz / 8192)), atol=1e-12)
+
+
+def test_two_pulse_response_at_a_slow_torso():
+    """0.5 m/s at the centre of the sweep: -13.9 dB."""
+    doppler = 2 * 0.5 / FREE.doppler_wavelength_m
+    assert 20 * math.log10(abs(2 * math.sin(math.pi * doppler / 8192))) == pytest.approx(-13.9, abs=0.05)
+
+
+def test_canceller_is_later_minus_earlier():
+    x = torch.tensor([[1.0 + 0j], [3.0 + 1j], [2.0 + 1j]])
+    assert MovingTargetIndicator()(x).flatten().tolist() == [2 + 1j, -1 + 0j]
+
+
+def test_mean_removal_keeps_motion_and_drops_clutter():
+    m = torch.arange(64).double()
+    mover = torch.polar(torch.ones(64).double(), 2 * math.pi * 4 * m / 64)[:, None]
+    actual = MovingTargetIndicator("mean")(mover + (3 - 2j))
+    np.testing.assert_allclose(actual, mover, atol=1e-12)
+
+
+def test_bad_arguments():
+    with pytest.raises(TensorsimError, match="window: got 'kaiser'"):
+        RangeProfile(FREE, "kaiser")
+    with pytest.raises(TensorsimError, match="method: got 'three-pulse'"):
+        MovingTargetIndicator("three-pulse")

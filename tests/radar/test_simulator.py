@@ -1,0 +1,265 @@
+"""The chain whole: equal to its stages, to the definition, and to itself in pieces."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.config import RadarConfig, WallConfig
+from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.radar.ambiguity import check_unambiguous, radial_speed
+from tensorsim.radar.echo import EchoSynthesizer
+from tensorsim.radar.simulator import RadarSimulator, block_rms
+from tests.radar import reference
+from tests.radar.scenes import SMALL, joint_rcs, recorded_walk, swinging, tensors
+from tests.stage import StageTester, assert_same
+
+FREE = RadarConfig.free_space()
+THROUGH = RadarConfig.through_wall()
+SCENES = {"free space": (FREE, None), "through wall": (THROUGH, WallConfig())}
+
+
+class TestRadarSimulator(StageTester):
+    batched_arguments = (0, 1)
+    gradient_arguments = (0, 1)
+
+    def make(self):
+        wall = WallConfig(center_m=(0.0, 3.0, 1.5))
+        return RadarSimulator(
+            SMALL,
+            wall,
+            multipath=True,
+            leakage=True,
+            wall_echo=True,
+            snr_db=None,
+            ridge_count=2,
+            pulse_chunk=8,
+        )
+
+    def inputs(self, batch, dtype):
+        count = math.prod(batch)
+        p = np.stack([swinging(35, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 35, 3, 3)
+        rcs = np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)).astype(np.float32)
+        return tensors(p, rcs, dtype)
+
+    def bad_inputs(self):
+        p, rcs = self.inputs((), torch.float32)
+        hole = p.clone()
+        hole[2, 1, 0] = float("nan")
+        return [
+            ((p[:26], rcs), "got 26 pulses, expected at least 27"),
+            ((p[:0], rcs), "at least one pulse"),
+            ((p[0], rcs), "positions: got shape"),
+            ((p, rcs[:2]), "rcs: got shape"),
+            ((p, -rcs), "no negative"),
+            ((hole, rcs), "NaN"),
+            ((p.long(), rcs), "positions: got dtype"),
+        ]
+
+    def test_gradients_against_finite_differences(self):
+        """With noise of one seed: a magnitude map without a noise floor has kinks, where it is next to zero."""
+        module = RadarSimulator(SMALL, WallConfig((0.0, 3.0, 1.5)), multipath=True, snr_db=10.0).double()
+        p, rcs = self.inputs((), torch.float64)
+
+        def function(p, rcs):
+            torch.manual_seed(0)
+            return [x for x in module(p, rcs) if x.requires_grad]
+
+        inputs = (p.requires_grad_(True), rcs.requires_grad_(True))
+        assert len(function(*inputs)) == 5  # all but the ridge bins
+        assert torch.autograd.gradcheck(function, inputs, fast_mode=True, rtol=1e-3)
+
+
+class TestSimulatorInFreeSpace(TestRadarSimulator):
+    def make(self):
+        return RadarSimulator(SMALL, snr_db=None, mti="mean", integration="paper", display_rate_hz=50.0)
+
+    def bad_inputs(self):
+        return TestRadarSimulator.bad_inputs(self)[1:]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_maps_equal_the_definition(scene):
+    radar, wall = SCENES[scene]
+    check_against_definition(
+        radar, wall, swinging(1100 if wall is None else 200, 5, radar.prf_hz), np.ones(5)
+    )
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_maps_equal_the_definition_on_recorded_motion(scene, shared_data):
+    radar, wall = SCENES[scene]
+    walk = recorded_walk(shared_data, radar.prf_hz, 0.12 if wall is None else 2.5)
+    check_against_definition(radar, wall, walk, joint_rcs())
+
+
+def check_against_definition(radar, wall, p, rcs):
+    expected = reference.profiles(reference.echo(radar, p, rcs, wall, multipath=wall is not None))
+    moving = reference.two_pulse(expected)
+    maps = RadarSimulator(radar, wall, multipath=True, snr_db=None)(*tensors(p, rcs))
+    assert maps.range_time.dtype == torch.float32
+    assert reference.relative(maps.range_time, np.abs(expected).T) < 1e-5
+    assert reference.relative(maps.range_time_mti, np.abs(moving).T) < 1e-5
+    assert reference.relative(maps.doppler_time, reference.doppler_time(moving, radar.prf_hz)[0]) < 1e-5
+    assert torch.isposinf(maps.snr_db)
+
+
+def test_simulator_equals_its_stages():
+    simulator = RadarSimulator(THROUGH, WallConfig(), leakage=True, snr_db=None)
+    p, rcs = tensors(swinging(100, 4, 128.0), np.ones(4))
+    profiles = simulator.range_profile(simulator.echo(p, rcs))
+    moving = simulator.mti(profiles)
+    doppler_time = simulator.doppler(moving)
+    ridges = simulator.ridges(doppler_time)
+    maps = simulator(p, rcs)
+    expected = (profiles.T.abs(), moving.T.abs(), doppler_time, ridges.indices, ridges.magnitudes)
+    assert_same(maps[:5], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("reference_name", ["echo", "total", "absolute"])
+def test_noise_has_the_power_of_its_reference(reference_name):
+    """White noise of variance v has v sum(w^2) in every bin, and twice that after the canceller."""
+    p, rcs = tensors(swinging(1000, 4, 128.0, speed_m_s=0.0), np.ones(4))
+    simulator = RadarSimulator(
+        THROUGH, leakage=True, snr_db=10.0, noise_reference=reference_name, transmit_power_w=1e-9
+    )
+    maps = simulator(p, rcs)
+    echo, total = (
+        float(EchoSynthesizer(THROUGH, leakage=on)(p, rcs).abs().square().mean()) for on in (False, True)
+    )
+    assert total > 100 * echo
+    thermal = 1.380649e-23 * 290 * 10e6 * 10 / 1e-9
+    variance = {"echo": echo / 10, "total": total / 10, "absolute": thermal}[reference_name]
+    far = maps.range_time_mti[150:].square().mean()  # beyond 20 m there is nothing but noise
+    assert float(far) == pytest.approx(2 * variance * (np.hamming(400) ** 2).sum(), rel=0.03)
+    signal = total if reference_name == "total" else echo
+    assert float(maps.snr_db) == pytest.approx(10 * math.log10(signal / variance), abs=0.1)
+
+
+def test_noise_is_set_per_clip():
+    near, far = swinging(200, 3, 128.0, distance_m=2.0), swinging(200, 3, 128.0, distance_m=6.0)
+    p, rcs = tensors(np.stack((near, far)), np.ones(3))
+    maps = RadarSimulator(THROUGH, snr_db=10.0)(p, rcs)
+    assert maps.snr_db.tolist() == pytest.approx([10.0, 10.0], abs=0.1)
+    floor = maps.range_time[:, 150:].square().mean((1, 2))  # beyond 20 m there is nothing but noise
+    assert float(floor[0] / floor[1]) > 5
+
+
+def test_seed_repeats_and_scripted_draws_the_same():
+    simulator = RadarSimulator(SMALL, pulse_chunk=16, snr_db=10.0)
+    p, rcs = tensors(swinging(50, 3, 256.0), np.ones(3))
+    results = []
+    for module in (simulator, simulator, torch.jit.script(simulator)):
+        torch.manual_seed(11)
+        results.append(module(p, rcs))
+    assert_same(results[1], results[0])
+    assert_same(results[2], results[0], atol=1e-6)
+    assert not torch.equal(simulator(p, rcs).doppler_time, results[0].doppler_time)
+
+
+def test_empty_scene_has_a_noise_floor():
+    empty = torch.zeros(2, 200, 0, 3)
+    maps = RadarSimulator(THROUGH, range_window=None, snr_db=20.0)(empty, torch.zeros(2, 0))
+    nominal = EchoSynthesizer(RadarConfig.through_wall(tx_m=(0, 0, 0), rx_m=(0, 0, 0)))
+    echo = nominal(torch.tensor([[[0.0, 3.0, 0.0]]]), torch.ones(1)).abs().square().mean()
+    assert float(maps.range_time.square().mean() / 400) == pytest.approx(float(echo) / 100, rel=0.02)
+    assert torch.isneginf(maps.snr_db).all()
+    quiet = RadarSimulator(THROUGH, snr_db=None, leakage=True)(empty, torch.zeros(2, 0))
+    assert float(quiet.range_time.max()) > 1
+    assert float(quiet.range_time_mti.max()) == 0
+
+
+@pytest.mark.parametrize("pulses", [27, 127, 129, 500])
+@pytest.mark.parametrize("display_rate_hz", [None, 50.0])
+def test_stream_equals_forward(pulses, display_rate_hz):
+    simulator = RadarSimulator(SMALL, snr_db=10.0, pulse_chunk=8, display_rate_hz=display_rate_hz)
+    p, rcs = tensors(swinging(pulses, 3, 256.0), np.ones(3))
+    torch.manual_seed(2)
+    expected = simulator(p, rcs)
+    torch.manual_seed(2)
+    asked = []
+
+    def source(start, stop):
+        asked.append((start, stop))
+        return p[start:stop], rcs
+
+    assert_same(simulator.stream(source, pulses), expected, atol=1e-6)
+    assert asked[: len(asked) // 2] == asked[len(asked) // 2 :]
+    assert asked[len(asked) // 2 - 1][1] == pulses
+
+
+def test_stream_takes_the_rcs_per_pulse_and_refuses_bad_pieces():
+    simulator = RadarSimulator(SMALL, snr_db=None, pulse_chunk=4)
+    p, rcs = tensors(swinging(90, 3, 256.0), np.random.default_rng(0).uniform(0, 1, (90, 3)))
+    assert_same(simulator.stream(lambda a, b: (p[a:b], rcs[a:b]), 90), simulator(p, rcs), atol=1e-6)
+    with pytest.raises(TensorsimError, match=r"source\(0, 32\): got positions of shape \[31, 3, 3\]"):
+        simulator.stream(lambda a, b: (p[a : b - 1], rcs[a : b - 1]), 90)
+    with pytest.raises(TensorsimError, match="got 20 pulses"):
+        simulator.stream(lambda a, b: (p[a:b], rcs[a:b]), 20)
+    with pytest.raises(TensorsimError, match="mti 'mean'"):
+        RadarSimulator(SMALL, mti="mean").stream(lambda a, b: (p[a:b], rcs[a:b]), 90)
+
+
+def test_block_rms():
+    x = torch.rand(2, 3, 11, dtype=torch.float64)
+    expected = [np.sqrt((x[..., i : i + 4].numpy() ** 2).mean(-1)) for i in (0, 4, 8)]
+    np.testing.assert_allclose(block_rms(x, 4), np.stack(expected, -1), rtol=1e-12)
+    assert block_rms(x, 1) is x
+
+
+def test_display_rate_keeps_the_doppler_map():
+    p, rcs = tensors(swinging(300, 3, 128.0), np.ones(3))
+    full = RadarSimulator(THROUGH, snr_db=None)(p, rcs)
+    short = RadarSimulator(THROUGH, snr_db=None, display_rate_hz=32.0)(p, rcs)
+    assert short.range_time.shape == (200, 75)
+    assert torch.equal(short.doppler_time, full.doppler_time)
+
+
+def mover(speed, prf_hz, scatterers=4):
+    t = torch.arange(40).double() / prf_hz
+    return torch.stack((0 * t, 4 + speed * t, 0 * t + 1.5), -1)[:, None].repeat(1, scatterers, 1)
+
+
+def test_radial_speed_is_half_the_rate_of_the_path():
+    radar = RadarConfig(tx_m=(0, 0, 1.5), rx_m=(0, 0, 1.5))
+    np.testing.assert_allclose(radial_speed(mover(2.5, 8192), radar), 2.5, rtol=1e-9)
+
+
+def test_motion_beyond_the_pulse_rate():
+    """2 GHz and 128 Hz follow 3.84 m/s."""
+    rcs = torch.ones(40, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_unambiguous(mover(3.7, 128), rcs, THROUGH)
+        check_unambiguous(mover(-3.7, 128), rcs, THROUGH)
+        check_unambiguous(mover(30.0, 128), 0 * rcs, THROUGH)
+    with pytest.raises(
+        TensorsimError, match=r"mean radial speed of 4.00 m/s, .* 3.84 m/s of a PRF of 128 Hz; .* 133 Hz"
+    ):
+        check_unambiguous(mover(4.0, 128), rcs, THROUGH)
+    one_foot = mover(0.5, 128)
+    one_foot[:, 2] = mover(-6.0, 128)[:, 2]
+    with pytest.warns(TensorsimWarning, match="some scatterer has a radial speed of 6.00 m/s"):
+        check_unambiguous(one_foot, rcs, THROUGH)
+    appearing = mover(0.5, 128)
+    appearing[:10] = 0  # not there yet: no position, no RCS
+    present = rcs.clone()
+    present[:10] = 0
+    check_unambiguous(appearing, present, THROUGH)
+
+
+def test_simulator_refuses_motion_beyond_the_pulse_rate():
+    simulator = RadarSimulator(THROUGH)
+    p, rcs = mover(5.0, 128), torch.ones(4)
+    with pytest.raises(TensorsimError, match="a PRF of"):
+        simulator(p, rcs)
+    with pytest.raises(TensorsimError, match="a PRF of"):
+        simulator.stream(lambda a, b: (p[a:b], rcs), 40)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
+def test_bad_display_rate(rate):
+    with pytest.raises(TensorsimError, match="display_rate_hz: got"):
+        RadarSimulator(FREE, display_rate_hz=rate)
