@@ -150,9 +150,8 @@ class RadarSimulator(nn.Module):
         self.doppler = DopplerTimeMap(radar, window_s, overlap, integration)
         self.ridges = RidgeExtractor(ridge_count)
         self.pulse_chunk = pulse_chunk
-        self.piece_chunks = (
-            4  # few enough for the allocator to reuse their memory, enough to amortise overlaps
-        )
+        # Chunks in a piece: few, so that the allocator reuses their memory; not few, since pieces overlap.
+        self.piece_chunks = 8
         self.range_time_block = 1
         if display_rate_hz is not None:
             check_positive(display_rate_hz, "display_rate_hz")
