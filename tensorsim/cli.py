@@ -16,6 +16,8 @@ examples:
   tensorsim simulate clip.mp4 --out out/ --detector rtmdet_nano_person.onnx --pose simplepose_coco17_256x192.onnx
   tensorsim simulate clip.mp4 --out out/ --scene through-wall --person-height 1.75
   tensorsim simulate clip.mp4 --out out/ --start 2 --end 6 --initial-distance 4.0 --seed 7
+  tensorsim simulate clip.mp4 --out out/ --radar ti-iwr6843
+  tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
   tensorsim check
 
 Networks can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE to their paths.
@@ -44,6 +46,10 @@ class Simulate:
     """COCO-17 heat maps: HRNet as .pth or .safetensors, or any such network as .onnx. Default: $TENSORSIM_POSE."""
     scene: Literal["free-space", "through-wall"] = "free-space"
     """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath."""
+    radar: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
+    infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, free-space, through-wall) or a YAML file with fields of
+    RadarConfig; a wall that it comes with replaces the scene's."""
     person_height: tuple[float, ...] = (1.80, 1.70)
     """Body heights in metres in order of appearance; the last one serves the rest."""
     initial_distance: tuple[float, ...] | None = None
@@ -91,6 +97,8 @@ class Simulate:
         if self.out.exists() and not self.out.is_dir():
             raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
 
+        scene = _scene(self)
+
         import torch
 
         from tensorsim import run
@@ -104,7 +112,7 @@ class Simulate:
             )
             people: VideoToPose = _video_to_pose(self, detector_path, pose_path).to(device).eval()
             length_s = 0.0 if reader.frame_count is None else reader.frame_count / reader.fps
-            maps_stage: PoseToDoppler = _pose_to_doppler(self, length_s).to(device).eval()
+            maps_stage: PoseToDoppler = _pose_to_doppler(self, scene, length_s).to(device).eval()
             with run.complete_or_nothing(self.out) as folder:
                 pose = run.pose_of_film(people, reader, device, self.quiet)
                 warn_of_empty_clips(pose.valid)
@@ -125,6 +133,7 @@ class Simulate:
                         "seed": self.seed,
                         "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
                         "radar": asdict(maps_stage.simulator.radar),
+                        "wall": None if scene.wall is None else asdict(scene.wall),
                         "config": config,
                         "warnings": messages,
                     },
@@ -209,19 +218,36 @@ def _video_to_pose(options: Simulate, detector_path: Path, pose_path: Path):  # 
     )
 
 
-def _pose_to_doppler(options: Simulate, length_s: float):  # type: ignore[no-untyped-def]
-    from tensorsim.config import RadarConfig, WallConfig
+def _scene(options: Simulate):  # type: ignore[no-untyped-def]
+    from tensorsim.radar.presets import PRESETS, RadarScene, radar_scene
+
+    scene = PRESETS[options.scene]
+    if options.radar is None:
+        return scene
+    try:
+        chosen = radar_scene(options.radar)
+    except TensorsimError as error:
+        raise TensorsimError(f"--radar: {error}") from None
+    if chosen.radar.has_array:
+        raise TensorsimError(
+            f"--radar: {options.radar} has several antennas, expected one transmitter and one receiver: the maps "
+            "of this command have no antenna dimension"
+        )
+    return RadarScene(chosen.radar, chosen.wall if chosen.wall is not None else scene.wall)
+
+
+def _pose_to_doppler(options: Simulate, scene, length_s: float):  # type: ignore[no-untyped-def]
     from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
     from tensorsim.motion.resample import PoseResampler
     from tensorsim.motion.savgol import SavitzkyGolay
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.radar.simulator import RadarSimulator
 
-    behind_wall = options.scene == "through-wall"
-    radar = RadarConfig.through_wall() if behind_wall else RadarConfig.free_space()
+    radar, wall = scene
+    behind_wall = wall is not None
     simulator = RadarSimulator(
         radar,
-        wall=WallConfig() if behind_wall else None,
+        wall=wall,
         multipath=behind_wall if options.multipath is None else options.multipath,
         leakage=options.leakage,
         wall_echo=options.wall_echo,

@@ -5,6 +5,8 @@ Every default is the control panel of the original application (RadHARSimulator 
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
 
 from tensorsim.errors import TensorsimError
 
@@ -77,9 +79,22 @@ def _require_positive(owner: str, **values: float) -> None:
             raise TensorsimError(f"{owner}.{name}: got {value}, expected a positive finite number")
 
 
+def _as_positions(value: Any) -> Any:
+    """Arrays and lists as tuples, so that a configuration is hashable; a tuple of numbers stays as it is."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return tuple(_as_positions(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+def _listed(positions: Any) -> tuple[Vector, ...]:
+    """One position, or several, as several."""
+    several = len(positions) > 0 and isinstance(positions[0], tuple)
+    return positions if several else (positions,)
+
+
 def _require_vector(owner: str, **values: Vector) -> None:
     for name, value in values.items():
-        if len(value) != 3 or not all(math.isfinite(v) for v in value):
+        numbers = all(isinstance(v, Real) and math.isfinite(v) for v in value)
+        if len(value) != 3 or not numbers:
             raise TensorsimError(
                 f"{owner}.{name}: got {value}, expected three finite numbers (x, y, z) in metres"
             )
@@ -87,13 +102,18 @@ def _require_vector(owner: str, **values: Vector) -> None:
 
 @dataclass(frozen=True)
 class RadarConfig:
-    """An FMCW radar with one transmitter and one receiver. World frame: x right, y range, z height, metres.
+    """An FMCW radar. World frame: x right, y range, z height, metres.
 
     The chirp sweeps upwards from ``carrier_hz``, the **start** of the sweep: ``f(t) = fc + (B / T) t``.
     Defaults are the free-space preset of the original's panel.
 
+    ``tx_m`` and ``rx_m`` are one position (x, y, z) each, or K and A of them: ``((x, y, z), ...)`` or anything
+    of shape (A, 3). Several give the echo an antenna dimension of K * A channels, transmitter by transmitter.
+    Transmitters fire in turn (time division): number k at ``k / (K PRF)`` after the start of a pulse interval.
+
     Raises:
-        TensorsimError: a frequency or duration that is not positive, or a position without three finite numbers.
+        TensorsimError: a frequency or duration that is not positive, a position without three finite numbers,
+            or K chirps that do not fit a pulse interval.
     """
 
     carrier_hz: float = 77e9
@@ -101,8 +121,8 @@ class RadarConfig:
     chirp_s: float = 40e-6
     prf_hz: float = 8192.0
     sample_rate_hz: float = 10e6
-    tx_m: Vector = (-0.1, 0.0, 1.5)
-    rx_m: Vector = (0.1, 0.0, 1.5)
+    tx_m: Vector | tuple[Vector, ...] = (-0.1, 0.0, 1.5)
+    rx_m: Vector | tuple[Vector, ...] = (0.1, 0.0, 1.5)
     antenna_gain_dbi: float = 10.0
     isolation_db: float = 20.0
 
@@ -115,7 +135,12 @@ class RadarConfig:
             prf_hz=self.prf_hz,
             sample_rate_hz=self.sample_rate_hz,
         )
-        _require_vector("RadarConfig", tx_m=self.tx_m, rx_m=self.rx_m)
+        for name in ("tx_m", "rx_m"):
+            object.__setattr__(self, name, _as_positions(getattr(self, name)))
+        for tx in self.tx_positions_m:
+            _require_vector("RadarConfig", tx_m=tx)
+        for rx in self.rx_positions_m:
+            _require_vector("RadarConfig", rx_m=rx)
         for name in ("antenna_gain_dbi", "isolation_db"):
             if not math.isfinite(getattr(self, name)):
                 raise TensorsimError(
@@ -126,10 +151,15 @@ class RadarConfig:
                 f"RadarConfig: {self.sample_rate_hz} Hz over a chirp of {self.chirp_s} s gives "
                 f"{self.samples_per_chirp} samples, expected at least 2"
             )
-        if self.chirp_s * self.prf_hz > 1.0:
+        turns = len(self.tx_positions_m)
+        if self.chirp_s * self.prf_hz * turns > 1.0:
+            chirps = (
+                f"a chirp of {self.chirp_s} s does"
+                if turns == 1
+                else f"{turns} chirps of {self.chirp_s} s do"
+            )
             raise TensorsimError(
-                f"RadarConfig: a chirp of {self.chirp_s} s does not fit the pulse interval "
-                f"{1.0 / self.prf_hz} s of prf_hz {self.prf_hz}"
+                f"RadarConfig: {chirps} not fit the pulse interval {1.0 / self.prf_hz} s of prf_hz {self.prf_hz}"
             )
 
     @classmethod
@@ -141,6 +171,21 @@ class RadarConfig:
     def through_wall(cls, **overrides: float | Vector) -> "RadarConfig":
         """The panel's through-wall radar: 2 GHz, 1 GHz of bandwidth, PRF 128 Hz."""
         return replace(cls(carrier_hz=2e9, bandwidth_hz=1e9, prf_hz=128.0), **overrides)  # type: ignore[arg-type]
+
+    @property
+    def tx_positions_m(self) -> tuple[Vector, ...]:
+        """Every transmitter, also where there is one."""
+        return _listed(self.tx_m)
+
+    @property
+    def rx_positions_m(self) -> tuple[Vector, ...]:
+        """Every receiver, also where there is one."""
+        return _listed(self.rx_m)
+
+    @property
+    def has_array(self) -> bool:
+        """Whether the echo has an antenna dimension: ``tx_m`` or ``rx_m`` is a list of positions."""
+        return self.tx_positions_m != (self.tx_m,) or self.rx_positions_m != (self.rx_m,)
 
     @property
     def slope_hz_per_s(self) -> float:
@@ -208,6 +253,36 @@ class WallConfig:
     def refractive_index(self) -> complex:
         """n = sqrt(eps_r (1 - j tan d)) = n' - j n''."""
         return (self.relative_permittivity * (1 - 1j * self.loss_tangent)) ** 0.5
+
+
+@dataclass(frozen=True)
+class FloorConfig:
+    """A smooth floor, the plane z = 0, that reflects.
+
+    Attributes:
+        relative_permittivity: of the material; the default is concrete (ITU-R P.2040-3, table 3).
+        loss_tangent: of the material.
+        reflection: a constant reflection coefficient in place of Fresnel's, for a floor that was measured.
+
+    Raises:
+        TensorsimError: numbers that are not physical.
+    """
+
+    relative_permittivity: float = 5.24
+    loss_tangent: float = 0.03
+    reflection: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.relative_permittivity) and self.relative_permittivity >= 1):
+            raise TensorsimError(
+                f"FloorConfig.relative_permittivity: got {self.relative_permittivity}, expected a finite number >= 1"
+            )
+        if not (math.isfinite(self.loss_tangent) and self.loss_tangent >= 0):
+            raise TensorsimError(
+                f"FloorConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0"
+            )
+        if self.reflection is not None and not -1 <= self.reflection <= 1:
+            raise TensorsimError(f"FloorConfig.reflection: got {self.reflection}, expected between -1 and 1")
 
 
 @dataclass(frozen=True)

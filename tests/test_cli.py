@@ -1,6 +1,8 @@
 """The command line on a film: files, contents, repeatable noise, nothing half-written."""
 
+import inspect
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +16,7 @@ import tensorsim as ts
 from tensorsim import cli, run
 from tensorsim.data.video import VideoReader
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.radar.presets import PRESETS
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import assert_same
 
@@ -105,6 +108,57 @@ def test_simulate_writes_everything(
     overlay = VideoReader(out / "overlay.mp4")
     assert (overlay.width, overlay.height) == (320, 240)
     assert sum(chunk.shape[0] for chunk in overlay.chunks(8)) == 25
+
+
+def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
+    """The file's radar replaces the scene's, its wall too; the scene's wall stays where the file has none."""
+    options = cli.Simulate(walk, tmp_path, scene="through-wall", radar="cw-24ghz")
+    assert cli._scene(options) == (PRESETS["cw-24ghz"].radar, ts.WallConfig())
+    assert cli._scene(cli.Simulate(walk, tmp_path, radar="cw-24ghz")).wall is None
+    assert cli._scene(cli.Simulate(walk, tmp_path, radar="through-wall")) == PRESETS["through-wall"]
+    assert cli._scene(cli.Simulate(walk, tmp_path)) == PRESETS["free-space"]
+
+    file = tmp_path / "my.yaml"
+    file.write_text("carrier_hz: 3e9\nbandwidth_hz: 500e6\nprf_hz: 200\nwall: {loss_tangent: 0.01}\n")
+    cli.main(["simulate", str(walk), "--out", str(tmp_path / "out"), "--radar", str(file), *stand_ins])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["radar"]["carrier_hz"] == 3e9
+    assert summary["wall"]["loss_tangent"] == 0.01
+    assert summary["config"]["radar"] == str(file)
+    maps = np.load(tmp_path / "out" / "maps.npz")
+    assert maps["range_time"].shape == (200, 500)
+    assert maps["range_m"][1] == pytest.approx(0.29979, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("radar", "message"),
+    [
+        ("ti-awr1834", "error: --radar: .*perhaps 'ti-awr1843'"),
+        ("bad.yaml", "error: --radar: .*bad.yaml: prf_hz: got 'fast', expected a number"),
+        ("ti-awr1843-array", "error: --radar: ti-awr1843-array has several antennas"),
+    ],
+)
+def test_a_bad_radar_is_refused_before_work_starts(
+    walk: Path,
+    tmp_path: Path,
+    stand_ins: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    radar: str,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bad.yaml").write_text("prf_hz: fast\n")
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["simulate", str(walk), "--out", str(tmp_path / "out"), "--radar", radar, *stand_ins])
+    assert exit_.value.code == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_names_every_preset() -> None:
+    help_text = inspect.getsource(cli.Simulate)
+    assert all(name in help_text for name, scene in PRESETS.items() if not scene.radar.has_array)
 
 
 def test_the_seed_repeats_the_noise(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:

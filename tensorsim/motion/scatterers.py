@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 
 import torch
 from torch import Tensor, nn
 
-from tensorsim.config import JOINT_RCS_M2
+from tensorsim.config import JOINT_RCS_M2, Vector
 from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive, check_size
 
 
@@ -63,28 +64,84 @@ def visibility_fade(
     return rise * fall
 
 
+def check_people(positions: Tensor, fade: Tensor, joints: int) -> None:
+    """Refuse anything but positions (..., P, M, ``joints``, 3) and fade (..., P, M), both floating point."""
+    layout = f"(..., P, M, {joints}, 3)"
+    check_floating(positions, "positions")
+    check_floating(fade, "fade")
+    check_min_rank(positions, 4, "positions", layout)
+    check_size(positions, -1, 3, "positions", layout)
+    check_size(positions, -2, joints, "positions", layout)
+    if fade.shape != positions.shape[:-2]:
+        raise TensorsimError(
+            f"fade: got shape {list(fade.shape)}, expected (..., P, M) {list(positions.shape[:-2])}"
+        )
+
+
+def one_scene(points: Tensor, rcs: Tensor, fade: Tensor) -> tuple[Tensor, Tensor]:
+    """The scatterers of P people as one scene, person after person.
+
+    Args:
+        points: (..., P, M, K, 3) metres, K scatterers per person.
+        rcs: (..., P, M, K) or what broadcasts to it, m^2.
+        fade: (..., P, M) amplitude of each person.
+
+    Returns:
+        Positions (..., M, P * K, 3) and cross sections (..., M, P * K), both in the dtype of the points.
+        Amplitude goes with the square root of the cross section, so a person counts ``fade ** 2`` times.
+    """
+    shown = (fade.square().unsqueeze(-1) * rcs).to(points.dtype)
+    return points.transpose(-4, -3).flatten(-3, -2), shown.transpose(-3, -2).flatten(-2)
+
+
+def check_antenna(name: str, position: Vector) -> None:
+    """Refuse an antenna position without three finite numbers."""
+    if len(position) != 3 or not all(isinstance(v, Real) and math.isfinite(v) for v in position):
+        raise TensorsimError(f"{name}: got {position}, expected three finite numbers (x, y, z) in metres")
+
+
+def weights(names: Sequence[str], *points: dict[str, float]) -> Tensor:
+    """Points that are weighted sums of named ones, as a matrix (points, names) float64."""
+    return torch.tensor([[point.get(name, 0.0) for name in names] for point in points], dtype=torch.float64)
+
+
 class JointScatterers(nn.Module):
     """One point scatterer per joint; the people of a clip become one scene.
 
     Args:
         rcs_m2: radar cross section of each joint in m^2; the default is the original's panel.
+        learnable: whether the table is a parameter, to be fitted to an echo from ``rcs_m2`` on. What is learned
+            is its logarithm ``log_rcs_m2``, so that it stays positive and a step is a step in dB.
 
     Example:
         >>> JointScatterers()(positions, fade)  # (B, P, M, 14, 3), (B, P, M) -> (B, M, 14 P, 3), (B, M, 14 P)
 
     Raises:
-        TensorsimError: no joint, or a cross section that is negative or not finite.
+        TensorsimError: no joint, or a cross section that is negative or not finite (or 0, if learnable).
     """
 
     rcs_m2: Tensor
+    log_rcs_m2: Tensor | None
 
-    def __init__(self, rcs_m2: Sequence[float] = JOINT_RCS_M2) -> None:
+    def __init__(self, rcs_m2: Sequence[float] = JOINT_RCS_M2, learnable: bool = False) -> None:
         super().__init__()
         if len(rcs_m2) == 0 or not all(math.isfinite(v) and v >= 0 for v in rcs_m2):
             raise TensorsimError(
                 f"JointScatterers.rcs_m2: got {rcs_m2}, expected finite numbers >= 0, one per joint"
             )
-        self.register_buffer("rcs_m2", torch.tensor(tuple(rcs_m2), dtype=torch.float64), persistent=False)
+        if learnable and min(rcs_m2) == 0:
+            raise TensorsimError(
+                f"JointScatterers.rcs_m2: got {rcs_m2}, expected numbers > 0 to learn from: the logarithm of 0 "
+                "cannot be moved"
+            )
+        table = torch.tensor(tuple(rcs_m2), dtype=torch.float64)
+        self.register_buffer("rcs_m2", table, persistent=False)
+        self.register_parameter("log_rcs_m2", nn.Parameter(table.log()) if learnable else None)
+
+    def table(self) -> Tensor:
+        """The cross sections (J,) in m^2 as they are now; differentiable by ``log_rcs_m2`` if learnable."""
+        log_rcs_m2 = self.log_rcs_m2
+        return self.rcs_m2 if log_rcs_m2 is None else log_rcs_m2.exp()
 
     def forward(self, positions: Tensor, fade: Tensor) -> tuple[Tensor, Tensor]:
         """Place scatterers at joints; any range of pulses.
@@ -95,23 +152,11 @@ class JointScatterers(nn.Module):
 
         Returns:
             Positions (..., M, P * J, 3), person after person, and their cross sections (..., M, P * J) in m^2
-            and in the dtype of the positions. Amplitude goes with the square root of the cross section, so
-            this is ``fade ** 2`` times that of the joint.
+            and in the dtype of the positions, see :func:`one_scene`.
 
         Raises:
             TensorsimError: wrong ranks or dtypes, another number of joints, or shapes that do not go
                 together.
         """
-        layout = f"(..., P, M, {self.rcs_m2.shape[0]}, 3)"
-        check_floating(positions, "positions")
-        check_floating(fade, "fade")
-        check_min_rank(positions, 4, "positions", layout)
-        check_size(positions, -1, 3, "positions", layout)
-        check_size(positions, -2, self.rcs_m2.shape[0], "positions", layout)
-        if fade.shape != positions.shape[:-2]:
-            raise TensorsimError(
-                f"fade: got shape {list(fade.shape)}, expected (..., P, M) {list(positions.shape[:-2])}"
-            )
-        rcs = fade.square().unsqueeze(-1) * self.rcs_m2.to(positions.dtype)
-        scene = positions.transpose(-4, -3).flatten(-3, -2)
-        return scene, rcs.to(positions.dtype).transpose(-3, -2).flatten(-2)
+        check_people(positions, fade, self.rcs_m2.shape[0])
+        return one_scene(positions, self.table().to(positions.dtype), fade)

@@ -13,10 +13,11 @@ from tensorsim.radar.paths import leg_length
 def radial_speed(positions: Tensor, radar: RadarConfig) -> Tensor:
     """Half the rate of change of ``|P - Ptx| + |P - Prx|`` in m/s, positive = receding.
 
-    (..., M, S, 3) metres -> (..., M - 1, S).
+    Of several antennas the first of each; (..., M, S, 3) metres -> (..., M - 1, S).
     """
     positions = positions.double()
-    length = leg_length(positions, radar.tx_m, 0.0) + leg_length(positions, radar.rx_m, 0.0)
+    tx, rx = positions.new_tensor([radar.tx_positions_m[0], radar.rx_positions_m[0]])
+    length = leg_length(positions, tx, 0.0) + leg_length(positions, rx, 0.0)
     return length.diff(dim=-2) * (radar.prf_hz / 2)
 
 

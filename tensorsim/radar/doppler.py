@@ -11,8 +11,27 @@ from tensorsim.radar.paths import safe_sqrt
 from tensorsim.radar.range_profile import check_complex_map, flatten_batch, unflatten_batch
 
 
-class DopplerTimeMap(nn.Module):
-    """Doppler-time map ``sqrt(sum over range bins of |STFT of that bin|^2)`` of complex profiles.
+def coherent_sum(profiles: Tensor, samples: int) -> Tensor:
+    """Sum range bins as the beat signal at mid-chirp: (..., M, R) complex -> (..., M, 1).
+
+    Bin k of a profile is ``X[k] = sum over n of w[n] x[n] exp(-j 2 pi k n / N)``, its phase counted from the first
+    of N = ``samples`` samples. The plain sum over all k is therefore ``N w[0] x[0]``: one sample, where every window
+    is weakest (0 for Hann). Counted from mid-chirp, ``c = (N - 1) / 2``, the bins
+
+        Y[k] = X[k] exp(+j 2 pi k c / N) = sum over n of w[n] x[n] exp(-j 2 pi k (n - c) / N)
+
+    of one target at beat bin b are ``a exp(j 2 pi b c / N) W(b - k)`` with a W that is real for a symmetric window:
+    its whole main lobe adds up in phase, and all bins give ``N w x`` at mid-chirp, where a window is strongest.
+    A first bin other than 0 turns the phase of all alike.
+    """
+    bins = torch.arange(profiles.shape[-1], dtype=torch.float64, device=profiles.device)
+    cycles = torch.remainder(bins * ((samples - 1) / (2 * samples)), 1.0)
+    phase = torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles).to(profiles.dtype)
+    return torch.matmul(profiles, phase.unsqueeze(-1))
+
+
+class DopplerFrames(nn.Module):
+    """The short-time Fourier transform that the maps over Doppler and time share: window, frames and axes.
 
     The window is a periodic Hann of ``L = round(window_s * PRF)`` pulses, the hop ``L - floor(overlap * L)``,
     the FFT length the next power of two >= max(L, 256); frames lie wholly inside the signal; nothing is
@@ -22,50 +41,41 @@ class DopplerTimeMap(nn.Module):
         radar: the radar (its PRF).
         window_s: window length in seconds.
         overlap: part of the window that neighbouring frames share, in [0, 1).
-        integration: ``"noncoherent"``, or ``"paper"`` for the printed formula, the STFT of the sum of
-            magnitudes over range, which is real and so shows every motion on both sides.
-
-    Shapes: (..., M, R) complex -> (..., F, K) magnitude, Doppler ascending. Differentiable, with gradient
-    0 where the map is 0.
 
     Attributes:
         doppler_hz: (F,) ascending, ``fftshift(fftfreq(F, 1 / PRF))``.
         length, hop, bins: L, the hop in pulses, and F.
+        frame_rate_hz: frames per second, PRF / hop.
 
     Raises:
-        TensorsimError: a window shorter than 2 pulses, an overlap outside [0, 1), real profiles, fewer than L
-            pulses.
+        TensorsimError: a window shorter than 2 pulses, an overlap outside [0, 1).
     """
 
     window: Tensor
+    shifting_window: Tensor
     doppler_hz: Tensor
 
-    def __init__(
-        self,
-        radar: RadarConfig,
-        window_s: float = 0.1,
-        overlap: float = 0.9,
-        integration: str = "noncoherent",
-    ) -> None:
+    def __init__(self, radar: RadarConfig, window_s: float = 0.1, overlap: float = 0.9) -> None:
         super().__init__()
-        if integration not in ("noncoherent", "paper"):
-            raise TensorsimError(f"integration: got {integration!r}, expected 'noncoherent' or 'paper'")
         if not 0 <= overlap < 1:
             raise TensorsimError(f"overlap: got {overlap}, expected a number in [0, 1)")
         if not (math.isfinite(window_s) and round(window_s * radar.prf_hz) >= 2):
             raise TensorsimError(
                 f"window_s: got {window_s} s, expected at least two pulses at a PRF of {radar.prf_hz} Hz"
             )
-        self.integration = integration
         self.prf_hz = float(radar.prf_hz)
         self.length = round(window_s * radar.prf_hz)
         self.hop = self.length - math.floor(overlap * self.length)
+        self.frame_rate_hz = self.prf_hz / self.hop
         self.bins = 1 << (max(self.length, 256) - 1).bit_length()
-        # Spectra are worked on in blocks of about 2 MB (complex64), which stay in the cache.
-        self.block_frames, self.block_size = 64, 2**18
+        # Spectra are worked on in blocks of about 512 kB (complex64), which stay in the cache.
+        self.block_size = 2**16
         window = torch.hann_window(self.length, periodic=True, dtype=torch.float64)
+        # Every other sample with the other sign turns the spectrum by half a circle: bins ascend from -PRF / 2.
+        alternating = 1.0 - 2.0 * (torch.arange(self.length, dtype=torch.float64) % 2)
         frequency = torch.fft.fftfreq(self.bins, 1 / radar.prf_hz, dtype=torch.float64)
         self.register_buffer("window", window, persistent=False)
+        self.register_buffer("shifting_window", window * alternating, persistent=False)
         self.register_buffer("doppler_hz", torch.fft.fftshift(frequency), persistent=False)
 
     @torch.jit.export
@@ -78,8 +88,8 @@ class DopplerTimeMap(nn.Module):
         """Centre (K,) of each frame in seconds after the first of ``pulses`` pulses."""
         return (torch.arange(self.frames(pulses)) * self.hop + self.length / 2).double() / self.prf_hz
 
-    def forward(self, profiles: Tensor) -> Tensor:
-        """Profiles (..., M, R) complex to the map (..., F, K)."""
+    def series(self, profiles: Tensor) -> Tensor:
+        """Profiles (..., M, R), checked, as one series per range bin: (B, R, M)."""
         check_complex_map(profiles, "profiles", "(..., pulses, range bins)")
         shape = list(profiles.shape)
         if shape[-2] < self.length:
@@ -87,23 +97,112 @@ class DopplerTimeMap(nn.Module):
                 f"profiles: got {shape[-2]} pulses in shape {shape}, expected at least the "
                 f"{self.length} of one Doppler window"
             )
-        series = flatten_batch(profiles, 2).transpose(1, 2)  # (B, R, M)
+        return flatten_batch(profiles, 2).transpose(1, 2)
+
+    def power(self, frames: Tensor) -> Tensor:
+        """Real and imaginary power (..., F, 2) of frames (..., L), Doppler ascending."""
+        window = self.shifting_window.to(torch.real(frames).dtype)
+        # |FFT(conj x)[f]| = |FFT(x)[-f]|, and a transform with the other sign puts -f at f.
+        spectrum = torch.fft.ifft(frames * window, self.bins, norm="forward")
+        return torch.view_as_real(spectrum.resolve_conj()).square()
+
+
+class DopplerTimeMap(DopplerFrames):
+    """Doppler-time map of complex profiles.
+
+    Args:
+        radar, window_s, overlap: see :class:`DopplerFrames`.
+        integration: over range bins. ``"noncoherent"``: ``sqrt(sum over range bins of |STFT of that bin|^2)``.
+            ``"coherent"``: |STFT| of :func:`coherent_sum`, which adds the bins of a target in phase and those of
+            others with whatever phase they have: for a gate around one target. ``"paper"``: the printed formula,
+            the STFT of the sum of magnitudes over range, which is real and so shows every motion on both sides.
+        gate_m: (nearest, farthest) range in metres whose bins are used, of profiles that start at range 0; None
+            takes all of them.
+
+    Shapes: (..., M, R) complex -> (..., F, K) magnitude, Doppler ascending. Differentiable, with gradient
+    0 where the map is 0.
+
+    Raises:
+        TensorsimError: as :class:`DopplerFrames`; unknown integration, a gate without bins, real profiles, fewer
+            than L pulses.
+    """
+
+    def __init__(
+        self,
+        radar: RadarConfig,
+        window_s: float = 0.1,
+        overlap: float = 0.9,
+        integration: str = "noncoherent",
+        gate_m: tuple[float, float] | None = None,
+    ) -> None:
+        super().__init__(radar, window_s, overlap)
+        if integration not in ("noncoherent", "coherent", "paper"):
+            raise TensorsimError(
+                f"integration: got {integration!r}, expected 'noncoherent', 'coherent' or 'paper'"
+            )
+        self.integration = integration
+        self.samples = radar.samples_per_chirp
+        first, last = 0, self.samples - 1
+        if gate_m is not None:
+            first = max(first, math.ceil(gate_m[0] / radar.range_resolution_m - 1e-9))
+            last = min(last, math.floor(gate_m[1] / radar.range_resolution_m + 1e-9))
+            if first > last:
+                raise TensorsimError(
+                    f"gate_m: got {gate_m}, expected a near and a far range with a bin between, bins being "
+                    f"{radar.range_resolution_m:.4g} m apart"
+                )
+        self.first_bin, self.last_bin = first, last
+
+    def forward(self, profiles: Tensor) -> Tensor:
+        """Profiles (..., M, R) complex to the map (..., F, K)."""
+        if profiles.dim() > 1 and profiles.shape[-1] <= self.first_bin and profiles.shape[-1] > 0:
+            raise TensorsimError(
+                f"profiles: got shape {list(profiles.shape)}, expected more than the {self.first_bin} range bins "
+                f"before the gate"
+            )
+        series = self.series(profiles[..., self.first_bin : self.last_bin + 1])  # (B, R, M)
         if self.integration == "paper":
             series = series.abs().sum(1, keepdim=True)
-        window = self.window.to(torch.view_as_real(profiles).dtype)
+        elif self.integration == "coherent":
+            series = coherent_sum(series.transpose(1, 2), self.samples).transpose(1, 2)
         frames = series.unfold(-1, self.length, self.hop)  # (B, R, K, L), a view
-        step = max(1, self.block_size // (frames.shape[0] * self.block_frames * self.bins))
+        # Neighbouring frames share most of their pulses: blocks take frames first, then range bins and clips.
+        columns = max(1, min(64, frames.shape[2], self.block_size // self.bins))
+        clips = max(1, self.block_size // (columns * self.bins))
+        step = max(1, self.block_size // (min(clips, frames.shape[0]) * columns * self.bins))
+        maps: list[Tensor] = []
+        for clip in range(0, frames.shape[0], clips):
+            blocks: list[Tensor] = []
+            for first in range(0, frames.shape[2], columns):
+                block = frames[clip : clip + clips, :, first : first + columns]
+                power = self.power(block[:, :step]).sum(1)
+                for near in range(step, block.shape[1], step):
+                    power = power + self.power(block[:, near : near + step]).sum(1)
+                blocks.append(safe_sqrt(power[..., 0] + power[..., 1]))
+            maps.append(torch.cat(blocks, 1))
+        return unflatten_batch(torch.cat(maps).transpose(1, 2), list(profiles.shape[:-2]))
+
+
+class RangeDopplerVideo(DopplerFrames):
+    """Range-Doppler power frame by frame: the Doppler-time map before its sum over range.
+
+    Args:
+        radar, window_s, overlap: see :class:`DopplerFrames`.
+
+    Shapes: (..., M, R) complex -> (..., K, R, F) power ``|STFT|^2``; the sum over R is the square of the noncoherent
+    Doppler-time map. Differentiable.
+
+    Raises:
+        TensorsimError: as :class:`DopplerFrames`; real profiles, fewer than L pulses.
+    """
+
+    def forward(self, profiles: Tensor) -> Tensor:
+        """Profiles (..., M, R) complex to power (..., K, R, F)."""
+        frames = (
+            self.series(profiles).unfold(-1, self.length, self.hop).transpose(1, 2)
+        )  # (B, K, R, L), a view
+        step = max(1, self.block_size // (frames.shape[0] * frames.shape[2] * self.bins))
         blocks: list[Tensor] = []
-        for first in range(0, frames.shape[2], self.block_frames):
-            block = frames[:, :, first : first + self.block_frames]
-            power = torch.zeros(
-                [block.shape[0], block.shape[2], self.bins, 2], dtype=window.dtype, device=window.device
-            )
-            for near in range(0, block.shape[1], step):
-                spectrum = torch.fft.fft(block[:, near : near + step] * window, self.bins)
-                power = power + torch.view_as_real(spectrum).square().sum(1)
-            blocks.append(power.sum(-1))
-        spectra = safe_sqrt(torch.cat(blocks, 1))
-        # |FFT(conj x)[f]| = |FFT(x)[-f]|, so the conjugate costs a flip of the result only.
-        spectra = torch.fft.fftshift(spectra.flip(-1).roll(1, -1), -1)
-        return unflatten_batch(spectra.transpose(1, 2), shape[:-2])
+        for first in range(0, frames.shape[1], step):
+            blocks.append(self.power(frames[:, first : first + step]).sum(-1))
+        return unflatten_batch(torch.cat(blocks, 1), list(profiles.shape[:-2]))

@@ -13,26 +13,27 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig, WallConfig
+from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, is_exporting
-from tensorsim.radar.paths import PropagationPaths, mirror
-from tensorsim.radar.wall import near_face_m, place_wall, slab_coefficients
+from tensorsim.radar.paths import Paths, PropagationPaths, Resonance, chosen_paths
+from tensorsim.radar.wall import place_wall
 
 
-class EchoParts(NamedTuple):
-    """The parts of an IF, each (..., M, N) complex; zero where the scene has no such part.
+class SideChannels(NamedTuple):
+    """Ground truth of every way W over every scatterer, each (..., M, S, W) float64.
+
+    With several antennas (..., V, M, S, W).
 
     Attributes:
-        direct: straight to every target and back, through a wall if there is one.
-        multipath: the bounced and mirrored ways, if the synthesizer was made with ``multipath``.
-        leakage: from transmitter to receiver.
-        wall_echo: static reflection of the wall.
+        range_m: ``c tau / 2``, where the way shows in a range profile.
+        radial_speed_m_s: its rate of change, positive = approaching as on the Doppler axis; central
+            differences, one-sided at the ends of the clip, 0 for a clip of one pulse.
+        amplitude: ``|a|`` of the IF for unit transmit power, 0 for a missing way.
     """
 
-    direct: Tensor
-    multipath: Tensor
-    leakage: Tensor
-    wall_echo: Tensor
+    range_m: Tensor
+    radial_speed_m_s: Tensor
+    amplitude: Tensor
 
 
 def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
@@ -111,39 +112,75 @@ def beat_sum(
     return torch.matmul(left, right).flatten(-2)
 
 
+def dispersed_sum(
+    paths: Paths,
+    resonance: Resonance,
+    carrier_hz: float,
+    slope_hz_per_s: float,
+    time_s: Tensor,
+) -> Tensor:
+    """:func:`beat_sum` of ways whose gain depends on the frequency of the sweep: (..., S, W) -> (..., N).
+
+    The wave that arrives at ``t_n`` has the frequency ``f = fc + mu (t_n - tau)``, and each leg multiplies it
+    by ``T(f) / T_0(fc) = exp(-alpha d (f / fc - 1)) / (1 - G^2 exp(-2 alpha d f / fc - j 2 pi f t))``: the
+    closed sum of all internal bounces over the straight passage, t the delay of a pair. The phase of the straight
+    passage is in ``tau`` and not in this factor; that the k-th bounce is k t late enters by the frequency
+    alone, which leaves out ``mu (k t)^2 / 2`` cycles (2e-4 for the default wall).
+    """
+    echo = paths.gain.new_zeros(list(paths.gain.shape[:-2]) + list(time_s.shape))
+    for s in range(paths.gain.shape[-2]):  # all at once would hold S W N complex numbers per pulse
+        delay = paths.delay_s[..., s, :, None]
+        cycles = carrier_hz * delay + slope_hz_per_s * delay * (time_s - 0.5 * delay)
+        frequency = (carrier_hz + slope_hz_per_s * (time_s - delay)).unsqueeze(-2)  # (..., W, 1, N)
+        relative = frequency / carrier_hz
+        neper, bounce = resonance.loss_neper[..., s, :, :, None], resonance.bounce_s[..., s, :, :, None]
+        turn = torch.polar(torch.exp(-2 * neper * relative), -2 * math.pi * bounce * frequency)
+        leg = torch.exp(-neper * (relative - 1)) / (1 - resonance.square[..., s, :, :, None] * turn)
+        factor = (leg[..., 0, :] * leg[..., 1, :]).conj() * paths.gain[..., s, :, None]
+        echo = echo + (phasor(cycles - cycles.round()) * factor).sum(-2)
+    return echo
+
+
 class EchoSynthesizer(nn.Module):
     """IF samples of a scene, free of noise.
 
     Args:
-        radar: the radar.
+        radar: the radar. Several transmitters or receivers give the IF an antenna dimension.
         wall: a wall in the scene; see :class:`~tensorsim.radar.paths.PropagationPaths` for what it does to
             the echo of a target, and :func:`~tensorsim.radar.wall.place_wall` for where it may stand.
         multipath: include the bounced and mirrored ways of the wall; without a wall there are none.
-        leakage: include the direct coupling from transmitter to receiver: amplitude ``10^(-isolation/20)``,
-            delay ``|Ptx - Prx| / c``.
-        wall_echo: include the static specular echo transmitter - near face - receiver, by the Friis equation
-            on the mirrored path: ``lambda sqrt(Gt Gr) / (4 pi R) G`` with ``R = |Ptx' - Prx|``.
+        leakage: include the direct coupling from transmitter to receiver.
+        wall_echo: include the static echo of the wall's near face.
         wall_paths: ``"series"``, or ``"paper"`` for the terms that the paper keeps.
         direct: include the direct way to each target; off, only bounced and mirrored ways are left.
         pulse_chunk: pulses that are worked on at a time; bounds the working memory.
+        incidence: ``"normal"``, ``"oblique"`` or ``"airy"``: how legs pass the wall.
+        polarization: ``"te"`` or ``"tm"`` at the wall, for the latter two.
+        bounces: largest number of pairs of internal bounces on a leg.
+        floor: a floor that reflects.
+        antenna: pattern of all antennas (:mod:`~tensorsim.radar.antenna`); None is isotropic.
+        paths: names of the paths to include, of ``tensorsim.radar.paths.PATH_NAMES``, instead of what
+            ``direct``, ``multipath``, ``leakage``, ``wall_echo`` and ``floor`` stand for.
+        learnable: which of ``tensorsim.radar.paths.LEARNABLE`` are parameters of ``.paths``, by that name.
 
     Shapes:
         positions (..., M, S, 3) metres in the world frame, rcs (..., S) m^2 per clip, (..., M, S) per pulse
         or (S,) -> (..., M, N) complex for transmit power 1. S = 0 is an empty scene: zeros, plus leakage and
-        wall echo.
+        wall echo. Several antennas: (..., V, M, N), channel ``v = k A + a`` for transmitter k and receiver a.
+
+    Transmitter k of K fires ``k / (K PRF)`` after the start of the pulse interval; the positions of that
+    instant are interpolated linearly between pulses, and extrapolated after the last.
 
     The result is complex64, and complex128 after ``.double()``; geometry is float64 always, so float64
-    positions keep their digits. Differentiable by positions and RCS (the gradient of sqrt(RCS) at RCS 0 is
-    set to 0).
+    positions keep their digits. Differentiable by positions, RCS (the gradient of sqrt(RCS) at RCS 0 is set
+    to 0) and what is learnable.
 
     Raises:
-        TensorsimError: wrong ranks or shapes, no pulse, NaN, negative RCS.
+        TensorsimError: wrong ranks or shapes, no pulse, NaN, negative RCS; unknown options.
     """
 
     coarse: Tensor
     fine: Tensor
-    leakage_if: Tensor
-    wall_echo_if: Tensor
 
     def __init__(
         self,
@@ -155,98 +192,147 @@ class EchoSynthesizer(nn.Module):
         wall_paths: str = "series",
         direct: bool = True,
         pulse_chunk: int = 1024,
+        incidence: str = "normal",
+        polarization: str = "te",
+        bounces: int = 1,
+        floor: FloorConfig | None = None,
+        antenna: nn.Module | None = None,
+        paths: tuple[str, ...] | None = None,
+        learnable: tuple[str, ...] = (),
     ) -> None:
         super().__init__()
         if pulse_chunk < 1:
             raise TensorsimError(f"pulse_chunk: got {pulse_chunk}, expected at least 1")
+        names = chosen_paths(multipath, leakage, wall_echo, direct, floor is not None, paths)
         wall = place_wall(wall, radar)
-        self.paths = PropagationPaths(radar, wall, multipath, wall_paths)
+        self.paths = PropagationPaths(
+            radar, wall, names, wall_paths, incidence, polarization, bounces, floor, antenna, learnable
+        )
         self.carrier_hz = float(radar.carrier_hz)
         self.slope_hz_per_s = float(radar.slope_hz_per_s)
         self.sample_rate_hz = float(radar.sample_rate_hz)
+        self.prf_hz = float(radar.prf_hz)
         self.samples = radar.samples_per_chirp
-        self.direct, self.leakage, self.wall_echo = direct, leakage, wall_echo
         self.pulse_chunk = pulse_chunk
         fine = math.isqrt(self.samples - 1) + 1
         self.register_buffer("fine", torch.arange(fine).float(), persistent=False)
         self.register_buffer("coarse", torch.arange(-(-self.samples // fine)).float(), persistent=False)
 
-        coupling = 10 ** (-radar.isolation_db / 20)
-        leakage_if = self._static_path(math.dist(radar.tx_m, radar.rx_m), complex(coupling))
-        wall_if = torch.zeros_like(leakage_if)
-        if wall is not None:
-            shortest = radar.wavelength_m / (4 * math.pi)
-            length = max(math.dist(mirror(radar.tx_m, near_face_m(wall)), radar.rx_m), shortest)
-            friis = 10 ** (radar.antenna_gain_dbi / 10) * shortest / length
-            reflection = slab_coefficients(wall, radar.carrier_hz).reflection
-            wall_if = self._static_path(length, friis * reflection.conjugate())
-        self.register_buffer("leakage_if", leakage_if, persistent=False)
-        self.register_buffer("wall_echo_if", wall_if, persistent=False)
-
-    @torch.jit.unused
-    def _static_path(self, length_m: float, gain: complex) -> Tensor:
-        """IF (N, 2), real and imaginary part in float64, of a path that does not move."""
-        delay = torch.tensor([[length_m / SPEED_OF_LIGHT_M_S]], dtype=torch.float64)
-        factor = torch.tensor([[gain]], dtype=torch.complex128)
-        pulse = beat_sum(
-            delay,
-            factor,
-            self.carrier_hz,
-            self.slope_hz_per_s,
-            self.sample_rate_hz,
-            self.coarse.double(),
-            self.fine.double(),
-        )
-        return torch.view_as_real(pulse[0, : self.samples].contiguous())
-
     @torch.jit.export
-    def target_echo(self, positions: Tensor, rcs: Tensor) -> Tensor:
-        """Echo of the targets alone, unchecked and in one go: (..., S, 3) m and (..., S) m^2 -> (..., N)."""
-        paths = self.paths(positions.double(), rcs.double())
-        first = 0 if self.direct else 1
-        return self._sum(paths.delay_s[..., first:], paths.gain[..., first:])
+    def target_echo(self, positions: Tensor, rcs: Tensor, step: Tensor | None = None) -> Tensor:
+        """Echo of the targets alone, unchecked and in one go.
 
-    def _sum(self, delay_s: Tensor, gain: Tensor) -> Tensor:
-        """IF (..., N) of paths (..., S, W)."""
+        (..., S, 3) m and (..., S) m^2 -> (..., N); several antennas (..., M, S, 3) -> (..., V, M, N). ``step``:
+        see :meth:`PropagationPaths.forward <tensorsim.radar.paths.PropagationPaths.forward>`.
+        """
+        paths = self.paths(positions.double(), rcs.double(), step)
+        if self.paths.airy:
+            resonance = self.paths.resonance(positions.double(), step)
+            return self._dispersed(paths, resonance)
+        return self._sum(paths.delay_s.flatten(-2), paths.gain.flatten(-2), self.fine.dtype)
+
+    def _dispersed(self, paths: Paths, resonance: Resonance) -> Tensor:
+        time = torch.arange(self.samples, device=self.fine.device).double() / self.sample_rate_hz
+        pulses = dispersed_sum(paths, resonance, self.carrier_hz, self.slope_hz_per_s, time)
+        return pulses.to(torch.complex(self.fine, self.fine).dtype)
+
+    def _sum(self, delay_s: Tensor, gain: Tensor, dtype: torch.dtype) -> Tensor:
+        """IF (..., N) of paths (..., P)."""
         pulses = beat_sum(
-            delay_s.flatten(-2),
-            gain.flatten(-2),
+            delay_s,
+            gain,
             self.carrier_hz,
             self.slope_hz_per_s,
             self.sample_rate_hz,
-            self.coarse,
-            self.fine,
+            self.coarse.to(dtype),
+            self.fine.to(dtype),
         )
         return pulses[..., : self.samples]
 
     @torch.jit.export
-    def parts(self, positions: Tensor, rcs: Tensor) -> EchoParts:
-        """What the IF is made of, part by part and whatever is switched on; arguments as in forward."""
-        rcs = check_scene(positions, rcs)
-        paths = self.paths(positions.double(), rcs.double())
-        direct = self._sum(paths.delay_s[..., :1], paths.gain[..., :1])
-        multipath = self._sum(paths.delay_s[..., 1:], paths.gain[..., 1:])
-        leakage = torch.view_as_complex(self.leakage_if.to(self.fine.dtype)).expand(direct.shape)
-        wall_echo = torch.view_as_complex(self.wall_echo_if.to(self.fine.dtype)).expand(direct.shape)
-        return EchoParts(direct, multipath, leakage, wall_echo)
-
-    @torch.jit.export
     def static_echo(self) -> Tensor:
-        """IF (N,) of what does not move and is switched on: leakage and wall echo."""
-        total = torch.zeros_like(self.leakage_if)
-        if self.leakage:
-            total = total + self.leakage_if
-        if self.wall_echo:
-            total = total + self.wall_echo_if
-        return torch.view_as_complex(total.to(self.fine.dtype))
+        """IF (N,) of what does not move: leakage and wall echo; (V, 1, N) for several antennas."""
+        static = self.paths.static()
+        parts = torch.view_as_real(self._sum(static.delay_s, static.gain, torch.float64))
+        return torch.view_as_complex(parts.to(self.fine.dtype).contiguous())
 
     def forward(self, positions: Tensor, rcs: Tensor) -> Tensor:
-        """(..., M, S, 3) metres and (..., S) or (..., M, S) m^2 to IF (..., M, N)."""
+        """(..., M, S, 3) metres and (..., S) or (..., M, S) m^2 to IF (..., M, N) or (..., V, M, N)."""
         rcs = check_scene(positions, rcs).flatten(0, -2)
         pulses = positions.flatten(0, -3)
+        step = self._step(positions)
         static = self.static_echo()
         chunks: list[Tensor] = []
         for start in range(0, pulses.shape[0], self.pulse_chunk):
             stop = start + self.pulse_chunk
-            chunks.append(self.target_echo(pulses[start:stop], rcs[start:stop]) + static)
-        return torch.cat(chunks).unflatten(0, list(positions.shape[:-2]))
+            ahead = None if step is None else step[start:stop]
+            chunks.append(self.target_echo(pulses[start:stop], rcs[start:stop], ahead) + static)
+        echo = torch.cat(chunks, -2).unflatten(-2, list(positions.shape[:-2]))
+        return echo.movedim(0, -3) if self.paths.has_array else echo
+
+    def _step(self, positions: Tensor) -> Tensor | None:
+        """Way to the next pulse, (pulses of all clips, S, 3), where transmitters need it."""
+        if self.paths.transmitters == 1:
+            return None
+        positions = positions.double()
+        if positions.shape[-3] == 1:
+            return torch.zeros_like(positions).flatten(0, -3)
+        step = positions.diff(dim=-3)
+        return torch.cat((step, step[..., -1:, :, :]), -3).flatten(0, -3)
+
+    @torch.jit.export
+    def contributions(self, positions: Tensor, rcs: Tensor, groups: Tensor) -> Tensor:
+        """IF of each group of scatterers by each way: (..., G, W, M, N), or (..., G, W, V, M, N).
+
+        ``groups`` (S,) int64 numbers the group of each scatterer: their person, or 0 ... S - 1 for each alone.
+        The ways are named by ``.paths.ways``. Summed over G and W, with :meth:`static_echo`, they are the echo.
+        """
+        rcs = check_scene(positions, rcs)
+        if groups.dim() != 1 or groups.shape[0] != positions.shape[-2] or groups.is_floating_point():
+            raise TensorsimError(
+                f"groups: got {list(groups.shape)} {groups.dtype}, expected one integer per scatterer, "
+                f"[{positions.shape[-2]}]"
+            )
+        if groups.numel() == 0 or len(self.paths.ways) == 0:
+            raise TensorsimError(
+                "contributions: got a scene without scatterers or ways, expected some of each"
+            )
+        step = self._step(positions)
+        if step is not None:
+            step = step.reshape(positions.shape)
+        paths = self.paths(positions.double(), rcs.double(), step)
+        resonance = self.paths.resonance(positions.double(), step) if self.paths.airy else None
+        people: list[Tensor] = []
+        for group in range(int(groups.max()) + 1):
+            gain = torch.where((groups == group).unsqueeze(-1), paths.gain, 0.0)
+            ways: list[Tensor] = []
+            for way in range(gain.shape[-1]):
+                one = Paths(paths.delay_s[..., way : way + 1], gain[..., way : way + 1])
+                if resonance is None:
+                    ways.append(self._sum(one.delay_s.squeeze(-1), one.gain.squeeze(-1), self.fine.dtype))
+                else:
+                    slab = Resonance(
+                        resonance.square[..., way : way + 1, :],
+                        resonance.loss_neper[..., way : way + 1, :],
+                        resonance.bounce_s[..., way : way + 1, :],
+                    )
+                    ways.append(self._dispersed(one, slab))
+            people.append(torch.stack(ways, positions.dim() - 3))
+        return torch.stack(people, positions.dim() - 3)
+
+    @torch.jit.export
+    def side_channels(self, positions: Tensor, rcs: Tensor) -> SideChannels:
+        """Range, radial speed and amplitude of each way over each scatterer; arguments as in forward."""
+        rcs = check_scene(positions, rcs)
+        step = self._step(positions)
+        if step is not None:
+            step = step.reshape(positions.shape)
+        paths = self.paths(positions.double(), rcs.double(), step)
+        length = paths.delay_s * (self.paths.speed_m_s / 2)
+        speed = torch.zeros_like(length)
+        if length.shape[-3] > 1:
+            change = length.diff(dim=-3)
+            before = torch.cat((change[..., :1, :, :], change), -3)
+            after = torch.cat((change, change[..., -1:, :, :]), -3)
+            speed = (before + after) * (-0.5 * self.prf_hz)
+        return SideChannels(length, speed, paths.gain.abs())

@@ -9,11 +9,14 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, check_positive, is_exporting
 from tensorsim.radar.ambiguity import SpeedCheck, check_unambiguous
+from tensorsim.radar.closed_form import RangeBinSynthesizer
+from tensorsim.radar.columns import Columns, block_rms, join_pulses
 from tensorsim.radar.doppler import DopplerTimeMap
 from tensorsim.radar.echo import EchoSynthesizer, check_scene
+from tensorsim.radar.engines import RangeBinEngine, TimeEngine
 from tensorsim.radar.mti import MovingTargetIndicator
 from tensorsim.radar.noise import ReceiverNoise, decibels, energy
-from tensorsim.radar.range_profile import RangeProfile, flatten_batch, unflatten_batch
+from tensorsim.radar.range_profile import FollowingGate, RangeProfile, flatten_batch, unflatten_batch
 from tensorsim.radar.ridges import RidgeExtractor, Ridges
 from tensorsim.types import RadarMaps
 
@@ -21,57 +24,34 @@ from tensorsim.types import RadarMaps
 Source = Callable[[int, int], tuple[Tensor, Tensor]]
 
 
+class Pending(NamedTuple):
+    """What later pulses of B clips need of earlier ones.
+
+    Attributes:
+        profiles: (B, p, R) complex, the last ones that the moving target indicator has seen.
+        moving: (B, q, R) complex, what it made of them as far as later Doppler frames need it.
+    """
+
+    profiles: Tensor
+    moving: Tensor
+
+
 class Piece(NamedTuple):
     """What a stretch of m pulses adds to the maps of B clips.
 
     Attributes:
-        range_time: (B, R, m).
-        range_time_mti: (B, R, m'); one less in the first piece.
+        profiles: (B, m, R) complex.
+        moving: (B, m', R) complex; fewer in the first piece.
         doppler_time: (B, F, k) frames that the pulses complete.
-        pending: (B, p, R) complex profiles that later frames need.
+        pending: for the next piece.
         noise_energy: (B,).
     """
 
-    range_time: Tensor
-    range_time_mti: Tensor
+    profiles: Tensor
+    moving: Tensor
     doppler_time: Tensor
-    pending: Tensor
+    pending: Pending
     noise_energy: Tensor
-
-
-def block_rms(magnitude: Tensor, block: int) -> Tensor:
-    """Root of the mean power of ``block`` columns at a time: (..., R, M) -> (..., R, ceil(M / block)).
-
-    The last block may be shorter.
-    """
-    if block == 1:
-        return magnitude
-    columns = magnitude.shape[-1]
-    whole = columns // block * block
-    power = magnitude.square()
-    mean = power[..., :whole].unflatten(-1, (whole // block, block)).mean(-1)
-    if whole < columns:
-        mean = torch.cat((mean, power[..., whole:].mean(-1, keepdim=True)), -1)
-    return mean.sqrt()
-
-
-class _BlockStream:
-    """:func:`block_rms` of columns that arrive piece by piece."""
-
-    def __init__(self, block: int) -> None:
-        self.block = block
-        self.rest: list[Tensor] = []
-        self.done: list[Tensor] = []
-
-    def push(self, magnitude: Tensor) -> None:
-        magnitude = torch.cat([*self.rest, magnitude], -1)
-        whole = magnitude.shape[-1] // self.block * self.block
-        self.done.append(block_rms(magnitude[..., :whole], self.block))
-        self.rest = [magnitude[..., whole:].clone()]
-
-    def result(self) -> Tensor:
-        rest = [block_rms(x, self.block) for x in self.rest if x.shape[-1] > 0]
-        return torch.cat(self.done + rest, -1)
 
 
 class RadarSimulator(nn.Module):
@@ -79,20 +59,32 @@ class RadarSimulator(nn.Module):
 
     The IF is never held whole: it is made and turned into profiles ``pulse_chunk`` pulses at a time, twice
     when noise is wanted, because the noise is set by the mean power of the clip. ``stream`` does the same for
-    clips of any length without holding their profiles either.
+    clips of any length without holding their profiles either; ``doppler_time`` makes that map alone, for data
+    sets.
 
     Args:
         radar: the radar.
         wall, multipath, leakage, wall_echo, wall_paths, direct: see
             :class:`~tensorsim.radar.echo.EchoSynthesizer`.
+        echo: a ready one with further options; the six arguments above then have no effect.
+        engine: ``"time"`` makes the IF and transforms it; ``"range-bins"`` makes the bins in closed form, see
+            :class:`~tensorsim.radar.closed_form.RangeBinSynthesizer`, and gives the noise in them the covariance
+            that windowed white noise has. The maps are the same, with noise another realisation.
+        near_bins: for ``"range-bins"``: only bins within this many of each path. Faster; its error is
+            ``simulator.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann).
+        range_gate_m: (nearest, farthest) metres: the maps have these bins only. One number is the width of a
+            gate that follows the targets after the moving target indicator, see
+            :class:`~tensorsim.radar.range_profile.FollowingGate`. None keeps all bins.
         snr_db, noise_reference: see :class:`~tensorsim.radar.noise.ReceiverNoise`; a scene without echo gets
             the noise of one with a target of 1 m^2 at 3 m in free space. ``"absolute"`` takes the bandwidth
             from the sample rate.
         noise_figure_db, transmit_power_w: for ``noise_reference="absolute"``.
         range_window: see :class:`~tensorsim.radar.range_profile.RangeProfile`.
-        mti: see :class:`~tensorsim.radar.mti.MovingTargetIndicator`.
+        mti: the method of a :class:`~tensorsim.radar.mti.MovingTargetIndicator`, or a ready one.
         window_s, overlap, integration: see :class:`~tensorsim.radar.doppler.DopplerTimeMap`.
+        doppler: a ready one; the three arguments above then have no effect.
         ridge_count: see :class:`~tensorsim.radar.ridges.RidgeExtractor`.
+        ridges: a ready one, in place of ``ridge_count``.
         pulse_chunk: pulses worked on at a time, over all clips of a batch. Noise is drawn chunk by chunk, so
             with one seed another chunk is another realisation.
         display_rate_hz: reduce the two range-time maps to about this many columns per second, each the root
@@ -125,16 +117,26 @@ class RadarSimulator(nn.Module):
         noise_figure_db: float = 10.0,
         transmit_power_w: float = 0.01,
         range_window: str | None = "hamming",
-        mti: str = "two-pulse",
+        mti: str | MovingTargetIndicator = "two-pulse",
         window_s: float = 0.1,
         overlap: float = 0.9,
         integration: str = "noncoherent",
         ridge_count: int = 3,
         pulse_chunk: int = 1024,
         display_rate_hz: float | None = None,
+        engine: str = "time",
+        near_bins: int | None = None,
+        range_gate_m: tuple[float, float] | float | None = None,
+        echo: EchoSynthesizer | None = None,
+        doppler: DopplerTimeMap | None = None,
+        ridges: RidgeExtractor | None = None,
     ) -> None:
         super().__init__()
-        self.echo = EchoSynthesizer(
+        if engine not in ("time", "range-bins"):
+            raise TensorsimError(f"engine: got {engine!r}, expected 'time' or 'range-bins'")
+        if near_bins is not None and engine == "time":
+            raise TensorsimError(f"near_bins: got {near_bins} with the engine 'time', expected 'range-bins'")
+        self.echo = echo or EchoSynthesizer(
             radar, wall, multipath, leakage, wall_echo, wall_paths, direct, pulse_chunk
         )
         self.noise = ReceiverNoise(
@@ -145,10 +147,18 @@ class RadarSimulator(nn.Module):
             noise_figure_db=noise_figure_db,
             transmit_power_w=transmit_power_w,
         )
-        self.range_profile = RangeProfile(radar, range_window)
-        self.mti = MovingTargetIndicator(mti)
-        self.doppler = DopplerTimeMap(radar, window_s, overlap, integration)
-        self.ridges = RidgeExtractor(ridge_count)
+        fixed = None if isinstance(range_gate_m, float | int) else range_gate_m
+        self.range_profile = RangeProfile(radar, range_window, fixed)
+        self.engine: nn.Module = TimeEngine(self.echo, self.noise, self.range_profile)
+        if engine == "range-bins":
+            bins = RangeBinSynthesizer(self.echo, self.range_profile, near_bins)
+            self.engine = RangeBinEngine(bins, self.noise)
+        self.gate: nn.Module | None = None
+        if isinstance(range_gate_m, float | int):
+            self.gate = FollowingGate(radar, self.range_profile.range_m, range_gate_m)
+        self.mti = MovingTargetIndicator(mti) if isinstance(mti, str) else mti
+        self.doppler = doppler or DopplerTimeMap(radar, window_s, overlap, integration)
+        self.ridges = ridges or RidgeExtractor(ridge_count)
         self.pulse_chunk = pulse_chunk
         # Chunks in a piece: few, so that the allocator reuses their memory; not few, since pieces overlap.
         self.piece_chunks = 8
@@ -161,13 +171,8 @@ class RadarSimulator(nn.Module):
 
     def forward(self, positions: Tensor, rcs: Tensor) -> RadarMaps:
         """Positions (..., M, S, 3) m and RCS (..., S) or (..., M, S) m^2 to maps."""
-        rcs = check_scene(positions, rcs)
-        shape = list(positions.shape)
-        self._check_pulses(shape[-3])
-        if not torch.jit.is_scripting() and not is_exporting():
-            check_unambiguous(positions, rcs, self.radar)
-        lead = shape[:-3]
-        positions, rcs = flatten_batch(positions, 3), flatten_batch(rcs, 2)
+        lead = list(positions.shape)[:-3]
+        positions, rcs = self._scene(positions, rcs)
         pulses = positions.shape[1]
         signal = self._energy(positions, rcs) / (pulses * self.echo.samples)
         noise = torch.zeros_like(signal)
@@ -175,12 +180,12 @@ class RadarSimulator(nn.Module):
         range_time: list[Tensor] = []
         range_time_mti: list[Tensor] = []
         doppler_times: list[Tensor] = []
-        span = pulses if self.mti.method == "mean" else self.piece_chunks * self._step(positions)
+        span = self._span(positions)
         for start in range(0, pulses, span):
             stop = start + span
             piece = self._piece(positions[:, start:stop], rcs[:, start:stop], signal, pending)
-            range_time.append(piece.range_time)
-            range_time_mti.append(piece.range_time_mti)
+            range_time.append(piece.profiles.transpose(1, 2).abs())
+            range_time_mti.append(piece.moving.transpose(1, 2).abs())
             doppler_times.append(piece.doppler_time)
             pending, noise = piece.pending, noise + piece.noise_energy
         doppler_time = torch.cat(doppler_times, -1)
@@ -195,6 +200,37 @@ class RadarSimulator(nn.Module):
             unflatten_batch(snr_db, lead),
         )
 
+    @torch.jit.export
+    def doppler_time(self, positions: Tensor, rcs: Tensor) -> Tensor:
+        """Only the Doppler-time map (..., F, K) of :meth:`forward`; with one seed the same."""
+        lead = list(positions.shape)[:-3]
+        positions, rcs = self._scene(positions, rcs)
+        pulses = positions.shape[1]
+        signal = self._energy(positions, rcs) / (pulses * self.echo.samples)
+        pending = self._nothing_pending(positions)
+        parts: list[Tensor] = []
+        span = self._span(positions)
+        for start in range(0, pulses, span):
+            stop = start + span
+            piece = self._piece(positions[:, start:stop], rcs[:, start:stop], signal, pending)
+            parts.append(piece.doppler_time)
+            pending = piece.pending
+        return unflatten_batch(torch.cat(parts, -1), lead)
+
+    def _scene(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (B, M, S, 3) and RCS (B, M, S) of a scene, checked."""
+        rcs = check_scene(positions, rcs)
+        self._check_pulses(positions.shape[-3])
+        if not torch.jit.is_scripting() and not is_exporting():
+            check_unambiguous(positions, rcs, self.radar)
+        return flatten_batch(positions, 3), flatten_batch(rcs, 2)
+
+    def _span(self, positions: Tensor) -> int:
+        """Pulses in a piece."""
+        if self.mti.whole_clip:
+            return positions.shape[1]
+        return max(self.piece_chunks * self._step(positions), self.mti.lost_pulses + 1)
+
     @torch.no_grad()
     def stream(self, source: Source, pulses: int) -> RadarMaps:
         """Maps of one clip of ``pulses`` pulses whose positions come from ``source`` piece by piece.
@@ -204,11 +240,12 @@ class RadarSimulator(nn.Module):
         ``display_rate_hz``. The source is asked twice for every piece and must answer the same.
 
         Raises:
-            TensorsimError: as forward; also ``mti="mean"``, which needs the whole clip.
+            TensorsimError: as forward; also an ``mti`` that needs the whole clip.
         """
-        if self.mti.method != "two-pulse":
+        if self.mti.whole_clip:
             raise TensorsimError(
-                f"stream: got mti {self.mti.method!r}, expected 'two-pulse': a mean needs the clip whole"
+                f"stream: got mti {self.mti.method!r}, expected 'two-pulse' or 'n-pulse', which do not need the "
+                "whole clip"
             )
         self._check_pulses(pulses)
         speeds = SpeedCheck(self.radar)
@@ -219,39 +256,38 @@ class RadarSimulator(nn.Module):
                 signal = signal + self._energy(positions, rcs).to(signal) / (pulses * self.echo.samples)
         speeds.judge()
 
-        range_time, range_time_mti = _BlockStream(self.range_time_block), _BlockStream(self.range_time_block)
-        total = self.doppler.frames(pulses - self.mti.lost_pulses)
-        maps: list[Tensor] = []
+        seen = pulses - self.mti.lost_pulses
+        range_time = Columns(pulses, self.range_time_block)
+        range_time_mti = Columns(seen, self.range_time_block)
+        doppler_time = Columns(self.doppler.frames(seen))
         peaks: list[Ridges] = []
-        pending: list[Tensor] = []
-        noise, frames = torch.zeros_like(signal), 0
+        pending: list[Pending] = []
+        noise = torch.zeros_like(signal)
         for positions, rcs in self._pieces(source, pulses):
             before = pending[0] if pending else self._nothing_pending(positions)
             piece = self._piece(positions, rcs, signal.to(positions.device), before)
             pending, noise = [piece.pending], noise + piece.noise_energy.to(noise)
-            range_time.push(piece.range_time[0])
-            range_time_mti.push(piece.range_time_mti[0])
-            part = piece.doppler_time[0]
-            maps = maps or [part.new_empty(self.doppler.bins, total)]  # one map: joining parts would take two
-            maps[0][:, frames : frames + part.shape[1]] = part
-            peaks.append(self.ridges.peaks(part))
-            frames += part.shape[1]
+            range_time.push(piece.profiles[0].T.abs())
+            range_time_mti.push(piece.moving[0].T.abs())
+            doppler_time.push(piece.doppler_time[0])
+            peaks.append(self.ridges.peaks(piece.doppler_time[0]))
         found = Ridges(
             torch.cat([p.indices for p in peaks], -1), torch.cat([p.magnitudes for p in peaks], -1)
         )
         ridges = self.ridges.connect(found, self.doppler.bins)
+        whole = doppler_time.result()
         return RadarMaps(
             range_time.result(),
             range_time_mti.result(),
-            maps[0],
+            whole,
             ridges.indices,
             ridges.magnitudes,
-            decibels(signal, noise / (pulses * self.echo.samples))[0].to(maps[0]),
+            decibels(signal, noise / (pulses * self.echo.samples))[0].to(whole),
         )
 
     def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[Tensor, Tensor]]:
         """Positions (1, m, S, 3) and RCS (1, m, S) of a source, checked; m a multiple of ``pulse_chunk``."""
-        span = self.piece_chunks * self.pulse_chunk
+        span = max(self.piece_chunks * self.pulse_chunk, self.mti.lost_pulses + 1)
         for start in range(0, pulses, span):
             stop = min(start + span, pulses)
             positions, rcs = source(start, stop)
@@ -268,26 +304,32 @@ class RadarSimulator(nn.Module):
                 f"positions: got {pulses} pulses, expected at least {self.min_pulses} for one Doppler window"
             )
 
-    def _nothing_pending(self, positions: Tensor) -> Tensor:
-        """Pending profiles (B, 0, R) before the first pulse of positions (B, M, S, 3)."""
-        return self.echo.static_echo().new_zeros([positions.shape[0], 0, self.echo.samples // 2])
+    def _nothing_pending(self, positions: Tensor) -> Pending:
+        """What is pending before the first pulse of positions (B, M, S, 3)."""
+        bins = self.range_profile.range_m.shape[0]
+        nothing = self.echo.static_echo().new_zeros([positions.shape[0], 0, bins])
+        return Pending(nothing, nothing)
 
-    def _piece(self, positions: Tensor, rcs: Tensor, signal: Tensor, pending: Tensor) -> Piece:
-        """Maps of the next pulses (B, m, S, 3), (B, m, S), after those whose profiles are ``pending``."""
+    def _piece(self, positions: Tensor, rcs: Tensor, signal: Tensor, pending: Pending) -> Piece:
+        """Maps of the next pulses (B, m, S, 3), (B, m, S), after those of which ``pending`` is left."""
         fresh, noise_energy = self._profiles(positions, rcs, signal)
-        profiles = torch.cat((pending.transpose(1, 2), fresh.transpose(1, 2)), -1).transpose(1, 2)
+        profiles = join_pulses(pending.profiles, fresh)
         moving = self.mti(profiles)
-        unseen = moving[:, max(0, pending.shape[1] - self.mti.lost_pulses) :]
-        count = self.doppler.frames(moving.shape[1])
+        if self.gate is not None:
+            late = positions.shape[1] - moving.shape[1]
+            moving = self.gate(moving, positions[:, late:], rcs[:, late:])
+        waiting = join_pulses(pending.moving, moving)
+        count = self.doppler.frames(waiting.shape[1])
         if count > 0:
-            doppler_time = self.doppler(moving[:, : (count - 1) * self.doppler.hop + self.doppler.length])
+            doppler_time = self.doppler(waiting[:, : (count - 1) * self.doppler.hop + self.doppler.length])
         else:
             doppler_time = fresh.abs().new_zeros([fresh.shape[0], self.doppler.bins, 0])
+        last = profiles[:, profiles.shape[1] - self.mti.lost_pulses :]
         return Piece(
-            fresh.transpose(1, 2).abs(),
-            unseen.transpose(1, 2).abs(),
+            fresh,
+            moving,
             doppler_time,
-            profiles[:, count * self.doppler.hop :],
+            Pending(last, waiting[:, count * self.doppler.hop :]),
             noise_energy,
         )
 
@@ -313,17 +355,13 @@ class RadarSimulator(nn.Module):
         """
         power = self.noise.noise_power(signal)
         total = torch.zeros_like(signal)
-        static = self.echo.static_echo()
         chunks: list[Tensor] = []
         step = self._step(positions)
         for start in range(0, positions.shape[1], step):
             stop = start + step
-            samples = self.echo.target_echo(positions[:, start:stop], rcs[:, start:stop]) + static
-            if not self.noise.noiseless:
-                noise = self.noise.draw(samples, power)
-                total = total + energy(noise)
-                samples += noise
-            chunks.append(self.range_profile(samples).transpose(1, 2))
+            profiles, drawn = self.engine(positions[:, start:stop], rcs[:, start:stop], power)
+            total = total + drawn
+            chunks.append(profiles.transpose(1, 2))
         return torch.cat(chunks, -1).transpose(1, 2), total
 
     def _step(self, positions: Tensor) -> int:

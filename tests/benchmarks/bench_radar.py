@@ -1,11 +1,13 @@
-"""Speed and memory of the radar chain: `python -m tests.benchmarks.bench_radar [--ten-minutes]`.
+"""Speed and memory of the radar chain: `python -m tests.benchmarks.bench_radar [--ten-minutes | --plot PNG]`.
 
-Positions to range-time maps, Doppler-time map and ridges, noise included, against the echo alone evaluated
-directly in float64 NumPy, in one run. Medians of the chain; the peer runs once.
+Peers, in the same run: the echo evaluated directly in NumPy complex128, and the same sum written plainly in torch.
+Medians of ours; the peers, which take long, run once. The chain is positions to Doppler-time map, noise included.
+On a GPU, if there is one: clips per second for batches of 1 to 64.
 """
 
 import argparse
 import math
+import os
 import resource
 import statistics
 import time
@@ -36,19 +38,113 @@ def seconds(function, repeats):
     return statistics.median(times)
 
 
+def plain_torch_echo(radar, positions, rcs):
+    """The sum over scatterers as one would write it down: every exponential of every sample, in complex128."""
+    p, light = positions.double(), 299_792_458.0
+    out = (p - torch.tensor(radar.tx_m)).norm(dim=-1)
+    back = (p - torch.tensor(radar.rx_m)).norm(dim=-1)
+    tau = ((out + back) / light).unsqueeze(-1)
+    gain = 10 ** (radar.antenna_gain_dbi / 10) * radar.wavelength_m / (4 * math.pi) ** 1.5
+    amplitude = gain * rcs.double().sqrt() / (out * back)
+    t = torch.arange(radar.samples_per_chirp, dtype=torch.float64) / radar.sample_rate_hz
+    total = torch.zeros(p.shape[0], len(t), dtype=torch.complex128)
+    for s in range(p.shape[1]):
+        delay = tau[:, s]
+        cycles = radar.carrier_hz * delay + radar.slope_hz_per_s * (delay * t - delay**2 / 2)
+        total += amplitude[:, s, None] * torch.exp(2j * math.pi * cycles)
+    return total
+
+
 def compare(name, radar, clip_s, wall=None, multipath=False):
-    """Print the chain's median, the peer's time and their ratio."""
+    """Print medians and ratios of echo and chain against both peers."""
     pulses = round(clip_s * radar.prf_hz)
     positions, rcs = walker(0, pulses, radar.prf_hz), torch.tensor(JOINT_RCS_M2)
-    simulator = RadarSimulator(radar, wall, multipath)
-    simulator(positions, rcs)
-    chain = seconds(lambda: simulator(positions, rcs), 7)
     p, sigma = positions.double().numpy(), np.asarray(JOINT_RCS_M2)
-    peer = seconds(lambda: reference.echo(radar, p, sigma, wall, multipath), 1)
+    answers = []
+    peer = seconds(lambda: answers.append(reference.echo(radar, p, sigma, wall, multipath)), 1)
     print(
-        f"{name}: {pulses} pulses x 14 scatterers x {radar.samples_per_chirp} samples: "
-        f"chain {chain:.3f} s (median of 7), NumPy echo alone {peer:.2f} s, ratio {peer / chain:.1f}"
+        f"{name}: {pulses} pulses x 14 scatterers x {radar.samples_per_chirp} samples; NumPy echo {peer:.2f} s"
     )
+    if wall is None:
+        plain = seconds(lambda: plain_torch_echo(radar, positions, rcs), 1)
+        print(f"  plain torch echo {plain:.2f} s")
+    echo = RadarSimulator(radar, wall, multipath).echo
+    error = reference.relative(echo(positions, rcs), answers.pop())
+    median = seconds(lambda: echo(positions, rcs), 5)
+    versus = f", plain torch {plain / median:.1f} times" if wall is None else ""
+    print(f"  echo {median:.3f} s, error {error:.1e}: NumPy {peer / median:.1f} times{versus}")
+    for options in ({}, {"engine": "range-bins", "near_bins": 8, "range_gate_m": (1.0, 7.0)}):
+        simulator = RadarSimulator(radar, wall, multipath, **options)
+        simulator(positions, rcs)
+        maps = seconds(lambda s=simulator: s(positions, rcs), 5)
+        alone = seconds(lambda s=simulator: s.doppler_time(positions, rcs), 5)
+        print(
+            f"  {options or 'time engine'}: all maps {maps:.3f} s, {peer / maps:.1f} times; "
+            f"Doppler-time map alone {alone:.3f} s, {peer / alone:.1f} times"
+        )
+
+
+def plot(path):
+    """Time of the echo against the length of the clip and the number of scatterers, as a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    radar = RadarConfig.free_space()
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    sweeps = {
+        "clip, s": [(x, 14) for x in (1, 4, 15, 60, 600)],
+        "scatterers": [(1, x) for x in (1, 5, 20, 100, 500)],
+    }
+    for axis, (label, cases) in zip(axes, sweeps.items(), strict=True):
+        times = []
+        for clip_s, scatterers in cases:
+            echo = RadarSimulator(radar).echo
+            rcs = torch.full((scatterers,), 0.1)
+
+            pulses = round(clip_s * radar.prf_hz)
+
+            def run(echo=echo, rcs=rcs, pulses=pulses, scatterers=scatterers):
+                for start in range(0, pulses, 1024):
+                    part = walker(start, min(start + 1024, pulses), radar.prf_hz, scatterers)
+                    echo.target_echo(part, rcs.expand(part.shape[:2]))
+
+            times.append(seconds(run, 1 if clip_s > 60 else 3))
+        values = [case[label == "scatterers"] for case in cases]
+        print(f"{label}: " + ", ".join(f"{v}: {t:.3f} s" for v, t in zip(values, times, strict=True)))
+        axis.loglog(values, times, "o-")
+        axis.set(xlabel=label, ylabel="echo, s")
+    figure.savefig(path)
+
+
+def on_gpu():
+    """Clips of 4 s per second, for batches of 1 to 64, and how much of the memory's bandwidth the IF alone takes."""
+    if not torch.cuda.is_available():
+        print("no GPU here")
+        return
+    radar, rcs = RadarConfig.free_space(), torch.tensor(JOINT_RCS_M2).cuda()
+    clip = walker(0, round(4 * radar.prf_hz), radar.prf_hz).cuda()
+    block = torch.empty(2**28, device="cuda")
+
+    def timed(function):
+        function()
+        torch.cuda.synchronize()
+        return seconds(lambda: (function(), torch.cuda.synchronize()), 5)
+
+    bandwidth = 2 * block.nbytes / timed(lambda: block.clone())
+    simulator = RadarSimulator(radar, pulse_chunk=32768, range_gate_m=(1.0, 7.0)).cuda()
+    print(f"{torch.cuda.get_device_name()}, {bandwidth / 1e9:.0f} GB/s")
+    for batch in (1, 4, 16, 64):
+        positions = clip.expand(batch, *clip.shape)
+        taken = timed(lambda positions=positions: simulator.doppler_time(positions, rcs))
+        floor = (
+            2 * 8 * batch * clip.shape[0] * radar.samples_per_chirp / bandwidth
+        )  # the IF, written and read once
+        print(
+            f"  batch {batch}: {batch / taken:.1f} clips/s, {4 * batch / taken:.0f} x real time, "
+            f"floor {floor / taken:.0%}"
+        )
 
 
 def ten_minutes(radar):
@@ -59,8 +155,10 @@ def ten_minutes(radar):
     begin = time.perf_counter()
     maps = simulator.stream(lambda start, stop: (walker(start, stop, radar.prf_hz), rcs), pulses)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    outputs = sum(x.nbytes for x in maps) / 2**30
     print(
         f"ten minutes of free space, {pulses} pulses: {time.perf_counter() - begin:.0f} s, peak {peak:.2f} GiB, "
+        f"of which outputs {outputs:.2f} GiB, "
         f"range-time {tuple(maps.range_time.shape)}, Doppler-time {tuple(maps.doppler_time.shape)}"
     )
 
@@ -70,12 +168,16 @@ if __name__ == "__main__":
     parser.add_argument(
         "--ten-minutes", action="store_true", help="only stream a ten-minute clip, for its memory"
     )
+    parser.add_argument("--plot", metavar="PNG", help="only plot the time against pulses and scatterers")
     arguments = parser.parse_args()
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f}")
     with torch.no_grad():
         if arguments.ten_minutes:
             ten_minutes(RadarConfig.free_space())
+        elif arguments.plot:
+            plot(arguments.plot)
         else:
+            on_gpu()
             compare("free space, 4 s", RadarConfig.free_space(), 4.0)
             compare("through wall, 4 s", RadarConfig.through_wall(), 4.0, WallConfig(), multipath=True)
             compare("through wall, 60 s", RadarConfig.through_wall(), 60.0, WallConfig(), multipath=True)

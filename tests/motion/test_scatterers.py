@@ -5,9 +5,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tensorsim.config import JOINT_RCS_M2
+from tensorsim.config import JOINT_RCS_M2, RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
+from tensorsim.radar.echo import EchoSynthesizer
 from tests.stage import StageTester, assert_same
 
 
@@ -35,6 +36,11 @@ class TestJointScatterers(StageTester):
             ((positions, fade > 0), r"fade: got dtype"),
             ((positions.int(), fade), r"positions: got dtype"),
         ]
+
+
+class TestLearnableJointScatterers(TestJointScatterers):
+    def make(self) -> nn.Module:
+        return JointScatterers((0.5, 1.0, 0.2), learnable=True)
 
 
 def test_people_of_a_clip_are_one_scene() -> None:
@@ -69,6 +75,53 @@ def test_no_people_are_no_scatterers() -> None:
 def test_refuses_impossible_cross_sections(rcs: tuple[float, ...]) -> None:
     with pytest.raises(TensorsimError, match=r"rcs_m2: got .*, expected finite numbers >= 0, one per joint"):
         JointScatterers(rcs)
+
+
+# ---- the learnable table -------------------------------------------------------------------------------
+
+
+def test_a_learnable_table_starts_as_given_and_a_fixed_one_has_no_parameter() -> None:
+    learnable = JointScatterers(learnable=True)
+    torch.testing.assert_close(learnable.table(), torch.tensor(JOINT_RCS_M2, dtype=torch.float64))
+    assert list(learnable.state_dict()) == ["log_rcs_m2"]
+    assert not JointScatterers().state_dict()
+    with pytest.raises(TensorsimError, match="expected numbers > 0 to learn from"):
+        JointScatterers((1.0, 0.0), learnable=True)
+
+
+def test_gradient_of_the_learnable_table() -> None:
+    """sigma = exp(l): the derivative of fade^2 sigma by l is fade^2 sigma, against finite differences too."""
+    model = JointScatterers((0.5, 1.0, 0.2), learnable=True)
+    positions, fade = torch.zeros(1, 2, 3, 3, dtype=torch.float64), torch.tensor([[1.0, 0.5]]).double()
+    rcs = model(positions, fade)[1]
+    (gradient,) = torch.autograd.grad(rcs.sum(), model.log_rcs_m2)
+    torch.testing.assert_close(gradient, 1.25 * torch.tensor([0.5, 1.0, 0.2]).double())
+
+    def of_table(log_rcs: Tensor) -> Tensor:
+        return torch.func.functional_call(model, {"log_rcs_m2": log_rcs}, (positions, fade))[1]
+
+    assert torch.autograd.gradcheck(of_table, (model.log_rcs_m2.detach().clone().requires_grad_(True),))
+
+
+def test_a_table_is_found_from_its_echo() -> None:
+    """Three joints at distances that a small radar tells apart; from equal cross sections to the true ones."""
+    radar = RadarConfig(carrier_hz=2e9, bandwidth_hz=0.6e9, sample_rate_hz=0.6e6, prf_hz=256.0)
+    echo = EchoSynthesizer(radar)
+    time = torch.arange(16, dtype=torch.float64).reshape(1, 16, 1) / 16
+    distance = torch.tensor([2.0, 3.0, 4.5], dtype=torch.float64) + time * torch.tensor([0.1, -0.2, 0.3])
+    positions = torch.stack((0 * distance, distance, 1.0 + 0 * distance), -1)
+    fade = torch.ones(1, 16, dtype=torch.float64)
+    truth = (0.5, 1.0, 0.1)
+    with torch.no_grad():
+        target = echo(*JointScatterers(truth)(positions, fade))
+    model = JointScatterers((0.3, 0.3, 0.3), learnable=True)
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.1)
+    for _ in range(150):
+        optimizer.zero_grad()
+        error = (echo(*model(positions, fade)) - target).abs().square().sum() / target.abs().square().sum()
+        error.backward()
+        optimizer.step()
+    np.testing.assert_allclose(model.table().detach().numpy(), truth, rtol=0.01)
 
 
 # ---- visibility_fade -------------------------------------------------------------------------------------

@@ -68,6 +68,86 @@ def path_list(radar, p, wall=None, multipath=False, paper=False):
     return paths
 
 
+def slab_matrix(wall, frequency, cos_incidence, polarization):
+    """(R, T) of the slab by the characteristic matrix of one layer; T with the phase of the whole passage."""
+    n = np.sqrt(wall.relative_permittivity * (1 - 1j * wall.loss_tangent) + 0j)
+    cos_inside = np.sqrt(1 - (1 - cos_incidence**2) / n**2)
+    outer = cos_incidence if polarization == "te" else 1 / cos_incidence
+    inner = n * cos_inside if polarization == "te" else n / cos_inside
+    delta = 2 * np.pi * frequency / C * wall.size_m[1] * n * cos_inside
+    b = np.cos(delta) + 1j * np.sin(delta) / inner * outer
+    c = 1j * inner * np.sin(delta) + np.cos(delta) * outer
+    return (outer * b - c) / (outer * b + c), 2 * outer / (outer * b + c)
+
+
+def interface(permittivity, loss_tangent, cos_incidence, polarization):
+    """Fresnel coefficient of the electric field by admittances, from air."""
+    n = np.sqrt(permittivity * (1 - 1j * loss_tangent) + 0j)
+    cos_inside = np.sqrt(1 - (1 - cos_incidence**2) / n**2)
+    outer = cos_incidence if polarization == "te" else 1 / cos_incidence
+    inner = n * cos_inside if polarization == "te" else n / cos_inside
+    return (outer - inner) / (outer + inner)
+
+
+def fermat(lateral, air, thickness, index):
+    """(cos of incidence, optical length) of the path of least time, by minimisation over the crossing."""
+    from scipy.optimize import minimize_scalar
+
+    def length(inside):
+        return np.hypot(lateral - inside, air) + index * np.hypot(inside, thickness)
+
+    best = minimize_scalar(length, bounds=(0, max(lateral, 1e-9)), method="bounded", options={"xatol": 1e-10})
+    return air / np.hypot(lateral - best.x, air), length(best.x)
+
+
+def oblique_legs(radar, point, antenna, wall, bounces, polarization):
+    """[(length, delay, factor)] of one leg through the wall by 0 ... ``bounces`` pairs of internal bounces."""
+    n = np.sqrt(wall.relative_permittivity * (1 - 1j * wall.loss_tangent) + 0j)
+    d = wall.size_m[1]
+    offset = np.asarray(point, dtype=np.float64) - np.asarray(antenna)
+    lateral, r = np.hypot(offset[0], offset[2]), np.linalg.norm(offset)
+    cosine, optical = fermat(lateral, offset[1] - d, d, n.real)
+    inside = np.sqrt(1 - (1 - cosine**2) / n.real**2)
+    k = 2 * np.pi * radar.carrier_hz / C
+    loss = np.exp(k * d * (n * np.sqrt(1 - (1 - cosine**2) / n**2)).imag)
+    g = interface(wall.relative_permittivity, wall.loss_tangent, cosine, polarization)
+    return [
+        (r, (optical + 2 * b * d * n.real * inside) / C, (1 - g**2) * g ** (2 * b) * loss ** (2 * b + 1))
+        for b in range(bounces + 1)
+    ]
+
+
+def floor_leg(point, antenna, floor, polarization):
+    """(length, delay, factor) of one leg by the floor, free space."""
+    image = np.array([antenna[0], antenna[1], -antenna[2]])
+    offset = np.asarray(point, dtype=np.float64) - image
+    r = np.linalg.norm(offset)
+    if floor.reflection is not None:
+        return r, r / C, floor.reflection
+    g = interface(floor.relative_permittivity, floor.loss_tangent, offset[2] / r, polarization)
+    return r, r / C, g
+
+
+def pair_legs(radar, out, back):
+    """(delays, gains in the IF) of every pair of legs, for 1 m^2; the first of ``out`` with all of ``back``."""
+    lam, gain = C / radar.carrier_hz, 10 ** (radar.antenna_gain_dbi / 10)
+    delays, gains = [], []
+    for r1, t1, f1 in out:
+        for r2, t2, f2 in back:
+            delays.append(t1 + t2)
+            gains.append(np.conj(np.sqrt(gain**2 * lam**2 / ((4 * np.pi) ** 3 * r1**2 * r2**2)) * f1 * f2))
+    return np.array(delays), np.array(gains)
+
+
+def beat(radar, delays, gains):
+    """IF (N,) of paths with these delays and gains."""
+    mu = radar.bandwidth_hz / radar.chirp_s
+    t = np.arange(round(radar.sample_rate_hz * radar.chirp_s)) / radar.sample_rate_hz
+    delays, gains = np.asarray(delays)[:, None], np.asarray(gains)[:, None]
+    phase = radar.carrier_hz * delays + mu * delays * t - mu * delays**2 / 2
+    return (gains * np.exp(2j * np.pi * phase)).sum(0)
+
+
 def echo(radar, p, rcs, wall=None, multipath=False, paper=False):
     """IF (M, N) of positions (M, S, 3) and rcs (S,) or (M, S), sample by sample."""
     p, rcs = np.asarray(p, dtype=np.float64), np.asarray(rcs, dtype=np.float64)

@@ -117,22 +117,21 @@ def test_beat_is_positive_and_approaching_phase_decreases():
     assert turn == pytest.approx(-2 * math.pi * 2 * 2e-4 * 77e9 / C, rel=1e-3)
 
 
-def test_parts_add_up_and_switches_switch():
+def test_switches_stand_for_names_of_paths():
     p, rcs = tensors(swinging(4, 3, THROUGH.prf_hz), np.ones(3))
     wall = WallConfig()
-    parts = EchoSynthesizer(THROUGH, wall, multipath=True).double().parts(p, rcs)
 
     def echo(**options):
         return EchoSynthesizer(THROUGH, wall, **options).double()(p, rcs)
 
-    assert_same(echo(), parts.direct, atol=1e-12)
-    assert_same(echo(multipath=True), parts.direct + parts.multipath, atol=1e-12)
-    assert_same(echo(multipath=True, direct=False), parts.multipath, atol=1e-12)
-    assert_same(echo(leakage=True), parts.direct + parts.leakage, atol=1e-12)
-    assert_same(echo(wall_echo=True), parts.direct + parts.wall_echo, atol=1e-12)
-    everything = parts.direct + parts.multipath + parts.leakage + parts.wall_echo
-    assert_same(echo(multipath=True, leakage=True, wall_echo=True), everything, atol=1e-12)
-    assert all(float(part.abs().max()) > 0 for part in parts)
+    alone = {name: echo(paths=(name,)) for name in ("direct", "wall_bounces", "leakage", "wall_echo")}
+    assert all(float(part.abs().max()) > 0 for part in alone.values())
+    assert_same(echo(), alone["direct"], atol=1e-12)
+    assert_same(echo(multipath=True), alone["direct"] + alone["wall_bounces"], atol=1e-12)
+    assert_same(echo(multipath=True, direct=False), alone["wall_bounces"], atol=1e-12)
+    assert_same(echo(leakage=True), alone["direct"] + alone["leakage"], atol=1e-12)
+    assert_same(echo(wall_echo=True), alone["direct"] + alone["wall_echo"], atol=1e-12)
+    assert_same(echo(multipath=True, leakage=True, wall_echo=True), sum(alone.values()), atol=1e-12)
 
 
 def test_leakage_and_wall_echo_equal_their_definitions():

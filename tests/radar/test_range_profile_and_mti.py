@@ -1,4 +1,4 @@
-"""Range profiles and the moving target indicator."""
+"""Range profiles."""
 
 import math
 
@@ -10,7 +10,6 @@ from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.mti import MovingTargetIndicator
 from tensorsim.radar.range_profile import RangeProfile
 from tests.radar import reference
 from tests.radar.scenes import SMALL
@@ -40,28 +39,6 @@ class TestRangeProfile(StageTester):
             ((x[:, :20],), "24 samples"),
             ((x[:, :0],), "IF: got shape"),
         ]
-
-
-class TestTwoPulseCanceller(StageTester):
-    def make(self):
-        return MovingTargetIndicator("two-pulse")
-
-    def inputs(self, batch, dtype):
-        return (noise(*batch, 9, 6, dtype=dtype),)
-
-    def bad_inputs(self):
-        x = self.inputs((), torch.float32)[0]
-        return [
-            ((x.real,), "profiles: got dtype"),
-            ((x[:1],), "at least two pulses"),
-            ((x[0],), "profiles: got shape"),
-            ((x[:, :0],), "profiles: got shape"),
-        ]
-
-
-class TestMeanRemoval(TestTwoPulseCanceller):
-    def make(self):
-        return MovingTargetIndicator("mean")
 
 
 @pytest.mark.parametrize("window", ["hamming", None])
@@ -105,35 +82,6 @@ def test_leakage_shows_at_its_delay():
     assert int(RangeProfile(FREE)(x[None]).abs().argmax()) == 3
 
 
-@pytest.mark.parametrize("doppler_hz", [0.0, 10.0, 263.0, 1024.0, 2048.0, 4096.0, -300.0])
-def test_two_pulse_response(doppler_hz):
-    m = torch.arange(50).double()
-    x = torch.polar(torch.ones(50).double(), 2 * math.pi * doppler_hz * m / 8192)[:, None]
-    response = MovingTargetIndicator()(x).abs()
-    assert response.shape == (49, 1)
-    np.testing.assert_allclose(response, abs(2 * math.sin(math.pi * doppler_hz / 8192)), atol=1e-12)
-
-
-def test_two_pulse_response_at_a_slow_torso():
-    """0.5 m/s at the centre of the sweep: -13.9 dB."""
-    doppler = 2 * 0.5 / FREE.doppler_wavelength_m
-    assert 20 * math.log10(abs(2 * math.sin(math.pi * doppler / 8192))) == pytest.approx(-13.9, abs=0.05)
-
-
-def test_canceller_is_later_minus_earlier():
-    x = torch.tensor([[1.0 + 0j], [3.0 + 1j], [2.0 + 1j]])
-    assert MovingTargetIndicator()(x).flatten().tolist() == [2 + 1j, -1 + 0j]
-
-
-def test_mean_removal_keeps_motion_and_drops_clutter():
-    m = torch.arange(64).double()
-    mover = torch.polar(torch.ones(64).double(), 2 * math.pi * 4 * m / 64)[:, None]
-    actual = MovingTargetIndicator("mean")(mover + (3 - 2j))
-    np.testing.assert_allclose(actual, mover, atol=1e-12)
-
-
 def test_bad_arguments():
     with pytest.raises(TensorsimError, match="window: got 'kaiser'"):
         RangeProfile(FREE, "kaiser")
-    with pytest.raises(TensorsimError, match="method: got 'three-pulse'"):
-        MovingTargetIndicator("three-pulse")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tensorsim.errors import TensorsimError
-from tensorsim.radar.ridges import RidgeExtractor
+from tensorsim.radar.ridges import PathRidgeExtractor, RidgeExtractor, best_path
 from tests.stage import StageTester
 
 
@@ -103,3 +103,106 @@ def test_axis_is_a_circle_and_plateaus_count_once():
 def test_bad_count(count):
     with pytest.raises(TensorsimError, match=f"count: got {count}"):
         RidgeExtractor(count)
+
+
+class TestPathRidgeExtractor(StageTester):
+    def make(self):
+        return PathRidgeExtractor(2, max_jump=5, band=3)
+
+    def inputs(self, batch, dtype):
+        generator = torch.Generator().manual_seed(4)
+        return (torch.rand(*batch, 32, 9, generator=generator).to(dtype),)
+
+    def bad_inputs(self):
+        x = self.inputs((), torch.float32)[0]
+        hole = x.clone()
+        hole[3, 2] = float("nan")
+        return [
+            ((x[:10],), "at least 11 bins"),
+            ((x[:, :0],), "one frame"),
+            ((x[0],), "map: got shape"),
+            ((x.long(),), "map: got dtype"),
+            ((hole,), "map: got NaN"),
+        ]
+
+
+def test_best_path_equals_trying_all():
+    gain = torch.rand(3, 6, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) * 4
+    jumps = torch.tensor([0, -1, 1, -2, 2])
+    cost = 0.7 * jumps.double().square()
+    actual = best_path(gain, jumps, cost)
+    for b in range(3):
+        best, worth = None, -np.inf
+        for path in itertools.product(range(6), repeat=5):
+            steps = [min((b - a) % 6, (a - b) % 6) for a, b in itertools.pairwise(path)]
+            if max(steps) > 2:
+                continue
+            value = sum(float(gain[b, f, k]) for k, f in enumerate(path)) - 0.7 * sum(s * s for s in steps)
+            if value > worth:
+                best, worth = path, value
+        assert actual[b].tolist() == list(best)
+
+
+def faded(frames=60):
+    """A strong slow line with a gap, a weaker one that crosses it later, and speckle 25 dB down everywhere."""
+    k = np.arange(frames)
+    tracks = np.stack((50 + 8 * np.sin(k / 12), 1.0 * k))
+    heights = np.stack((np.where((k > 20) & (k < 32), 0.0, 1.0), np.full(frames, 0.3)))
+    speckle = 0.1 * np.random.default_rng(0).rayleigh(0.5, (128, frames))
+    return bumps(tracks, heights) + torch.as_tensor(speckle), tracks
+
+
+def test_path_bridges_a_gap_and_holds_through_a_crossing():
+    maps, tracks = faded()
+    paths = PathRidgeExtractor(2, penalty_db=2.0, floor_db=30.0)(maps).indices.numpy()
+    error = np.abs(paths[0] - tracks[0])
+    assert error.max() <= 4  # also in the gap, where there is nothing but the crossing line and speckle
+    assert np.median(error) <= 1
+    assert (
+        np.abs(paths[1] - tracks[1]) <= 3
+    ).mean() > 0.85  # the band of the first covers it where they cross
+    maxima = RidgeExtractor(2)(maps).indices.numpy()
+    assert np.abs(maxima - tracks[0]).max(1).min() > 15  # no row of connected maxima keeps to the line
+
+
+def test_paths_come_in_the_order_of_what_they_earn():
+    k = np.arange(20)
+    tracks = np.stack((20 + 0 * k, 60 + 0 * k, 100 + 0 * k))
+    x = bumps(tracks, np.stack((0.5 + 0 * k, 1.0 + 0 * k, 0.7 + 0 * k)))
+    ridges = PathRidgeExtractor(3)(x)
+    assert ridges.indices[:, 7].tolist() == [60, 100, 20]
+    np.testing.assert_allclose(ridges.magnitudes[:, 7], [1.0, 0.7, 0.5])
+
+
+def test_path_goes_around_the_circle_of_doppler():
+    k = np.arange(30)
+    x = torch.zeros(64, 30)
+    x[(50 + k) % 64, k] = 1.0  # aliases from the top to the bottom
+    assert PathRidgeExtractor(1)(x).indices[0].tolist() == ((50 + k) % 64).tolist()
+
+
+def test_dear_jumps_make_straight_paths():
+    maps, _ = faded()
+    loose, stiff = (PathRidgeExtractor(1, penalty_db=p)(maps).indices[0] for p in (0.01, 1e4))
+    assert int(loose.diff().abs().max()) > int(stiff.diff().abs().max()) == 0
+
+
+def test_path_in_silence_stays_put():
+    ridges = PathRidgeExtractor(2)(torch.zeros(64, 5))
+    assert int(ridges.indices.diff(dim=-1).abs().max()) == 0
+    assert float(ridges.magnitudes.abs().max()) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"count": 0}, "count, max_jump, band: got 0"),
+        ({"max_jump": 0}, "got 3, 0"),
+        ({"band": -1}, "got 3, 24, -1"),
+        ({"penalty_db": 0.0}, "penalty_db: got 0.0"),
+        ({"floor_db": float("nan")}, "floor_db: got nan"),
+    ],
+)
+def test_bad_path_settings(arguments, message):
+    with pytest.raises(TensorsimError, match=message):
+        PathRidgeExtractor(**arguments)

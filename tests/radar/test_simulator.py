@@ -10,8 +10,12 @@ import torch
 from tensorsim.config import RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.ambiguity import check_unambiguous, radial_speed
+from tensorsim.radar.columns import block_rms
+from tensorsim.radar.doppler import DopplerTimeMap
 from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.simulator import RadarSimulator, block_rms
+from tensorsim.radar.mti import MovingTargetIndicator
+from tensorsim.radar.ridges import RidgeExtractor
+from tensorsim.radar.simulator import RadarSimulator
 from tests.radar import reference
 from tests.radar.scenes import SMALL, joint_rcs, recorded_walk, swinging, tensors
 from tests.stage import StageTester, assert_same
@@ -198,8 +202,81 @@ def test_stream_takes_the_rcs_per_pulse_and_refuses_bad_pieces():
         simulator.stream(lambda a, b: (p[a : b - 1], rcs[a : b - 1]), 90)
     with pytest.raises(TensorsimError, match="got 20 pulses"):
         simulator.stream(lambda a, b: (p[a:b], rcs[a:b]), 20)
-    with pytest.raises(TensorsimError, match="mti 'mean'"):
+    with pytest.raises(TensorsimError, match="got mti 'mean'"):
         RadarSimulator(SMALL, mti="mean").stream(lambda a, b: (p[a:b], rcs[a:b]), 90)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"engine": "range-bins"},
+        {"mti": MovingTargetIndicator("n-pulse", pulses=12)},
+        {"mti": MovingTargetIndicator("high-pass", SMALL)},
+        {"range_gate_m": (1.0, 2.0)},
+        {"range_gate_m": 0.8, "engine": "range-bins", "near_bins": 3},
+    ],
+)
+def test_pieces_and_the_doppler_map_alone_equal_forward(options):
+    p, rcs = tensors(np.stack([swinging(300, 3, 256.0, seed=i) for i in (0, 1)]), np.ones(3))
+    module = RadarSimulator(SMALL, snr_db=10.0, pulse_chunk=8, **options)
+    torch.manual_seed(3)
+    expected = module(p, rcs)
+    for alone in (module, torch.jit.script(module)):
+        torch.manual_seed(3)
+        assert_same(alone.doppler_time(p, rcs), expected.doppler_time, atol=1e-6)
+    if not module.mti.whole_clip:
+        torch.manual_seed(3)
+        streamed = module.stream(lambda a, b: (p[0, a:b], rcs), 300)
+        torch.manual_seed(3)
+        assert_same(streamed, module(p[0], rcs), atol=1e-6)
+
+
+def test_ready_stages_take_the_place_of_their_settings():
+    echo = EchoSynthesizer(SMALL, leakage=True)
+    doppler, ridges = DopplerTimeMap(SMALL, overlap=0.5, integration="paper"), RidgeExtractor(1)
+    ready = RadarSimulator(
+        SMALL, snr_db=None, echo=echo, doppler=doppler, ridges=ridges, mti=MovingTargetIndicator()
+    )
+    named = {"leakage": True, "overlap": 0.5, "integration": "paper", "ridge_count": 1}
+    p, rcs = tensors(swinging(60, 3, 256.0), np.ones(3))
+    assert_same(ready(p, rcs), RadarSimulator(SMALL, snr_db=None, **named)(p, rcs))
+
+
+def test_fixed_gate_is_a_cut_through_the_maps():
+    p, rcs = tensors(swinging(1000, 3, FREE.prf_hz), np.ones(3))
+    whole, gated = (
+        RadarSimulator(FREE, snr_db=None),
+        RadarSimulator(FREE, snr_db=None, range_gate_m=(2.5, 3.0)),
+    )
+    chosen = (whole.range_profile.range_m >= 2.5) & (whole.range_profile.range_m <= 3.0)
+    assert torch.equal(gated.range_profile.range_m, whole.range_profile.range_m[chosen])
+    expected, maps = whole(p, rcs), gated(p, rcs)
+    assert_same(maps[:2], (expected.range_time[chosen], expected.range_time_mti[chosen]))
+    profiles = whole.mti(whole.range_profile(whole.echo(p, rcs)))[:, chosen]
+    assert_same(maps.doppler_time, whole.doppler(profiles), atol=1e-5)
+    for gate in ((3.0, 3.01), (9.0, 10.0), (3.0, 2.0), (0.0, math.nan)):
+        with pytest.raises(TensorsimError, match="gate_m: got"):
+            RadarSimulator(FREE, range_gate_m=gate)
+    with pytest.raises(TensorsimError, match="width_m: got 0"):
+        RadarSimulator(FREE, range_gate_m=0)
+
+
+def test_following_gate_follows():
+    """Two bodies, the second of little weight and 3 m behind: its bins go, those of the first stay, both moving."""
+    p = np.concatenate([swinging(3000, 3, FREE.prf_hz, d, -2.0, seed=i) for i, d in ((0, 3.0), (1, 6.0))], 1)
+    p, rcs = tensors(p, [1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
+    simulator = RadarSimulator(FREE, snr_db=None, range_gate_m=1.5)
+    maps, whole = simulator(p, rcs), RadarSimulator(FREE, snr_db=None)(p, rcs)
+    assert_same(maps.range_time, whole.range_time)
+    distance = 0.5 * sum(
+        np.linalg.norm(p.numpy() - np.array(antenna), axis=-1) for antenna in (FREE.tx_m, FREE.rx_m)
+    )
+    center = (distance * rcs.numpy()).sum(1) / rcs.numpy().sum()
+    keep = np.abs(simulator.range_profile.range_m.numpy()[:, None] - center[1:]) <= 0.75
+    assert np.array_equal(maps.range_time_mti.numpy(), np.where(keep, whole.range_time_mti.numpy(), 0))
+    assert abs(center[-1] - center[0]) > 0.3  # else nothing was followed
+    nobody = simulator(p, torch.zeros(6, dtype=torch.float64))
+    assert float(nobody.range_time_mti.abs().max()) == 0
 
 
 def test_block_rms():

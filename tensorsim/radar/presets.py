@@ -1,0 +1,283 @@
+"""Radars by name, and radars from YAML files.
+
+A file holds fields of :class:`~tensorsim.config.RadarConfig` and, for a scene with a wall, a section with those
+of :class:`~tensorsim.config.WallConfig`; what is not named keeps its default::
+
+    carrier_hz: 24.0e9
+    bandwidth_hz: 250e6
+    chirp_s: 256e-6
+    prf_hz: 2000
+    sample_rate_hz: 250e3
+    rx_m: [0.02, 0.0, 1.0]
+    wall:
+      relative_permittivity: 4.5
+"""
+
+import dataclasses
+import difflib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig, WallConfig
+from tensorsim.errors import TensorsimError
+
+
+class RadarScene(NamedTuple):
+    """A radar, and the wall before it.
+
+    Attributes:
+        radar: the radar.
+        wall: the wall; None is free space.
+    """
+
+    radar: RadarConfig
+    wall: WallConfig | None = None
+
+
+#: Radars by name. Each number is marked: (D) limit or value of the public data sheet or evaluation board guide,
+#: (T) a typical setting for people, within these limits; antennas stand 1 m above the floor. Check the numbers
+#: against the data sheet of the part at hand where they matter. The simulated pulses are evenly spaced, without
+#: pauses between frames, and the samples complex; the swept band is all sampled, where a real chirp loses some at
+#: its ends.
+PRESETS: dict[str, RadarScene] = {
+    # The two scenes of the paper's control panel.
+    "free-space": RadarScene(RadarConfig.free_space()),
+    "through-wall": RadarScene(RadarConfig.through_wall(), WallConfig()),
+    # Texas Instruments AWR1642 on its BOOST board: 76 to 81 GHz.
+    "ti-awr1642": RadarScene(
+        RadarConfig(
+            carrier_hz=77e9,  # D: start of the 4 GHz band
+            bandwidth_hz=4e9,  # D: widest sweep
+            chirp_s=51.2e-6,  # T: 78 MHz/us; D: at most 100 MHz/us
+            prf_hz=8000.0,  # T: 7.6 m/s
+            sample_rate_hz=6.25e6,  # D: highest complex rate (5 MHz of intermediate frequency); range 6 m
+            tx_m=(-0.01, 0.0, 1.0),  # T: centimetres apart on the board
+            rx_m=(0.01, 0.0, 1.0),
+            antenna_gain_dbi=10.5,  # D: board guide, peak
+            isolation_db=30.0,  # T
+        )
+    ),
+    # Texas Instruments AWR1843 on its BOOST board: 76 to 81 GHz.
+    "ti-awr1843": RadarScene(
+        RadarConfig(
+            carrier_hz=77e9,  # D: start of the 4 GHz band
+            bandwidth_hz=4e9,  # D: widest sweep
+            chirp_s=40.96e-6,  # T: 98 MHz/us; D: at most 100 MHz/us
+            prf_hz=8000.0,  # T: 7.6 m/s
+            sample_rate_hz=12.5e6,  # D: highest complex rate (10 MHz of intermediate frequency); range 9.6 m
+            tx_m=(-0.01, 0.0, 1.0),  # T: centimetres apart on the board
+            rx_m=(0.01, 0.0, 1.0),
+            antenna_gain_dbi=10.5,  # D: board guide, peak
+            isolation_db=30.0,  # T
+        )
+    ),
+    # Texas Instruments IWR6843 on its ISK board: 60 to 64 GHz.
+    "ti-iwr6843": RadarScene(
+        RadarConfig(
+            carrier_hz=60e9,  # D: start of the 4 GHz band
+            bandwidth_hz=4e9,  # D: widest sweep
+            chirp_s=40.96e-6,  # T: 98 MHz/us; D: at most 250 MHz/us
+            prf_hz=6400.0,  # T: 7.7 m/s
+            sample_rate_hz=12.5e6,  # D: highest complex rate (10 MHz of intermediate frequency); range 9.6 m
+            tx_m=(-0.01, 0.0, 1.0),  # T: centimetres apart on the board
+            rx_m=(0.01, 0.0, 1.0),
+            antenna_gain_dbi=7.0,  # D: board guide, peak
+            isolation_db=30.0,  # T
+        )
+    ),
+    # Infineon BGT60TR13C: antennas in the package, one transmitter, three receivers in an L; here the corner one.
+    "infineon-bgt60tr13c": RadarScene(
+        RadarConfig(
+            carrier_hz=58e9,  # D: 58 to 63.5 GHz
+            bandwidth_hz=5.5e9,  # D: widest sweep
+            chirp_s=128e-6,  # T: 43 MHz/us; D: at most 400 MHz/us
+            prf_hz=4000.0,  # T: 4.9 m/s
+            sample_rate_hz=4e6,  # D: highest rate; real samples, which reach as far as half the bins here; 7.0 m
+            tx_m=(-0.0025, 0.0, 1.0),  # T: other side of a package 6.5 mm wide (D)
+            rx_m=(0.0025, 0.0, 1.0),
+            antenna_gain_dbi=5.0,  # D
+            isolation_db=30.0,  # T
+        )
+    ),
+    # Infineon BGT24MTR12 with patch arrays, as on its Position2Go board: the 24 GHz ISM band.
+    "infineon-bgt24mtr12": RadarScene(
+        RadarConfig(
+            carrier_hz=24e9,  # D: 24.0 to 24.25 GHz
+            bandwidth_hz=250e6,  # D: all of the band, range bins of 0.6 m
+            chirp_s=256e-6,  # T
+            prf_hz=2000.0,  # T: 6.2 m/s
+            sample_rate_hz=250e3,  # T: range 19 m
+            tx_m=(-0.02, 0.0, 1.0),  # T: centimetres apart on the board
+            rx_m=(0.02, 0.0, 1.0),
+            antenna_gain_dbi=12.0,  # T: patch arrays of the board
+            isolation_db=30.0,  # T
+        )
+    ),
+    # A continuous-wave Doppler sensor at 24 GHz, 160 Hz per m/s: a sweep so narrow that all is in one range bin.
+    "cw-24ghz": RadarScene(
+        RadarConfig(
+            carrier_hz=24e9 - 0.5e6,  # D: the centre of the sweep at 24 GHz
+            bandwidth_hz=1e6,  # T: range bins of 150 m
+            chirp_s=100e-6,  # T
+            prf_hz=4096.0,  # T: 12.8 m/s
+            sample_rate_hz=160e3,  # T
+            tx_m=(-0.01, 0.0, 1.0),  # T
+            rx_m=(0.01, 0.0, 1.0),
+            antenna_gain_dbi=10.0,  # T
+            isolation_db=20.0,  # T
+        )
+    ),
+}
+
+#: Half a wavelength in the middle of the AWR1843's band.
+_HALF_79_GHZ = SPEED_OF_LIGHT_M_S / 79e9 / 2
+
+PRESETS |= {
+    # D: four receivers half a wavelength apart, the two outer transmitters two wavelengths: a virtual row of eight.
+    "ti-awr1843-array": RadarScene(
+        replace(
+            PRESETS["ti-awr1843"].radar,
+            tx_m=tuple((-0.01 + 4 * k * _HALF_79_GHZ, 0.0, 1.0) for k in range(2)),
+            rx_m=tuple((0.01 + k * _HALF_79_GHZ, 0.0, 1.0) for k in range(4)),
+        )
+    ),
+    # D: the corner of the L, its neighbours 2.5 mm beside and above it (which is up depends on the mounting).
+    "infineon-bgt60tr13c-array": RadarScene(
+        replace(
+            PRESETS["infineon-bgt60tr13c"].radar,
+            rx_m=((0.0025, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0025, 0.0, 1.0025)),
+        )
+    ),
+}
+
+
+def radar_scene(name_or_path: str) -> RadarScene:
+    """The preset of this name, or the scene of this YAML file.
+
+    Raises:
+        TensorsimError: neither a preset nor a file, or a file that :func:`load_scene_yaml` refuses.
+    """
+    if name_or_path in PRESETS:
+        return PRESETS[name_or_path]
+    if Path(name_or_path).is_file():
+        return load_scene_yaml(name_or_path)
+    raise TensorsimError(
+        f"radar: got {name_or_path!r}, which is no file, expected one or a preset"
+        f"{_suggestion(name_or_path, list(PRESETS))} ({', '.join(PRESETS)})"
+    )
+
+
+def load_radar_yaml(path: str | Path) -> RadarConfig:
+    """The radar of a YAML file; see the module for the format and :func:`load_scene_yaml` for the wall as well."""
+    return load_scene_yaml(path).radar
+
+
+def load_scene_yaml(path: str | Path) -> RadarScene:
+    """The radar of a YAML file, and its wall if the file has a section ``wall``.
+
+    The fields of the radar may also stand in a section ``radar``. Numbers may be written as in Python: unlike
+    plain YAML 1.1, ``77e9`` is one. Nothing in the file is run.
+
+    Raises:
+        TensorsimError: no such file, no YAML, an unknown or repeated key, a value of the wrong type, or one that
+            the configuration refuses; the message names file and key.
+    """
+    import yaml
+
+    try:
+        document = yaml.load(Path(path).read_text(encoding="utf-8"), _unique_keys_loader())
+    except OSError as error:
+        raise TensorsimError(f"{path}: {error.strerror}") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise TensorsimError(f"{path}: not valid YAML: {error}") from None
+    document = _mapping(f"{path}", document)
+    sections = {name: document.pop(name) for name in ("radar", "wall") if name in document}
+    fields = document
+    if "radar" in sections:
+        if fields:
+            raise TensorsimError(
+                f"{path}: got {', '.join(map(str, fields))} beside the section radar, expected them in it"
+            )
+        fields = _mapping(f"{path}: radar", sections["radar"])
+    radar = _build(f"{path}", RadarConfig, fields, ["radar", "wall"])
+    if "wall" not in sections:
+        return RadarScene(radar)
+    return RadarScene(
+        radar, _build(f"{path}: wall", WallConfig, _mapping(f"{path}: wall", sections["wall"]), [])
+    )
+
+
+def save_radar_yaml(path: str | Path, radar: RadarConfig, wall: WallConfig | None = None) -> None:
+    """Write a file from which :func:`load_scene_yaml` reads the same scene."""
+    import yaml
+
+    document = _plain(dataclasses.asdict(radar))
+    if wall is not None:
+        document["wall"] = _plain(dataclasses.asdict(wall))
+    Path(path).write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+
+
+def _unique_keys_loader() -> type:
+    """YAML's safe loader, which would take the last of two equal keys, made to refuse them."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            keys = [str(key.value) for key, _ in node.value]
+            twice = sorted({key for key in keys if keys.count(key) > 1})
+            if twice:
+                raise yaml.YAMLError(f"twice the key {', '.join(twice)}")
+            return super().construct_mapping(node, deep)
+
+    return Loader
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, as deep as they go: YAML's safe form has no tuples."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+def _mapping(where: str, value: Any) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        raise TensorsimError(f"{where}: got {value!r}, expected keys with values")
+    return dict(value)
+
+
+def _suggestion(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name.lower(), known, n=1)
+    return f", perhaps {close[0]!r}" if close else ""
+
+
+def _build(where: str, config: type, values: dict[Any, Any], sections: list[str]) -> Any:
+    """A configuration of this dataclass from YAML's values."""
+    defaults = {field.name: field.default for field in dataclasses.fields(config)}
+    for key in values:
+        if key not in defaults:
+            raise TensorsimError(
+                f"{where}: got the key {key!r}, expected one of {', '.join([*defaults, *sections])}"
+                f"{_suggestion(str(key), [*defaults, *sections])}"
+            )
+    converted = {key: _like(f"{where}: {key}", value, defaults[key]) for key, value in values.items()}
+    try:
+        return config(**converted)
+    except TensorsimError as error:
+        raise TensorsimError(f"{where}: {error}") from None
+
+
+def _like(where: str, value: Any, default: Any) -> Any:
+    """A value of YAML in the type of a field's default: a number, (nested) tuples of numbers, or as it is."""
+    if isinstance(default, tuple):
+        if not isinstance(value, list):
+            raise TensorsimError(f"{where}: got {value!r}, expected a list of numbers")
+        return tuple(_like(where, item, default if isinstance(item, list) else 0.0) for item in value)
+    if isinstance(default, float):
+        try:
+            if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+                return float(value)
+        except ValueError:
+            pass
+        raise TensorsimError(f"{where}: got {value!r}, expected a number")
+    return tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,43 @@
+"""The notebooks run from top to bottom; each asserts in its last cell what it claims."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+#: These read recordings that are not part of the project.
+NEED_DATA = {"measured_radar"}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.filterwarnings("ignore")  # of the notebook client; the kernel is a process of its own
+def test_notebook_runs(path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    if path.stem in NEED_DATA:
+        monkeypatch.setenv("TENSORSIM_SHARED_DATA", str(request.getfixturevalue("shared_data")))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    notebook = nbformat.read(path, as_version=4)
+    assert "assert" in notebook.cells[-1].source
+    nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}}
+    ).execute()
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_is_stored_without_outputs(path: Path) -> None:
+    nbformat = pytest.importorskip("nbformat")
+    for cell in nbformat.read(path, as_version=4).cells:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+
+
+def test_missing_recordings_are_said_plainly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(ROOT / "notebooks" / "measured_radar.ipynb", as_version=4)
+    monkeypatch.setenv("TENSORSIM_SHARED_DATA", str(tmp_path / "nowhere"))
+    first = next(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    with pytest.raises(FileNotFoundError, match="set TENSORSIM_SHARED_DATA"):
+        exec(first, {})
