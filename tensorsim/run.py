@@ -136,7 +136,7 @@ def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
     doppler = simulator.doppler
     pulses = doppler.length + (maps.doppler_time.shape[-1] - 1) * doppler.hop
     # What the two-pulse canceller gives lies between the two pulses that it subtracts.
-    delay_s = simulator.mti.lost_pulses / 2 / simulator.radar.prf_hz
+    delay_s = simulator.mti.delay_pulses / simulator.radar.prf_hz
     return Axes(
         range_m=simulator.range_profile.range_m.cpu().numpy(),
         doppler_hz=doppler.doppler_hz.cpu().numpy(),

@@ -1,7 +1,7 @@
 """The base tester: every stage of tensorsim inherits it, so that none arrives untested.
 
-A test class names its module and its inputs; the tester checks what every stage promises (DESIGN of the
-package): scripted equals eager, batch equals loop, float32 near float64, CPU equals CUDA, gradients against
+A test class names its module and its inputs; the tester checks what every stage
+promises: scripted equals eager, batch equals loop, float32 near float64, CPU equals CUDA, gradients against
 finite differences, no hidden state, and an exception of ours for bad input.
 """
 

@@ -80,7 +80,7 @@ PYTHON_CASES: list[tuple[str, Callable[[], object], str]] = [
     (
         "one pulse into MTI",
         lambda: ts.radar.MovingTargetIndicator("two-pulse")(torch.zeros(1, 4) + 0j),
-        "two",
+        "at least 2 pulses",
     ),
     ("STFT overlap of 1", lambda: ts.radar.DopplerTimeMap(RADAR, overlap=1.0), "overlap"),
     ("STFT window of 0 s", lambda: ts.radar.DopplerTimeMap(RADAR, window_s=0.0), "window_s"),

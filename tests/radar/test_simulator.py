@@ -340,3 +340,17 @@ def test_simulator_refuses_motion_beyond_the_pulse_rate():
 def test_bad_display_rate(rate):
     with pytest.raises(TensorsimError, match="display_rate_hz: got"):
         RadarSimulator(FREE, display_rate_hz=rate)
+
+
+def test_warns_of_what_the_range_axis_cannot_show():
+    far = torch.tensor([0.0, 9.0, 1.5]).expand(64, 2, 3).clone()
+    with pytest.warns(TensorsimWarning, match=r"9\.00 m away, beyond the 7\.49 m"):
+        check_unambiguous(far, torch.ones(64, 2), RadarConfig.free_space())
+    check_unambiguous(far, torch.zeros(64, 2), RadarConfig.free_space())  # nobody is there
+    check_unambiguous(far, torch.ones(64, 2), THROUGH)  # 30 m
+
+
+def test_refuses_an_array_of_antennas():
+    radar = RadarConfig(rx_m=((0.0, 0.0, 1.5), (0.002, 0.0, 1.5)))
+    with pytest.raises(TensorsimError, match="several antennas"):
+        RadarSimulator(radar)
