@@ -1,17 +1,27 @@
 """Joints at video rate -> scatterers at pulse rate."""
 
+from tensorsim.motion.activities import ActivityGenerator, Motion
+from tensorsim.motion.body import body_to_coco
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
+from tensorsim.motion.people import People, PeopleConfig
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers
 from tensorsim.motion.shadowing import Shadowing
+from tensorsim.motion.walking import boulic_gait
 
 __all__ = [
+    "ActivityGenerator",
     "Body13Scatterers",
     "JointScatterers",
     "LimbScatterers",
+    "Motion",
+    "People",
+    "PeopleConfig",
     "PoseResampler",
     "SavitzkyGolay",
     "Shadowing",
+    "body_to_coco",
+    "boulic_gait",
 ]

@@ -5,12 +5,13 @@ Drillis and Contini), except the half widths of shoulders and hips and the place
 of key points in pictures.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tensorsim.config import JOINTS
+from tensorsim.config import COCO_KEYPOINTS, JOINTS
 
 ANKLE_HEIGHT = 0.039
 SHANK = 0.246
@@ -25,6 +26,21 @@ NOSE_FORWARD = 0.06
 NOSE_UP = 0.11
 #: Flesh between a joint and the floor that it rests on; ankles stand at their own height.
 FLESH = 0.045
+
+
+class Proportions(NamedTuple):
+    """Lengths of segments as fractions of the body height, each a number or a tensor (...).
+
+    The defaults are the means; head and ankles keep the same fraction in every body.
+    """
+
+    shank: Tensor | float = SHANK
+    thigh: Tensor | float = THIGH
+    trunk: Tensor | float = TRUNK
+    half_hips: Tensor | float = HALF_HIPS
+    half_shoulders: Tensor | float = HALF_SHOULDERS
+    upper_arm: Tensor | float = UPPER_ARM
+    forearm: Tensor | float = FOREARM
 
 
 class BodyPose(NamedTuple):
@@ -75,18 +91,25 @@ def rotation(axis: int, angle: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def forward_kinematics(pose: BodyPose, height_m: Tensor | float = 1.0) -> Tensor:
+def forward_kinematics(
+    pose: BodyPose, height_m: Tensor | float = 1.0, proportions: Proportions | None = None
+) -> Tensor:
     """Joints of an articulated body with constant bone lengths.
 
     Args:
         pose: angles with any leading dimensions.
         height_m: standing body height, a number or (...) metres.
+        proportions: lengths of the segments; None is the mean body.
 
     Returns:
         (..., 14, 3) metres, order of ``tensorsim.JOINTS``, x right, y forward, z up, relative to the middle
         of the hips. Differentiable.
     """
     like = pose.heading
+    sizes = Proportions() if proportions is None else proportions
+    shank, thigh, trunk, half_hips, half_shoulders, upper_arm, forearm = (
+        torch.as_tensor(size, dtype=like.dtype, device=like.device)[..., None] for size in sizes
+    )
 
     def vector(x: float, y: float, z: float) -> Tensor:
         return torch.tensor([x, y, z], dtype=like.dtype, device=like.device)
@@ -98,21 +121,21 @@ def forward_kinematics(pose: BodyPose, height_m: Tensor | float = 1.0) -> Tensor
     pelvis = body @ rotation(2, pose.pelvis[..., 1]) @ rotation(1, pose.pelvis[..., 0])
     skull = chest @ rotation(2, pose.head[..., 1]) @ rotation(0, -pose.head[..., 0])
 
-    neck = chest @ vector(0.0, 0.0, TRUNK)
+    neck = trunk * (chest @ vector(0.0, 0.0, 1.0))
     joints = [neck + skull @ vector(0.0, NOSE_FORWARD, NOSE_UP), neck]
     for limb, side in ((0, 1.0), (1, -1.0)):  # right arm, left arm
         flexion, abduction, inward = pose.shoulder[..., limb, :].unbind(-1)
         arm = twisted @ rotation(0, flexion) @ rotation(1, -side * abduction) @ rotation(2, side * inward)
-        shoulder = neck + chest @ vector(side * HALF_SHOULDERS, 0.0, 0.0)
-        elbow = shoulder + UPPER_ARM * (arm @ down)
-        wrist = elbow + FOREARM * (arm @ rotation(0, pose.elbow[..., limb]) @ down)
+        shoulder = neck + half_shoulders * (chest @ vector(side, 0.0, 0.0))
+        elbow = shoulder + upper_arm * (arm @ down)
+        wrist = elbow + forearm * (arm @ rotation(0, pose.elbow[..., limb]) @ down)
         joints += [shoulder, elbow, wrist]
     for limb, side in ((0, 1.0), (1, -1.0)):  # right leg, left leg
         flexion, abduction = pose.hip[..., limb, :].unbind(-1)
         leg = body @ rotation(0, flexion) @ rotation(1, -side * abduction)
-        hip = pelvis @ vector(side * HALF_HIPS, 0.0, 0.0)
-        knee = hip + THIGH * (leg @ down)
-        ankle = knee + SHANK * (leg @ rotation(0, -pose.knee[..., limb]) @ down)
+        hip = half_hips * (pelvis @ vector(side, 0.0, 0.0))
+        knee = hip + thigh * (leg @ down)
+        ankle = knee + shank * (leg @ rotation(0, -pose.knee[..., limb]) @ down)
         joints += [hip, knee, ankle]
     height = torch.as_tensor(height_m, dtype=like.dtype, device=like.device)
     return torch.stack(joints, dim=-2) * height[..., None, None]
@@ -139,3 +162,41 @@ def mirror(joints: Tensor) -> Tensor:
     ]
     flipped = joints[..., swapped, :]
     return torch.cat([-flipped[..., :1], flipped[..., 1:]], dim=-1)
+
+
+#: Eyes and ears seen from the nose: sideways, backward and up, in body heights.
+_EYE = (0.018, 0.014, 0.019)
+_EAR = (0.043, 0.060, 0.010)
+
+
+def body_to_coco(joints: Tensor) -> Tensor:
+    """The 17 key points of COCO from the 14 joints of the radar body.
+
+    Eyes and ears are placed about the nose in a frame that neck and nose (which give its size too) and the
+    line of the shoulders span: a head that turns against the trunk turns them in part only.
+
+    Args:
+        joints: (..., 14, 3) metres, order of ``tensorsim.JOINTS``, any frame with right-handed axes.
+
+    Returns:
+        (..., 17, 3) in the order of ``tensorsim.COCO_KEYPOINTS``; body joints and nose are kept as they are.
+    """
+    nose, neck = joints[..., 0, :], joints[..., 1, :]
+    reach = nose - neck
+    height = reach.norm(dim=-1, keepdim=True) / math.hypot(NOSE_FORWARD, NOSE_UP)
+    reach = reach / reach.norm(dim=-1, keepdim=True)
+    across = joints[..., 2, :] - joints[..., 5, :]
+    right = across - (across * reach).sum(dim=-1, keepdim=True) * reach
+    right = right / right.norm(dim=-1, keepdim=True)
+    beside = torch.linalg.cross(right, reach)  # a quarter turn from `reach`, back to up as forward to right
+    angle = math.atan2(NOSE_FORWARD, NOSE_UP)
+    up = math.cos(angle) * reach + math.sin(angle) * beside
+    forward = math.sin(angle) * reach - math.cos(angle) * beside
+
+    def face(side: float, place: tuple[float, float, float]) -> Tensor:
+        sideways, back, above = place
+        return nose + height * (side * sideways * right - back * forward + above * up)
+
+    points = [nose, face(-1.0, _EYE), face(1.0, _EYE), face(-1.0, _EAR), face(1.0, _EAR)]
+    points += [joints[..., JOINTS.index(name), :] for name in COCO_KEYPOINTS[5:]]
+    return torch.stack(points, dim=-2)

@@ -1,0 +1,185 @@
+"""A movement at given times, and the parts that the scripts of activities are made of.
+
+Everybody is right-handed here, starts at the origin and faces +y; times in seconds, angles in degrees.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.motion.body import BodyPose
+from tensorsim.motion.feet import tread
+from tensorsim.motion.people import People
+from tensorsim.motion.walking import Gait, boulic_gait, cycle_s
+
+_DEGREE = math.pi / 180
+Pair = tuple[Tensor | float, Tensor | float]
+
+#: Slightly bent legs of quiet standing, and how far walking lowers the hips (leg lengths) so that both legs reach.
+REST_HIP, REST_KNEE = 7.0, 14.0
+_WALKING_DROP = 0.018
+#: Phase at which the body is over the standing foot.
+_STANDING = 0.24
+#: Body heights that a swinging foot is kept clear of the floor.
+SWING_LIFT = 0.03
+
+
+class Act(NamedTuple):
+    """A movement at given times (B, T).
+
+    Attributes:
+        pose: angles of the body.
+        stance: angles that carry the body: its ankles, weighted by ``support``, stay at the origin.
+        support: (B, T, 2) weight on the right and left ankle, sum 1.
+        offset: (B, T, 3) m of the hips on top of that: right, forward, up.
+        path: (B, T) m walked.
+        hold: (B, T, 2) how firmly each foot is held by the floor, 0 to 1.
+        moment: (B, K, 2) times at which the feet are where they are held, step by step.
+        step: (B, T, 2) int64, the step of each time.
+        other: (B, T, 2) int64, the step that the foot comes from or goes to.
+        progress: (B, T, 2) towards that one, as a share of the way; None for feet that do not walk.
+        lift: (B, T, 2) body heights by which a foot on its way to another place is raised at the floor, less
+            higher up.
+        level: (B, T) 1 where feet that are held stand on the floor, 0 where the body lies.
+    """
+
+    pose: BodyPose
+    stance: BodyPose
+    support: Tensor
+    offset: Tensor
+    path: Tensor
+    hold: Tensor
+    moment: Tensor
+    step: Tensor
+    other: Tensor
+    progress: Tensor | None
+    lift: Tensor
+    level: Tensor
+
+
+class Vary:
+    """Numbers of a script, each with the person's own deviation, as columns (B, 1)."""
+
+    def __init__(self, who: People) -> None:
+        self.factor, self.used = who.factor, 0
+
+    def __call__(self, nominal: float) -> Tensor:
+        """The next number, varied."""
+        self.used += 1
+        return nominal * self.factor[:, self.used - 1 : self.used]
+
+
+def make_pose(
+    time: Tensor,
+    who: People,
+    *,
+    turn: Tensor | float = 0.0,
+    lean: Tensor | float = 0.0,
+    pitch: Tensor | float = 0.0,
+    twist: Tensor | float = 0.0,
+    nod: Tensor | float = 0.0,
+    look: Tensor | float = 0.0,
+    hip: Pair = (REST_HIP, REST_HIP),
+    knee: Pair = (REST_KNEE, REST_KNEE),
+    flexion: Pair = (2.0, 2.0),
+    abduction: Pair = (8.0, 8.0),
+    inward: Pair = (15.0, 15.0),
+    elbow: Pair = (12.0, 12.0),
+) -> BodyPose:
+    """Angles in degrees to a pose (B, T); the chest breathes by half a degree."""
+
+    def angle(value: Tensor | float) -> Tensor:
+        return torch.as_tensor(value, dtype=time.dtype).expand(time.shape) * _DEGREE
+
+    def stack(*values: Tensor | float) -> Tensor:
+        return torch.stack([angle(value) for value in values], dim=-1)
+
+    breath = 0.5 * torch.sin(2 * math.pi * (0.25 * time + who.gait_phase[:, None]))
+    arms = [stack(flexion[i], abduction[i], inward[i]) for i in (0, 1)]
+    return BodyPose(
+        heading=angle(turn),
+        lean=angle(lean),
+        roll=angle(0.0),
+        trunk=stack(breath + pitch, 0.0, twist),
+        pelvis=stack(0.0, 0.0),
+        head=stack(nod, look),
+        shoulder=torch.stack(arms, dim=-2),
+        elbow=stack(*elbow),
+        hip=torch.stack([stack(hip[0], 0.0), stack(hip[1], 0.0)], dim=-2),
+        knee=stack(*knee),
+    )
+
+
+def on_the_spot(time: Tensor, pose: BodyPose) -> Act:
+    """Both feet stay where they are."""
+    pair = torch.ones((*time.shape, 2), dtype=time.dtype)
+    zero = torch.zeros_like(time)
+    return Act(
+        pose,
+        pose,
+        support=pair / 2,
+        offset=torch.zeros((*time.shape, 3), dtype=time.dtype),
+        path=zero,
+        hold=pair,
+        moment=0 * pair[:, :1],
+        step=torch.zeros_like(pair, dtype=torch.int64),
+        other=torch.zeros_like(pair, dtype=torch.int64),
+        progress=None,
+        lift=0 * pair,
+        level=zero + 1,
+    )
+
+
+def _reach_ahead(who: People, gait: Gait) -> Tensor:
+    """How far the ankles (B, T, 2) are ahead of a hip that moves evenly, in leg lengths."""
+    sizes = who.proportions
+    thigh = torch.as_tensor(sizes.thigh / (sizes.thigh + sizes.shank))[:, None, None]
+    leg = thigh * torch.sin(gait.hip) + (1 - thigh) * torch.sin(gait.hip - gait.knee)
+    return leg + gait.translation[..., 1:2]
+
+
+def with_gait(time: Tensor, who: People, base: BodyPose, pace: Tensor, path: Tensor) -> Act:
+    """Walking on top of what the body does else, ``pace`` (B, T) of it between 0 and 1."""
+    leg = (who.proportions.thigh + who.proportions.shank) * who.height_m
+    relative_speed = who.speed_m_s / leg
+    cycle = cycle_s(relative_speed)[:, None]
+    phase = time / cycle + who.gait_phase[:, None]
+    gait = boulic_gait(relative_speed, phase)
+    rest = 1 - pace[..., None]
+    share = pace[..., None]
+    bend = torch.tensor([REST_HIP, 0.0], dtype=time.dtype) * _DEGREE
+    hip = base.hip + share[..., None] * (torch.stack([gait.hip, 0 * gait.hip], dim=-1) - bend)
+    hang = torch.stack([gait.shoulder, 0 * gait.shoulder, 0 * gait.shoulder], dim=-1)
+    pose = base._replace(
+        hip=hip,
+        knee=base.knee + share * (gait.knee - REST_KNEE * _DEGREE),
+        shoulder=base.shoulder + share[..., None] * hang,
+        elbow=base.elbow * (rest + share * 0.3) + share * gait.elbow,
+        trunk=base.trunk + share * gait.trunk,
+        pelvis=base.pelvis + share * gait.pelvis,
+        head=base.head - share * torch.stack([0 * phase, gait.trunk[..., 2]], dim=-1),
+    )
+    act = on_the_spot(time, base)
+    drop = torch.tensor([0.0, 0.0, _WALKING_DROP], dtype=time.dtype)
+    # A foot is flat on the floor from 0.09 to 0.39 of its cycle; then the heel rises.
+    steps = tread(time, cycle[:, 0], who.gait_phase, _STANDING, 0.30, 0.17)
+    # Between two steps it goes on as in steady walking: with the hips, and ahead of or behind them.
+    ahead = _reach_ahead(who, gait)
+    still = boulic_gait(relative_speed, torch.full_like(time[:, :1], _STANDING))
+    ahead_still = _reach_ahead(who, still)[:, :, :1]
+    stride = who.speed_m_s[:, None, None] * cycle[..., None]
+    progress = steps.since + (ahead - ahead_still) * leg[:, None, None] / stride
+    return act._replace(
+        pose=pose,
+        stance=base,
+        offset=share * (gait.translation - drop) * leg[:, None, None],
+        path=path,
+        hold=steps.hold,
+        moment=steps.moment,
+        step=steps.step,
+        other=steps.other,
+        progress=torch.where(steps.since < 0, -progress, progress),
+        lift=SWING_LIFT * (1 - steps.hold) ** 2,
+    )

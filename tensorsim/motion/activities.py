@@ -1,0 +1,240 @@
+"""The twelve activities as moving bodies: joints in metres at any rate, seeded, batched."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.motion.act import Act
+from tensorsim.motion.body import (
+    ANKLE_HEIGHT,
+    FLESH,
+    Proportions,
+    forward_kinematics,
+    mirror,
+    rotation,
+)
+from tensorsim.motion.feet import LEFT_LEG, RIGHT_LEG, place_ankles
+from tensorsim.motion.people import People, PeopleConfig, draw_people
+from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature
+from tensorsim.motion.scripts import SCRIPTS
+
+#: Joints are worked out at this rate and interpolated by a C2 spline: bones keep their length to micrometres.
+_KNOT_HZ = 240.0
+#: Knots beyond both ends of a clip, where the spline's free ends fade away.
+_MARGIN = 12
+#: Softness of the contact with the floor, 1/m: bodies sink or float by less than a centimetre.
+_FLOOR_SHARPNESS = 150.0
+
+
+class Motion(NamedTuple):
+    """People who act.
+
+    Attributes:
+        joints: (B, T, 14, 3) float64 world metres (x right, y away from the radar, z up), order of
+            ``tensorsim.JOINTS``. Where nobody is (S1 Empty), somebody standing still who does not count.
+        valid: (B, T) bool, whether somebody is there.
+        activity: (B,) int64 index into ``tensorsim.ACTIVITIES``.
+        people: who acted, to do it again.
+    """
+
+    joints: Tensor
+    valid: Tensor
+    activity: Tensor
+    people: People
+
+
+def activity_index(name: str) -> int:
+    """Index of a class by its full name, or by the words without the number, in any case.
+
+    Raises:
+        TensorsimError: no such class; the message lists them.
+    """
+    wanted = name.strip().lower()
+    for i, full in enumerate(ACTIVITIES):
+        if wanted in (full.lower(), full.lower().split(" ", 1)[1], full.lower().split(" ", 1)[0]):
+            return i
+    import difflib
+
+    words = [full.lower().split(" ", 1)[1] for full in ACTIVITIES]
+    close = difflib.get_close_matches(wanted, words, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise TensorsimError(f"activity: got {name!r}{hint}, expected one of {', '.join(ACTIVITIES)}")
+
+
+def _carried(act: Act, who: People) -> Tensor:
+    """Joints (B, T, 14, 3) of bodies that rest on the floor, before their feet are held fast."""
+    height = who.height_m[:, None]
+    sizes = Proportions(*(torch.as_tensor(p)[:, None] for p in who.proportions))
+    standing = forward_kinematics(act.stance, height, sizes)
+    ankles = standing[..., (RIGHT_LEG + 2, LEFT_LEG + 2), :]
+    anchor = (act.support[..., None] * ankles).sum(dim=-2)
+    room = torch.full((14,), FLESH, dtype=standing.dtype)
+    room[[RIGHT_LEG + 2, LEFT_LEG + 2]] = ANKLE_HEIGHT
+    lack = room * height[..., None] - standing[..., 2]
+    # Smooth maximum, exact for two feet side by side.
+    lift = (torch.logsumexp(_FLOOR_SHARPNESS * lack, dim=-1) - math.log(2)) / _FLOOR_SHARPNESS
+    spot = torch.stack([-anchor[..., 0], -anchor[..., 1], lift], dim=-1)
+    turned = (rotation(2, act.pose.heading) @ act.offset[..., None])[..., 0]
+    zero = torch.zeros_like(act.path)
+    root = spot + turned + torch.stack([zero, act.path, zero], dim=-1)
+    moving = standing if act.pose is act.stance else forward_kinematics(act.pose, height, sizes)
+    return moving + root[..., None, :]
+
+
+def _of_step(spots: Tensor, step: Tensor) -> Tensor:
+    """Spots (B, K, 3) of the steps (B, T) of each time."""
+    return spots.gather(1, step[..., None].expand(-1, -1, 3))
+
+
+def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) -> Tensor:
+    """Joints of people who follow a script, at the origin and facing +y, with feet that do not slide.
+
+    Where a script says that a foot is held, its ankle is moved to where the script has it at the middle of
+    standing, on the floor, and the leg is bent to reach it.
+
+    Args:
+        script: one of ``SCRIPTS``.
+        time: (B, T) s.
+        who: B people.
+
+    Returns:
+        (B, T, 14, 3) m.
+    """
+    act = script(time, who)
+    joints = _carried(act, who)
+    height = who.height_m[:, None]
+    floor = (ANKLE_HEIGHT * height).expand_as(time)
+    places = []
+    for side, ankle in ((0, RIGHT_LEG + 2), (1, LEFT_LEG + 2)):
+        then = script(act.moment[..., side], who)
+        spots = _carried(then, who)[..., ankle, :]
+        ground = torch.lerp(spots[..., 2], floor[:, :1].expand_as(then.level), then.level)
+        spots = torch.cat([spots[..., :2], ground[..., None]], dim=-1)
+        held = _of_step(spots, act.step[..., side])
+        swung = joints[..., ankle, :]
+        place = swung[..., :2]
+        lift = torch.zeros_like(time)
+        if act.progress is not None:
+            other = _of_step(spots, act.other[..., side])
+            way = torch.lerp(held, other, act.progress[..., side, None])[..., :2]
+            place = torch.lerp(place, way, act.level[..., None])
+            steps_out = 1 - torch.exp(-(((other - held)[..., :2] / 0.1).square().sum(dim=-1)))
+            near_floor = torch.exp((floor - swung[..., 2]) / (0.04 * height))
+            lift = act.lift[..., side] * height * steps_out * near_floor
+        swung = torch.cat([place, (swung[..., 2] + lift)[..., None]], dim=-1)
+        places.append(torch.lerp(swung, held, act.hold[..., side, None]))
+    forward = (rotation(2, act.pose.heading) @ rotation(0, -act.pose.lean))[..., 1]
+    thigh = torch.as_tensor(who.proportions.thigh)[:, None] * height
+    shank = torch.as_tensor(who.proportions.shank)[:, None] * height
+    return place_ankles(joints, torch.stack(places, dim=-2), forward, thigh, shank)
+
+
+class ActivityGenerator:
+    """Makes people who do one of the twelve activities.
+
+    A source of data, not a stage: it draws at random, computes in float64 on the CPU, and does not script. The
+    same seed gives the same people and motion, whatever the rate.
+
+    Movements happen at the seconds of a clip of 4 s; in longer ones walking, punching, kicking, grabbing and
+    rotating go on, and those that end stay as they ended.
+
+    Args:
+        people: the distributions to draw from.
+
+    Example:
+        >>> motion = ActivityGenerator().generate("walking", batch=8, seed=1, rate_hz=30.0)
+        >>> motion.joints.shape  # (8, 120, 14, 3)
+    """
+
+    def __init__(self, people: PeopleConfig | None = None) -> None:
+        self.config = PeopleConfig() if people is None else people
+
+    def generate(
+        self,
+        activity: str | int | Tensor,
+        batch: int = 1,
+        seed: int | torch.Generator = 0,
+        duration_s: float = 4.0,
+        rate_hz: float = 30.0,
+        people: People | None = None,
+    ) -> Motion:
+        """Motion of ``batch`` people.
+
+        Args:
+            activity: name ("S8 Walking", "walking", "S8") or index of a class for all, or one index per person,
+                an integer tensor (B,), which then is the batch.
+            batch: number of people if ``activity`` is not a tensor and ``people`` not given.
+            seed: of the draw, or a generator to go on with.
+            duration_s: length of the clip.
+            rate_hz: frame k is at ``k / rate_hz``; there are ``round(duration_s * rate_hz)``.
+            people: these instead of drawn ones.
+
+        Raises:
+            TensorsimError: an unknown activity, a number that is not positive, a clip without a frame, people
+                and activities of different number, or a speed beyond 3 leg lengths per second.
+        """
+        check_positive(duration_s, "duration_s")
+        check_positive(rate_hz, "rate_hz")
+        frames = round(duration_s * rate_hz)
+        if frames < 1:
+            raise TensorsimError(f"generate: got {duration_s} s at {rate_hz} Hz, expected at least one frame")
+        classes = self._classes(activity, batch if people is None else people.height_m.shape[0])
+        if people is None:
+            generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
+            people = draw_people(classes.shape[0], self.config, generator)
+        elif people.height_m.shape[0] != classes.shape[0]:
+            raise TensorsimError(
+                f"generate: got {people.height_m.shape[0]} people for {classes.shape[0]} activities"
+            )
+        # Knots cover the clip to its end, so that the path in range does not depend on the rate.
+        knots = round(duration_s * _KNOT_HZ) + 1 + 2 * _MARGIN
+        time = (torch.arange(knots, dtype=torch.float64) - _MARGIN) / _KNOT_HZ
+        joints = torch.empty((classes.shape[0], knots, 14, 3), dtype=torch.float64)
+        for index in classes.unique().tolist():
+            chosen = torch.nonzero(classes == index)[:, 0]
+            joints[chosen] = perform(SCRIPTS[index], time.expand(len(chosen), -1), people.take(chosen))
+        joints = self._placed(joints, people)
+        at = torch.arange(frames, dtype=torch.float64) * (_KNOT_HZ / rate_hz) + _MARGIN
+        joints = evaluate_cubic(joints, natural_spline_curvature(joints, 1 / _KNOT_HZ), 1 / _KNOT_HZ, at)
+        valid = (classes != 0)[:, None].expand(-1, frames).clone()
+        return Motion(joints, valid, classes, people)
+
+    def _classes(self, activity: str | int | Tensor, batch: int) -> Tensor:
+        if isinstance(activity, str):
+            activity = activity_index(activity)
+        if not isinstance(activity, Tensor):
+            if batch < 1:
+                raise TensorsimError(f"batch: got {batch}, expected at least 1")
+            activity = torch.full((batch,), activity, dtype=torch.int64)
+        if activity.is_floating_point() or activity.dim() != 1 or activity.shape[0] == 0:
+            raise TensorsimError(
+                f"activity: got a tensor of {activity.dtype} and shape {list(activity.shape)}, expected (B,) integers"
+            )
+        if not bool(((activity >= 0) & (activity < len(SCRIPTS))).all()):
+            raise TensorsimError(
+                f"activity: got indices {activity.tolist()}, expected 0 to {len(SCRIPTS) - 1}"
+            )
+        return activity.to(torch.int64).cpu()
+
+    def _placed(self, joints: Tensor, people: People) -> Tensor:
+        """Mirrored, turned and set down in the world."""
+        joints = torch.where(people.left_handed[:, None, None, None], mirror(joints), joints)
+        turn = rotation(2, people.heading_rad)[:, None, None]
+        joints = (turn @ joints[..., None])[..., 0]
+        hips = joints[:, _MARGIN:-_MARGIN, (RIGHT_LEG, LEFT_LEG), :2].mean(dim=-2)
+        near, far = self.config.keep_range_m
+        y = hips[..., 1] + people.start_m[:, None, 1]
+        closest, farthest = y.amin(dim=-1), y.amax(dim=-1)
+        shift = (near - closest).clamp(min=0.0) - (farthest - far).clamp(min=0.0).minimum(
+            (closest - near).clamp(min=0.0)
+        )
+        middle = (hips[..., 0].amin(dim=-1) + hips[..., 0].amax(dim=-1)) / 2
+        place = torch.stack(
+            [people.start_m[:, 0] - middle, people.start_m[:, 1] + shift, torch.zeros_like(shift)], dim=-1
+        )
+        return joints + place[:, None, None]

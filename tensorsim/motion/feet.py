@@ -1,0 +1,96 @@
+"""Feet that stand: legs are bent so that ankles reach given places, with the bones as long as before."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.config import JOINTS
+from tensorsim.motion.timing import minimum_jerk
+
+RIGHT_LEG, LEFT_LEG = JOINTS.index("right_hip"), JOINTS.index("left_hip")
+
+#: A leg bent to this share of its length, and more, reaches exactly; from there it straightens ever more slowly,
+#: where the knee of exact geometry would snap, and never beyond the sum of both numbers.
+_EXACT_REACH, _LAST_STRETCH = 0.985, 0.0125
+
+
+def two_bone_leg(hip: Tensor, ankle: Tensor, towards: Tensor, thigh: Tensor, shank: Tensor) -> Tensor:
+    """A leg from the hip to an ankle (two circles meet: the law of cosines).
+
+    Args:
+        hip, ankle: (..., 3) m; an ankle that is out of reach is approached on the straight line.
+        towards: (..., 3) direction to which the knee points.
+        thigh, shank: (...) m.
+
+    Returns:
+        (..., 3, 3) hip, knee and ankle.
+    """
+    length = thigh + shank
+    line = ankle - hip
+    wanted = line.norm(dim=-1)
+    line = line / wanted[..., None]
+    excess = (wanted / length - _EXACT_REACH).clamp(min=0.0)
+    stretch = _LAST_STRETCH * torch.tanh(excess / _LAST_STRETCH)
+    reach = torch.minimum(wanted, _EXACT_REACH * length) + length * stretch
+    along = (thigh**2 - shank**2 + reach**2) / (2 * reach)
+    beside = (thigh**2 - along**2).clamp(min=0.0).sqrt()
+    bend = towards - (towards * line).sum(dim=-1, keepdim=True) * line
+    bend = bend / bend.norm(dim=-1, keepdim=True)
+    knee = hip + along[..., None] * line + beside[..., None] * bend
+    return torch.stack([hip, knee, hip + reach[..., None] * line], dim=-2)
+
+
+def place_ankles(joints: Tensor, ankles: Tensor, forward: Tensor, thigh: Tensor, shank: Tensor) -> Tensor:
+    """Bend the legs of bodies (..., 14, 3) so that their ankles are at ``ankles`` (..., 2, 3), right and left.
+
+    Knees keep pointing where they do; straight legs bend ``forward`` (..., 3).
+    """
+    legs = []
+    for side, first in ((0, RIGHT_LEG), (1, LEFT_LEG)):
+        hip, knee, ankle = joints[..., first : first + 3, :].unbind(-2)
+        towards = 2 * knee - hip - ankle + 0.1 * thigh[..., None] * forward
+        legs.append(two_bone_leg(hip, ankles[..., side, :], towards, thigh, shank))
+    return torch.cat([joints[..., :RIGHT_LEG, :], *legs], dim=-2)
+
+
+class Tread(NamedTuple):
+    """Steps of both feet, right and left.
+
+    Attributes:
+        hold: (B, T, 2) in [0, 1], how firmly a foot is held by the floor.
+        since: (B, T, 2) cycles since (or, negative, until) the nearest middle of standing.
+        step: (B, T, 2) int64, the number of that step.
+        other: (B, T, 2) int64, the number of the step after it or, until its middle, before it.
+        moment: (B, K, 2) time of the middle of each step; one more at either end than occur.
+    """
+
+    hold: Tensor
+    since: Tensor
+    step: Tensor
+    other: Tensor
+    moment: Tensor
+
+
+def tread(time: Tensor, cycle_s: Tensor, phase: Tensor, middle: float, hold: float, blend: float) -> Tread:
+    """When the feet of a periodic gait stand.
+
+    Args:
+        time: (B, T) s.
+        cycle_s: (B,) length of a cycle.
+        phase: (B,) cycles of the right leg at time 0; the left leg is half a cycle apart.
+        middle: phase of the middle of standing.
+        hold, blend: parts of a cycle for which the foot is held fast, and over which it gets hold and leaves
+            it; ``hold + 2 blend <= 1``.
+    """
+    begin = phase[:, None] + torch.tensor([0.0, 0.5], dtype=time.dtype) - middle  # (B, 2) at time 0
+    cycles = (time / cycle_s[:, None])[..., None] + begin[:, None]
+    number = torch.floor(cycles + 0.5)
+    since = cycles - number
+    share = ((hold / 2 + blend - since.abs()) / blend).clamp(0.0, 1.0)
+    first = number.amin(dim=1, keepdim=True) - 1
+    step = (number - first).to(torch.int64)
+    numbers = first + torch.arange(int(step.max()) + 2, dtype=time.dtype)[:, None]
+    other = torch.where(since < 0, step - 1, step + 1)
+    moment = (numbers - begin[:, None]) * cycle_s[:, None, None]
+    return Tread(minimum_jerk(share), since, step, other, moment)

@@ -1,0 +1,181 @@
+"""Who moves: bodies and habits drawn at random, from distributions that a frozen config holds."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.body import Proportions
+
+#: Numbers of a movement (angles, moments) that vary from person to person, at most.
+VARIED_NUMBERS = 24
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PeopleConfig:
+    """Distributions of people and of how they move; ranges are uniform, (low, high).
+
+    Attributes:
+        height_m: body height.
+        body_mass_index: mean and standard deviation in kg/m^2, cut at 3 deviations; times height^2 is the mass.
+        female_share: probability of a female body: shoulders 4 % narrower and hips 4 % wider than the mean
+            (male: the reverse).
+        limb_deviation: standard deviation of the length of each segment, as a share of it, cut at 2 deviations.
+        speed_m_s: mean speed of walking.
+        heading_rad: largest turn from the line of sight, to either side.
+        facing_radar_share: probability of heading towards the radar rather than away from it.
+        start_range_m: distance y of the body at the start.
+        keep_range_m: nearest and farthest y of the hips; paths are moved along y as far as it takes to stay inside.
+        start_side_m: largest x of the middle of the path.
+        left_handed_share: probability of the mirrored movement.
+        variation: largest relative deviation of each angle and moment of a movement.
+
+    Raises:
+        TensorsimError: a range that is not ascending and finite, a share outside of [0, 1], or sizes that no body
+            has.
+    """
+
+    height_m: Range = (1.55, 1.90)
+    body_mass_index: Range = (23.5, 3.0)
+    female_share: float = 0.5
+    limb_deviation: float = 0.03
+    speed_m_s: Range = (0.7, 1.4)
+    heading_rad: float = math.pi / 6
+    facing_radar_share: float = 0.5
+    start_range_m: Range = (2.0, 5.0)
+    keep_range_m: Range = (1.5, 7.0)
+    start_side_m: float = 0.3
+    left_handed_share: float = 0.5
+    variation: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name, least, most in (
+            ("height_m", 0.5, 2.5),
+            ("speed_m_s", 0.2, 2.0),
+            ("start_range_m", 0.0, math.inf),
+            ("keep_range_m", 0.0, math.inf),
+        ):
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                raise TensorsimError(
+                    f"PeopleConfig.{name}: got {(low, high)}, expected an ascending range within {least} to {most}"
+                )
+        mean, deviation = self.body_mass_index
+        if not 0 <= 3 * deviation < mean < math.inf:
+            raise TensorsimError(
+                f"PeopleConfig.body_mass_index: got {self.body_mass_index}, expected a mean above 3 deviations"
+            )
+        for name, most in (
+            ("female_share", 1.0),
+            ("facing_radar_share", 1.0),
+            ("left_handed_share", 1.0),
+            ("limb_deviation", 0.1),
+            ("variation", 0.2),
+            ("heading_rad", math.pi),
+            ("start_side_m", math.inf),
+        ):
+            if not 0 <= getattr(self, name) <= most:
+                raise TensorsimError(
+                    f"PeopleConfig.{name}: got {getattr(self, name)}, expected a number from 0 to {most}"
+                )
+
+
+class People(NamedTuple):
+    """Drawn bodies and habits; every field has one entry per person.
+
+    Attributes:
+        height_m, mass_kg: (B,).
+        female, left_handed: (B,) bool.
+        proportions: segments as fractions of the height, each (B,).
+        speed_m_s: (B,) mean speed of walking.
+        heading_rad: (B,) direction of the body at the start, 0 = +y (away from the radar), counter-clockwise.
+        start_m: (B, 2) middle of the path in x, and y at the start, before the path is moved to stay in range.
+        gait_phase: (B,) cycles at time 0.
+        factor: (B, VARIED_NUMBERS) around 1, one for each varying number of a movement.
+    """
+
+    height_m: Tensor
+    mass_kg: Tensor
+    female: Tensor
+    left_handed: Tensor
+    proportions: Proportions
+    speed_m_s: Tensor
+    heading_rad: Tensor
+    start_m: Tensor
+    gait_phase: Tensor
+    factor: Tensor
+
+    def take(self, index: Tensor) -> "People":
+        """Some of these people: index (N,)."""
+        fields = self._asdict()
+        fields["proportions"] = Proportions(*(torch.as_tensor(p)[index] for p in self.proportions))
+        return People(**{k: v if k == "proportions" else v[index] for k, v in fields.items()})
+
+
+def nominal_people(count: int, height_m: float = 1.75, speed_m_s: float = 1.1) -> People:
+    """The mean body, moving exactly by the book: facing the radar from 4 m, right-handed."""
+
+    def full(value: float, *tail: int) -> Tensor:
+        return torch.full((count, *tail), value, dtype=torch.float64)
+
+    no = torch.zeros(count, dtype=torch.bool)
+    return People(
+        height_m=full(height_m),
+        mass_kg=full(23.5 * height_m**2),
+        female=no,
+        left_handed=no,
+        proportions=Proportions(*(full(float(p)) for p in Proportions())),
+        speed_m_s=full(speed_m_s),
+        heading_rad=full(math.pi),
+        start_m=torch.stack([full(0.0), full(4.0)], dim=-1),
+        gait_phase=full(0.0),
+        factor=full(1.0, VARIED_NUMBERS),
+    )
+
+
+def draw_people(count: int, config: PeopleConfig, generator: torch.Generator) -> People:
+    """Draw people. The generator lives on the CPU; all numbers are float64.
+
+    Raises:
+        TensorsimError: a count below 1.
+    """
+    if count < 1:
+        raise TensorsimError(f"draw_people: got count {count}, expected at least 1")
+
+    def uniform(low: float, high: float, *tail: int) -> Tensor:
+        return low + (high - low) * torch.rand(count, *tail, generator=generator, dtype=torch.float64)
+
+    def normal(deviation: float, cut: float, *tail: int) -> Tensor:
+        z = torch.randn(count, *tail, generator=generator, dtype=torch.float64)
+        return deviation * z.clamp(-cut, cut)
+
+    height = uniform(*config.height_m)
+    female = uniform(0, 1) < config.female_share
+    broad = torch.where(female, -0.04, 0.04).double()
+    limbs = 1 + normal(config.limb_deviation, 2.0, len(Proportions._fields))
+    sizes = [float(mean) * limbs[:, i] for i, mean in enumerate(Proportions())]
+    proportions = Proportions(*sizes)
+    proportions = proportions._replace(
+        half_shoulders=proportions.half_shoulders * (1 + broad), half_hips=proportions.half_hips * (1 - broad)
+    )
+    mean_index, index_deviation = config.body_mass_index
+    facing = uniform(0, 1) < config.facing_radar_share
+    return People(
+        height_m=height,
+        mass_kg=(mean_index + normal(index_deviation, 3.0)) * height**2,
+        female=female,
+        left_handed=uniform(0, 1) < config.left_handed_share,
+        proportions=proportions,
+        speed_m_s=uniform(*config.speed_m_s),
+        heading_rad=math.pi * facing + uniform(-config.heading_rad, config.heading_rad),
+        start_m=torch.stack(
+            [uniform(-config.start_side_m, config.start_side_m), uniform(*config.start_range_m)], dim=-1
+        ),
+        gait_phase=uniform(0, 1),
+        factor=1 + uniform(-config.variation, config.variation, VARIED_NUMBERS),
+    )
