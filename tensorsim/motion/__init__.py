@@ -1,6 +1,6 @@
 """Joints at video rate -> scatterers at pulse rate."""
 
-from tensorsim.motion.activities import ActivityGenerator, Motion
+from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion
 from tensorsim.motion.body import body_to_coco
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
@@ -14,9 +14,9 @@ from tensorsim.motion.walking import boulic_gait
 __all__ = [
     "ActivityGenerator",
     "Body13Scatterers",
+    "GeneratedMotion",
     "JointScatterers",
     "LimbScatterers",
-    "Motion",
     "People",
     "PeopleConfig",
     "PoseResampler",

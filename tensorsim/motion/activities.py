@@ -31,7 +31,7 @@ _MARGIN = 12
 _FLOOR_SHARPNESS = 150.0
 
 
-class Motion(NamedTuple):
+class GeneratedMotion(NamedTuple):
     """People who act.
 
     Attributes:
@@ -162,8 +162,8 @@ class ActivityGenerator:
         duration_s: float = 4.0,
         rate_hz: float = 30.0,
         people: People | None = None,
-    ) -> Motion:
-        """Motion of ``batch`` people.
+    ) -> GeneratedMotion:
+        """GeneratedMotion of ``batch`` people.
 
         Args:
             activity: name ("S8 Walking", "walking", "S8") or index of a class for all, or one index per person,
@@ -202,7 +202,7 @@ class ActivityGenerator:
         at = torch.arange(frames, dtype=torch.float64) * (_KNOT_HZ / rate_hz) + _MARGIN
         joints = evaluate_cubic(joints, natural_spline_curvature(joints, 1 / _KNOT_HZ), 1 / _KNOT_HZ, at)
         valid = (classes != 0)[:, None].expand(-1, frames).clone()
-        return Motion(joints, valid, classes, people)
+        return GeneratedMotion(joints, valid, classes, people)
 
     def _classes(self, activity: str | int | Tensor, batch: int) -> Tensor:
         if isinstance(activity, str):

@@ -13,7 +13,7 @@ from torch import Tensor
 from tensorsim.config import ACTIVITIES, COCO_KEYPOINTS, JOINTS, RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.motion import body
-from tensorsim.motion.activities import ActivityGenerator, Motion, activity_index, perform
+from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion, activity_index, perform
 from tensorsim.motion.body import BodyPose, Proportions, body_to_coco, forward_kinematics, mirror
 from tensorsim.motion.feet import tread, two_bone_leg
 from tensorsim.motion.people import VARIED_NUMBERS, PeopleConfig, draw_people, nominal_people
@@ -46,12 +46,12 @@ def at(joints: Tensor, name: str) -> Tensor:
 
 
 @cache
-def nominal(index: int) -> Motion:
+def nominal(index: int) -> GeneratedMotion:
     return ActivityGenerator().generate(index, people=nominal_people(1), rate_hz=RATE)
 
 
 @cache
-def crowd() -> Motion:
+def crowd() -> GeneratedMotion:
     """Three drawn people per class."""
     return ActivityGenerator().generate(torch.arange(36) % 12, seed=11, rate_hz=RATE)
 
