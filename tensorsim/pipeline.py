@@ -40,6 +40,7 @@ class VideoToPose(nn.Module):
         camera: where the camera stands and its focal length.
         keypoint_threshold: score from which a keypoint counts as seen.
         detection_interval: run the detector on every n-th frame (panel: 2).
+        fewest_joints: of the 14, in a frame that says anything of the pose.
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages.
@@ -57,6 +58,7 @@ class VideoToPose(nn.Module):
         camera: CameraConfig | None = None,
         keypoint_threshold: float = 0.3,
         detection_interval: int = 2,
+        fewest_joints: int = 5,
         brief_gap_s: float = 0.25,
         frames_per_batch: int = 8,
         tracker: nn.Module | None = None,
@@ -83,6 +85,7 @@ class VideoToPose(nn.Module):
         self.smoother = smoother if smoother is not None else KalmanSmoother()
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
+        self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
         self.frames_per_batch = frames_per_batch
 
@@ -194,11 +197,14 @@ class VideoToPose(nn.Module):
         # Joints below the threshold have no say in the match: the network guesses what it cannot see.
         trusted = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
         body_scores = body_scores * trusted
+        # A foot alone at the edge of the picture does not tell a pose: such frames of a track coast.
+        told = tracks.valid & (trusted.sum(dim=-1) >= self.fewest_joints)
+        told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
         lifted = self.lifter(body, body_scores)
-        joints, seen = self.metric_pose(body, body_scores, lifted, tracks.valid, height, width, fps)
+        joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
         # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
         # the pose that was found stands in for it, as long as the person is in the scene.
-        in_scene = tracks.valid.unsqueeze(-1).expand_as(seen)
+        in_scene = told.unsqueeze(-1).expand_as(seen)
         coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         joints = self.smoother(joints, in_scene & ~coasting, fps)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid)

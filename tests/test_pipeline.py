@@ -147,6 +147,19 @@ def test_batch_equals_loop_with_people_padded() -> None:
         assert_same(single[5:], [f[i : i + 1] for f in both[5:]], atol=1e-4)
 
 
+def test_a_foot_alone_at_the_end_of_a_track_does_not_fold_the_body() -> None:
+    stage = pipeline().video_to_pose
+    whole = stage(film(*walker(20, FPS, 4.0, 0.5, 0.0)).unsqueeze(0), FPS)
+    tracks = ts.Tracks(whole.boxes, whole.valid, whole.valid)
+    scores = whole.keypoint_scores.clone()
+    scores[:, :, 16:, :15] = 0.1  # the ankles alone pass the threshold
+    joints = stage.lift(tracks, whole.keypoints, scores, 240, 320, FPS).joints
+    assert_same(joints[:, :, :10], whole.joints[:, :, :10], atol=0.02)
+    hips = joints[0, 0, 16:, [8, 11], 2]
+    assert hips.min() > 0.7
+    assert (joints[0, 0, 16:, 8, 1].diff() > 0).all(), "goes on walking away"
+
+
 def test_padded_frames_do_not_count() -> None:
     stage, clips = pipeline(), two_clips()
     padded = clips.clone()

@@ -163,7 +163,7 @@ class ActivityGenerator:
         rate_hz: float = 30.0,
         people: People | None = None,
     ) -> GeneratedMotion:
-        """GeneratedMotion of ``batch`` people.
+        """Motion of ``batch`` people.
 
         Args:
             activity: name ("S8 Walking", "walking", "S8") or index of a class for all, or one index per person,
