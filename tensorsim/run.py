@@ -23,8 +23,8 @@ from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps
 
 
-def _bar(iterable: Any, name: str, total: int | None, quiet: bool) -> Any:
-    return tqdm(iterable, desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
+def _bar(name: str, total: int | None, quiet: bool) -> tqdm:
+    return tqdm(desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
 
 
 def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, quiet: bool = False) -> Pose:
@@ -40,7 +40,7 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
     found: list[Detections] = []
     count = 0
     last = torch.empty(0)
-    with _bar(None, "detect", reader.frame_count, quiet) as bar:
+    with _bar("detect", reader.frame_count, quiet) as bar:
         for frames in reader.chunks(size * interval):
             index = torch.arange(count, count + frames.shape[0])
             if bool((index % interval == 0).any()):
@@ -63,7 +63,7 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
     keypoints: list[Tensor] = []
     scores: list[Tensor] = []
     done = 0
-    with _bar(None, "pose", count, quiet) as bar:
+    with _bar("pose", count, quiet) as bar:
         for frames in reader.chunks(size):
             stop = done + frames.shape[0]
             k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
@@ -85,7 +85,7 @@ def maps_of_pose(
     pulses = stage.resampler.pulses(joints.shape[2], fps)
     coefficients = stage.resampler.coefficients(joints, fps)
 
-    with _bar(None, "radar", pulses, quiet) as bar:
+    with _bar("radar", pulses, quiet) as bar:
         bar.unit = "pulse"
 
         def source(start: int, stop: int) -> tuple[Tensor, Tensor]:
@@ -219,7 +219,7 @@ def write_overlay(
 
     def drawn() -> Iterator[np.ndarray]:
         index = 0
-        with _bar(None, "overlay", valid.shape[1], quiet) as bar:
+        with _bar("overlay", valid.shape[1], quiet) as bar:
             for frames in reader.chunks(8):
                 for frame in frames.permute(0, 2, 3, 1).numpy():
                     yield plot.draw_people(
