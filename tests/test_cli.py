@@ -14,6 +14,7 @@ import torch
 
 import tensorsim as ts
 from tensorsim import cli, run
+from tensorsim.commands import simulate
 from tensorsim.data.video import VideoReader
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.presets import PRESETS
@@ -53,10 +54,10 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     weights = tmp_path / "w.onnx"
     weights.write_text("")
 
-    def people(options: cli.Simulate, *_: Path) -> VideoToPose:
+    def people(options: simulate.Simulate, *_: Path) -> VideoToPose:
         return VideoToPose(RectangleDetector(), StandingPose(), person_height_m=options.person_height)
 
-    monkeypatch.setattr(cli, "_video_to_pose", people)
+    monkeypatch.setattr(simulate, "_video_to_pose", people)
     return ["--detector", str(weights), "--pose", str(weights), "--scene", "through-wall", "--quiet"]
 
 
@@ -112,11 +113,11 @@ def test_simulate_writes_everything(
 
 def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
     """The file's radar replaces the scene's, its wall too; the scene's wall stays where the file has none."""
-    options = cli.Simulate(walk, tmp_path, scene="through-wall", radar="cw-24ghz")
-    assert cli._scene(options) == (PRESETS["cw-24ghz"].radar, ts.WallConfig())
-    assert cli._scene(cli.Simulate(walk, tmp_path, radar="cw-24ghz")).wall is None
-    assert cli._scene(cli.Simulate(walk, tmp_path, radar="through-wall")) == PRESETS["through-wall"]
-    assert cli._scene(cli.Simulate(walk, tmp_path)) == PRESETS["free-space"]
+    options = simulate.Simulate(walk, tmp_path, scene="through-wall", radar="cw-24ghz")
+    assert simulate._scene(options) == (PRESETS["cw-24ghz"].radar, ts.WallConfig())
+    assert simulate._scene(simulate.Simulate(walk, tmp_path, radar="cw-24ghz")).wall is None
+    assert simulate._scene(simulate.Simulate(walk, tmp_path, radar="through-wall")) == PRESETS["through-wall"]
+    assert simulate._scene(simulate.Simulate(walk, tmp_path)) == PRESETS["free-space"]
 
     file = tmp_path / "my.yaml"
     file.write_text("carrier_hz: 3e9\nbandwidth_hz: 500e6\nprf_hz: 200\nwall: {loss_tangent: 0.01}\n")
@@ -157,7 +158,7 @@ def test_a_bad_radar_is_refused_before_work_starts(
 
 
 def test_help_names_every_preset() -> None:
-    help_text = inspect.getsource(cli.Simulate)
+    help_text = inspect.getsource(simulate.Simulate)
     assert all(name in help_text for name, scene in PRESETS.items() if not scene.radar.has_array)
 
 

@@ -1,0 +1,17 @@
+"""``tensorsim check``: is this installation in order?"""
+
+from dataclasses import dataclass
+
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check the installation: libraries, shipped files, and a moving target through the radar chain."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.selfcheck import run_checks
+
+        if not run_checks():
+            raise TensorsimError("the installation is not in order, see above")
