@@ -171,6 +171,41 @@ def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | 
     module.load_state_dict(state_dict, strict=False)
 
 
+def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict[str, str]) -> None:
+    """Write the weights of a module as ``.safetensors`` for shipping: parameters in float16, statistics as they are.
+
+    A tensor that the module lists under several names is stored under the first. The file appears whole or not at
+    all.
+
+    Args:
+        module: its state dict is written.
+        path: ends in ``.safetensors``.
+        metadata: strings stored in the header.
+
+    Raises:
+        TensorsimError: a parameter that float16 cannot hold.
+    """
+    from safetensors.torch import save_file
+
+    path = Path(path)
+    parameters = {id(parameter) for parameter in module.parameters()}
+    stored: dict[str, Tensor] = {}
+    seen: set[int] = set()
+    for key, tensor in module.state_dict(keep_vars=True).items():
+        if id(tensor) in seen:
+            continue
+        seen.add(id(tensor))
+        value = tensor.detach().cpu().contiguous()
+        if id(tensor) in parameters and value.is_floating_point():
+            value = value.half()
+            if not bool(torch.isfinite(value).all()):
+                raise TensorsimError(f"{path}: {key} has values that float16 cannot hold")
+        stored[key] = value
+    scratch = path.with_suffix(".tmp")
+    save_file(stored, scratch, metadata)
+    os.replace(scratch, path)
+
+
 def _equal(state_dict: dict[str, Tensor], first: str, second: str) -> bool:
     a, b = state_dict[first], state_dict[second]
     return a.data_ptr() == b.data_ptr() or torch.equal(a, b)

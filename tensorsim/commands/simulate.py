@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from tensorsim.commands.networks import network_path, usable_device
+from tensorsim.commands.networks import network_path
 from tensorsim.errors import TensorsimError
 
 #: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
@@ -90,6 +90,7 @@ class Simulate:
 
         from tensorsim import run
         from tensorsim.data.video import VideoReader
+        from tensorsim.device import usable_device
         from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 
         device = usable_device(self.device)

@@ -1,0 +1,1 @@
+"""Recipes that produced the weights in ``models/``, runnable again: ``tensorsim train``."""

@@ -1,0 +1,346 @@
+"""The loop that every training recipe runs in: seeded, resumable, logged, on one device or several.
+
+A recipe says what is trained, on which samples and by which loss; the loop does the rest. Samples come from an
+endless stream and depend on their number alone, and the random state is set anew before every step, so a run
+that was interrupted goes on to the same result. Several GPUs: ``torchrun --nproc-per-node N -m tensorsim.cli train
+...``; each process takes its share of every batch.
+"""
+
+import csv
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader, Dataset, default_collate
+from tqdm import tqdm
+
+from tensorsim.device import usable_device
+from tensorsim.errors import TensorsimError
+from tensorsim.weights import save_weights
+
+Batch = dict[str, Any]
+
+
+class Recipe:
+    """What a training run is made of; subclasses give the parts.
+
+    Attributes:
+        net: the network to train.
+        settings: everything that must be equal for a run to go on from a checkpoint.
+        metadata: strings stored in the weight file, for those who load it.
+    """
+
+    net: nn.Module
+    settings: dict[str, Any]
+    metadata: dict[str, str]
+
+    def __init__(self, net: nn.Module, settings: dict[str, Any], metadata: dict[str, str]) -> None:
+        self.net = net
+        self.settings = settings
+        self.metadata = metadata
+
+    def sample(self, index: int) -> dict[str, Any]:
+        """The ``index``-th sample of an endless stream; it depends on the seed and on ``index`` only."""
+        raise NotImplementedError
+
+    def collate(self, samples: list[dict[str, Any]]) -> Batch:
+        """Samples to a batch."""
+        return default_collate(samples)
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Scalars to log; the one called ``loss`` is minimised. ``net`` is the network as the loop wraps it."""
+        raise NotImplementedError
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        """The optimiser of ``self.net``."""
+        raise NotImplementedError
+
+    def rate(self, step: int, steps: int) -> float:
+        """Factor on the learning rate at ``step`` of ``steps``."""
+        raise NotImplementedError
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Figures on held-out data; the largest ``score`` tells the best weights."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How a recipe is run.
+
+    Attributes:
+        out: folder of ``last.pt`` (to go on from), ``best.safetensors``, ``metrics.csv`` and TensorBoard's events.
+        steps: optimiser steps in all.
+        batch: samples per step, over all processes.
+        seed: of everything random in the loop.
+        device: ``"auto"`` takes a GPU where there is one.
+        workers: processes that prepare samples; 0 prepares them in this one.
+        precision: ``"bfloat16"`` is mixed precision: convolutions and products in bfloat16, weights in float32.
+        checkpoint_every, validate_every, log_every: steps between.
+        ema_decay: of the moving average of the weights that is validated and saved; 0 takes the weights as they are.
+        quiet: no progress bar.
+
+    Raises:
+        TensorsimError: counts below one, a decay outside of [0, 1), an unknown precision.
+    """
+
+    out: Path
+    steps: int
+    batch: int
+    seed: int = 0
+    device: str = "auto"
+    workers: int = 1
+    precision: str = "bfloat16"
+    checkpoint_every: int = 200
+    validate_every: int = 1000
+    log_every: int = 20
+    ema_decay: float = 0.999
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "checkpoint_every", "validate_every", "log_every"):
+            if getattr(self, name) < 1:
+                raise TensorsimError(f"LoopConfig: got {name} {getattr(self, name)}, expected at least 1")
+        if self.workers < 0:
+            raise TensorsimError(f"LoopConfig: got workers {self.workers}, expected at least 0")
+        if not 0 <= self.ema_decay < 1:
+            raise TensorsimError(f"LoopConfig: got ema_decay {self.ema_decay}, expected 0 <= decay < 1")
+        if self.precision not in ("bfloat16", "float32"):
+            raise TensorsimError(
+                f"LoopConfig: got precision {self.precision!r}, expected 'bfloat16' or 'float32'"
+            )
+        if self.out.exists() and not self.out.is_dir():
+            raise TensorsimError(f"LoopConfig: {self.out} is a file, expected a folder")
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What a run that goes on must share with the run that began. The number of steps may change."""
+        return {name: getattr(self, name) for name in ("batch", "seed", "precision", "ema_decay")}
+
+
+class _Stream(Dataset[Batch]):
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+
+    def __getitem__(self, index: int) -> Batch:
+        return self.recipe.sample(index)
+
+
+class _Shares:
+    """Numbers of the samples of each step that belong to this process."""
+
+    def __init__(self, first: int, config: LoopConfig, rank: int, processes: int) -> None:
+        self.first, self.config, self.rank, self.processes = first, config, rank, processes
+
+    def __len__(self) -> int:
+        return self.config.steps - self.first
+
+    def __iter__(self) -> Iterator[list[int]]:
+        batch = self.config.batch
+        for step in range(self.first, self.config.steps):
+            yield list(range(step * batch + self.rank, (step + 1) * batch, self.processes))
+
+
+class _Log:
+    """``metrics.csv`` (step, name, value) and TensorBoard's events; lines after ``step`` of an older run go."""
+
+    def __init__(self, out: Path, step: int) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise TensorsimError(
+                f"training logs: TensorBoard does not import ({error}); install tensorsim[train]"
+            ) from error
+        self.path = out / "metrics.csv"
+        rows: list[list[str]] = []
+        if self.path.is_file():
+            with self.path.open(newline="", encoding="utf-8") as file:
+                rows = [row for row in list(csv.reader(file))[1:] if len(row) == 3 and int(row[0]) <= step]
+        scratch = self.path.with_suffix(".tmp")
+        with scratch.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([["step", "name", "value"], *rows])
+        os.replace(scratch, self.path)
+        self.events = SummaryWriter(str(out), purge_step=step + 1)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([step, name, f"{value:.6g}"] for name, value in values.items())
+        for name, value in values.items():
+            self.events.add_scalar(name, value, step)
+
+
+def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
+    """Train, from the start or from the last checkpoint in ``config.out``.
+
+    Returns:
+        The figures of the best weights, with their ``step``.
+
+    Raises:
+        TensorsimError: the checkpoint belongs to another run, a loss that is not finite, TensorBoard missing.
+    """
+    rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    device = usable_device(config.device)
+    if processes > 1:
+        if device.type == "cuda":
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(device)
+        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    if config.batch % processes:
+        raise TensorsimError(
+            f"fit: got a batch of {config.batch}, expected a multiple of {processes} processes"
+        )
+
+    recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
+    averaged = AveragedModel(
+        recipe.net,
+        avg_fn=lambda mean, new, count: new + (mean - new) * _decay(config.ema_decay, int(count)),
+        use_buffers=True,
+    )
+    optimiser = recipe.optimiser()
+    base_rates = [group["lr"] for group in optimiser.param_groups]
+    config.out.mkdir(parents=True, exist_ok=True)
+    last = config.out / "last.pt"
+    first, best = 0, {"score": float("-inf"), "step": -1.0}
+    if last.is_file():
+        first, best = _resume(last, recipe, config, averaged, optimiser)
+    wrapped: nn.Module = recipe.net
+    if processes > 1:
+        ids = [device.index] if device.type == "cuda" else None
+        wrapped = nn.parallel.DistributedDataParallel(recipe.net, device_ids=ids)
+    log = _Log(config.out, first) if rank == 0 else None
+
+    loader = DataLoader(
+        _Stream(recipe),
+        batch_sampler=_Shares(first, config, rank, processes),
+        collate_fn=recipe.collate,
+        num_workers=config.workers,
+        prefetch_factor=4 if config.workers else None,
+    )
+    bar = tqdm(total=config.steps, initial=first, disable=config.quiet or rank > 0, unit="step")
+    began, trained = time.perf_counter(), 0
+    for step, batch in enumerate(loader, start=first):
+        torch.manual_seed(config.seed * 1_000_003 + step * processes + rank)
+        recipe.net.train()
+        factor = recipe.rate(step, config.steps)
+        for group, rate in zip(optimiser.param_groups, base_rates, strict=True):
+            group["lr"] = rate * factor
+        batch = _to(batch, device)
+        with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
+            losses = recipe.loss(wrapped, batch)
+        if not bool(torch.isfinite(losses["loss"])):
+            raise TensorsimError(
+                f"fit: the loss of step {step} is {float(losses['loss'])}; lower the learning rate"
+            )
+        optimiser.zero_grad(set_to_none=True)
+        losses["loss"].backward()
+        optimiser.step()
+        averaged.update_parameters(recipe.net)
+
+        done, trained = step + 1, trained + config.batch
+        bar.update()
+        if log and (done % config.log_every == 0 or done == config.steps):
+            values = {name: float(value.detach()) for name, value in losses.items()}
+            bar.set_postfix({name: f"{value:.4g}" for name, value in values.items()})
+            speed = trained / (time.perf_counter() - began)
+            log.write(done, values | {"rate": factor, "samples_per_s": speed})
+        if done % config.validate_every == 0 or done == config.steps:
+            if log:
+                net = averaged.module if config.ema_decay else recipe.net
+                figures = _validate(recipe, net, config.quiet)
+                log.write(done, {f"validation/{name}": value for name, value in figures.items()})
+                bar.write(f"step {done}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+                if figures["score"] > best["score"]:
+                    best = figures | {"step": float(done)}
+                    save_weights(net, config.out / "best.safetensors", recipe.metadata)
+            if processes > 1:
+                distributed.barrier()
+        if log and (done % config.checkpoint_every == 0 or done == config.steps):
+            _save(last, done, best, recipe, config, averaged, optimiser)
+    bar.close()
+    if log:
+        log.events.close()
+    if processes > 1:
+        distributed.destroy_process_group()
+    return best
+
+
+def _decay(decay: float, count: int) -> float:
+    # A short memory at first, or the average would long remember the random start.
+    return min(decay, (1 + count) / (10 + count))
+
+
+def _to(batch: Any, device: torch.device) -> Any:
+    if isinstance(batch, Tensor):
+        channels_last = batch.ndim == 4 and batch.is_floating_point()
+        return batch.to(
+            device,
+            non_blocking=True,
+            memory_format=torch.channels_last if channels_last else torch.preserve_format,
+        )
+    if isinstance(batch, dict):
+        return {key: _to(value, device) for key, value in batch.items()}
+    if isinstance(batch, (list, tuple)):
+        return [_to(value, device) for value in batch]
+    return batch
+
+
+def _validate(recipe: Recipe, net: nn.Module, quiet: bool) -> dict[str, float]:
+    was_training = net.training
+    net.eval()
+    with torch.no_grad():
+        figures = recipe.validate(net)
+    net.train(was_training)
+    return figures
+
+
+def _save(
+    path: Path,
+    step: int,
+    best: dict[str, float],
+    recipe: Recipe,
+    config: LoopConfig,
+    averaged: AveragedModel,
+    optimiser: torch.optim.Optimizer,
+) -> None:
+    scratch = path.with_suffix(".tmp")
+    torch.save(
+        {
+            "step": step,
+            "best": best,
+            "loop": config.fingerprint(),
+            "recipe": recipe.settings,
+            "net": recipe.net.state_dict(),
+            "averaged": averaged.state_dict(),
+            "optimiser": optimiser.state_dict(),
+        },
+        scratch,
+    )
+    os.replace(scratch, path)
+
+
+def _resume(
+    path: Path,
+    recipe: Recipe,
+    config: LoopConfig,
+    averaged: AveragedModel,
+    optimiser: torch.optim.Optimizer,
+) -> tuple[int, dict[str, float]]:
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    for part, mine in (("loop", config.fingerprint()), ("recipe", recipe.settings)):
+        differ = [key for key in {**state[part], **mine} if state[part].get(key) != mine.get(key)]
+        if differ:
+            told = ", ".join(
+                f"{key}: {mine.get(key)!r} for {state[part].get(key)!r}" for key in sorted(differ)
+            )
+            raise TensorsimError(
+                f"{path}: it belongs to another run ({told}); choose another folder, or the same settings"
+            )
+    recipe.net.load_state_dict(state["net"])
+    averaged.load_state_dict(state["averaged"])
+    optimiser.load_state_dict(state["optimiser"])
+    return int(state["step"]), state["best"]

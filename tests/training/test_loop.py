@@ -1,0 +1,133 @@
+"""The training loop: resume, best weights, logs, refusals."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.training.loop import LoopConfig, Recipe, fit
+from tensorsim.weights import load_state_dict, load_strict
+
+
+class Line(Recipe):
+    """y = 2 x + 1 learnt by a net with batch norm, dropout and a little noise: every kind of state."""
+
+    def __init__(self, rate: float = 0.1) -> None:
+        torch.manual_seed(0)
+        net = nn.Sequential(nn.Linear(1, 8), nn.BatchNorm1d(8), nn.Dropout(0.1), nn.Linear(8, 1))
+        super().__init__(net, {"rate": rate}, {"purpose": "test"})
+
+    def sample(self, index: int) -> dict[str, Any]:
+        x = torch.rand(1, generator=torch.Generator().manual_seed(index)) - 0.5
+        return {"x": x, "y": 2 * x + 1}
+
+    def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+        noise = 0.01 * torch.randn_like(batch["x"])
+        error = ((net(batch["x"] + noise) - batch["y"]) ** 2).mean()
+        return {"loss": error, "rms": error.sqrt()}
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.net.parameters(), lr=self.settings["rate"])
+
+    def rate(self, step: int, steps: int) -> float:
+        return 1 / (1 + step / 20)
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        x = torch.linspace(-0.5, 0.5, 11).unsqueeze(1)
+        error = float(((net(x) - 2 * x - 1) ** 2).mean().detach())
+        return {"score": -error, "error": error}
+
+
+def config(out: Path, steps: int = 40, **options: Any) -> LoopConfig:
+    settings = {"workers": 0, "precision": "float32", "ema_decay": 0.9, "quiet": True} | options
+    return LoopConfig(out, steps, batch=16, checkpoint_every=10, validate_every=20, log_every=5, **settings)
+
+
+def weights(folder: Path) -> dict[str, Tensor]:
+    return torch.load(folder / "last.pt", weights_only=True)["averaged"]
+
+
+def test_training_learns(tmp_path: Path) -> None:
+    before = Line().validate(Line().net.eval())["error"]
+    best = fit(Line(), config(tmp_path, steps=200))
+    assert best["error"] < 0.05 * before
+    # What is stored is what was validated, up to float16.
+    net = Line().net
+    load_strict(net, load_state_dict(tmp_path / "best.safetensors"), "best")
+    assert Line().validate(net.eval())["error"] == pytest.approx(best["error"], rel=0.2, abs=1e-4)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path: Path, workers: int) -> None:
+    whole = fit(Line(), config(tmp_path / "whole", workers=workers))
+
+    class Interrupted(Line):
+        def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+            if self.steps == 27:
+                raise KeyboardInterrupt
+            self.steps += 1
+            return super().loss(net, batch)
+
+        steps = 0
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(Interrupted(), config(tmp_path / "parts", workers=workers))
+    parts = fit(Line(), config(tmp_path / "parts", workers=workers))
+    assert parts == whole
+    for (name, a), b in zip(
+        weights(tmp_path / "whole").items(), weights(tmp_path / "parts").values(), strict=True
+    ):
+        assert torch.equal(a, b), name
+    rows = list(csv.reader((tmp_path / "parts" / "metrics.csv").read_text().splitlines()))
+    kept = [row[:2] for row in rows[1:] if row[1] == "loss"]
+    assert kept == [[str(step), "loss"] for step in range(5, 41, 5)]
+
+
+def test_logs_are_there(tmp_path: Path) -> None:
+    fit(Line(), config(tmp_path))
+    rows = list(csv.reader((tmp_path / "metrics.csv").read_text().splitlines()))
+    assert rows[0] == ["step", "name", "value"]
+    assert {row[1] for row in rows[1:]} == {
+        "loss",
+        "rms",
+        "rate",
+        "samples_per_s",
+        "validation/score",
+        "validation/error",
+    }
+    assert list(tmp_path.glob("events.out.tfevents*"))
+
+
+def test_another_run_is_refused(tmp_path: Path) -> None:
+    fit(Line(), config(tmp_path, steps=10))
+    with pytest.raises(TensorsimError, match=r"another run \(rate: 0.2 for 0.1\)"):
+        fit(Line(rate=0.2), config(tmp_path, steps=20))
+    with pytest.raises(TensorsimError, match=r"seed: 1 for 0"):
+        fit(Line(), config(tmp_path, steps=20, seed=1))
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
+    class Broken(Line):
+        def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+            return {"loss": net(batch["x"]).sum() * float("nan")}
+
+    with pytest.raises(TensorsimError, match="the loss of step 0 is nan"):
+        fit(Broken(), config(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps 0, expected at least 1"),
+        ({"ema_decay": 1.0}, "ema_decay 1.0"),
+        ({"precision": "half"}, "precision 'half'"),
+        ({"workers": -1}, "workers -1"),
+    ],
+)
+def test_bad_settings_are_refused(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        config(tmp_path, **options)
