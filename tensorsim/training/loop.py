@@ -7,6 +7,7 @@ that was interrupted goes on to the same result. Several GPUs: ``torchrun --npro
 """
 
 import csv
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -232,10 +233,9 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
         batch = _to(batch, device)
         with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
             losses = recipe.loss(wrapped, batch)
-        if not bool(torch.isfinite(losses["loss"])):
-            raise TensorsimError(
-                f"fit: the loss of step {step} is {float(losses['loss'])}; lower the learning rate"
-            )
+        value = float(losses["loss"].detach())
+        if not math.isfinite(value):
+            raise TensorsimError(f"fit: the loss of step {step} is {value}; lower the learning rate")
         optimiser.zero_grad(set_to_none=True)
         losses["loss"].backward()
         optimiser.step()
