@@ -7,6 +7,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from tensorsim.commands.check import Check
+from tensorsim.commands.models import FetchModels, ListModels, VerifyModels
 from tensorsim.commands.simulate import Simulate
 from tensorsim.errors import TensorsimError
 
@@ -23,7 +24,14 @@ Networks can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_PO
 """
 
 #: Commands by name; a command that has commands of its own is a table of them after its description.
-COMMANDS: dict[str, Any] = {"simulate": Simulate, "check": Check}
+COMMANDS: dict[str, Any] = {
+    "simulate": Simulate,
+    "models": (
+        "Weights by name: shipped ones and published ones.",
+        {"list": ListModels, "fetch": FetchModels, "verify": VerifyModels},
+    ),
+    "check": Check,
+}
 
 
 def _choice(commands: Mapping[str, Any]) -> Any:

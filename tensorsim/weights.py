@@ -125,6 +125,24 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     return tensors
 
 
+def read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
+    """What the header of a ``.safetensors`` file says beside its tensors; {} of any other file.
+
+    Raises:
+        TensorsimError: a damaged file.
+    """
+    path = Path(path)
+    if path.suffix != ".safetensors" or not path.is_file():
+        return {}
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}
+    except (SafetensorError, ValueError) as error:
+        raise TensorsimError(f"{path}: damaged or not a safetensors file ({error})") from error
+
+
 def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | os.PathLike[str]) -> None:
     """Copy weights into a module, or refuse and leave it as it was.
 

@@ -90,18 +90,21 @@ class DnCNN(nn.Module):
         return folded.train(self.training)
 
     @classmethod
-    def from_pretrained(cls, path: str | os.PathLike[str]) -> "DnCNN":
+    def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "DnCNN":
         """Build the network that a weight file holds, in evaluation mode.
 
         Args:
-            path: ``.pth`` or ``.safetensors`` with the names ``conv{i}`` (folded), those of the authors'
-                PyTorch code, folded or not, or a state dict of this class, which are the same.
+            source: a path of a ``.pth`` or ``.safetensors`` with the names ``conv{i}`` (folded), those of the
+                authors' PyTorch code, folded or not, or of this class, which are the same; or a name that
+                ``tensorsim models list`` prints; None: the shipped weights.
 
         Raises:
             TensorsimError: no such file, a file that is not safe or not whole, or weights of another network.
         """
+        from tensorsim.registry import locate
         from tensorsim.weights import load_state_dict, load_strict
 
+        path = locate(source, cls.__name__)
         weights = load_state_dict(path)
         state = {
             re.sub(r"^conv(\d+)\.", lambda m: f"model.{2 * int(m[1])}.", k): w for k, w in weights.items()

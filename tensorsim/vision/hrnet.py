@@ -255,7 +255,10 @@ class HRNet(nn.Module):
 
     @classmethod
     def from_pretrained(
-        cls, path: str | os.PathLike[str], width: int | None = None, input_size: tuple[int, int] = (256, 192)
+        cls,
+        source: str | os.PathLike[str] | None = None,
+        width: int | None = None,
+        input_size: tuple[int, int] | None = None,
     ) -> "HRNet":
         """Load a ``.pth`` or ``.safetensors`` checkpoint, in evaluation mode.
 
@@ -263,20 +266,29 @@ class HRNet(nn.Module):
         mmpose 0.x and 1.x.
 
         Args:
-            path: the checkpoint.
+            source: a path, or a name that ``tensorsim models list`` prints, such as ``"hrnet-w32-coco"``; None: the
+                shipped weights.
             width: insist on this variant.
-            input_size: (H, W) of the crops the weights were trained on, which a checkpoint does not tell.
+            input_size: (H, W) of the crops the weights were trained on. None: as a ``.safetensors`` file states it
+                or a published file has it in its name (``...384x288...``), else (256, 192).
 
         Raises:
-            TensorsimError: a file that cannot be read or trusted, keys or shapes that are not an HRNet's, or
-                another variant than ``width``.
+            TensorsimError: an unknown name, weights that cannot be fetched, a file that cannot be read or trusted,
+                keys or shapes that are not an HRNet's, or another variant than ``width``.
         """
-        from tensorsim.weights import load_state_dict, load_strict
+        from tensorsim.registry import locate
+        from tensorsim.weights import load_state_dict, load_strict, read_metadata
 
+        path = locate(source, cls.__name__)
         state = _original_names(load_state_dict(path))
         config = _read_config(state, str(path))
         if width is not None and VARIANTS.get(width) != config:
             raise TensorsimError(f"{path}: got the weights of {config}, expected HRNet width {width}")
+        if input_size is None:
+            stated = re.search(r"(\d+)x(\d+)", read_metadata(path).get("input_size", ""))
+            named = re.search(r"(?<!\d)(\d{3})x(\d{3})(?!\d)", path.stem)
+            found = stated or named
+            input_size = (int(found[1]), int(found[2])) if found else (256, 192)
         network = cls(config, input_size)
         load_strict(network, state, str(path))
         return network.eval()

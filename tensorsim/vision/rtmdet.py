@@ -1,7 +1,6 @@
 """RTMDet: people (or the 80 classes of COCO) in images, as one module from pixels to separate boxes."""
 
 import os
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -94,22 +93,29 @@ class RTMDet(nn.Module):
 
     @classmethod
     def from_pretrained(
-        cls, path: str | os.PathLike[str], variant: str | None = None, **options: Any
+        cls, source: str | os.PathLike[str] | None = None, variant: str | None = None, **options: Any
     ) -> "RTMDet":
         """Build the network of a weight file and load it, ready for use (``eval()``).
 
         Args:
-            path: a published ``.pth``, a ``.safetensors`` of its keys, or an ``.onnx`` exported by mmdeploy.
+            source: a published ``.pth``, a ``.safetensors`` of its keys, or an ``.onnx`` exported by mmdeploy; or a
+                name that ``tensorsim models list`` prints, such as ``"rtmdet-m-person"``; None: the shipped weights.
             variant: None tells it from the shapes in the file.
-            **options: further arguments of the constructor.
+            **options: further arguments of the constructor. An ``input_size`` that a ``.safetensors`` file states
+                is taken unless one is given here.
 
         Raises:
-            TensorsimError: the file is damaged, unsafe or not of this network; see
-                :func:`tensorsim.weights.load_state_dict`.
+            TensorsimError: an unknown name, weights that cannot be fetched, or a file that is damaged, unsafe or
+                not of this network; see :func:`tensorsim.weights.load_state_dict`.
         """
-        from tensorsim.weights import load_state_dict, load_strict
+        from tensorsim.registry import locate
+        from tensorsim.weights import load_state_dict, load_strict, read_metadata
 
-        if Path(path).suffix == ".onnx":
+        path = locate(source, cls.__name__)
+        stated = read_metadata(path)
+        if "input_size" in stated:
+            options = {"input_size": int(stated["input_size"])} | options
+        if path.suffix == ".onnx":
             from tensorsim.vision.rtmdet_onnx import read_convolutions, unfold
 
             convolutions = read_convolutions(path)

@@ -1,0 +1,65 @@
+"""``tensorsim models list | fetch | verify``: weights by name."""
+
+from dataclasses import dataclass
+
+import tyro
+
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class ListModels:
+    """List the weights that are known by name: shipped ones, and those fetched from their makers on demand."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim import registry
+
+        for entry in registry.entries():
+            there = "shipped" if entry.shipped else "fetched" if entry.path.is_file() else "online"
+            print(f"{entry.name}\n    {entry.network}, {there}, {entry.licence}; {entry.metrics}")
+            print(f"    {entry.source}; {entry.path if there != 'online' else entry.url}")
+
+
+@dataclass(frozen=True)
+class FetchModels:
+    """Download weights into the cache, so that later runs need no network."""
+
+    names: tyro.conf.Positional[tuple[str, ...]]
+    """Names as `tensorsim models list` prints them."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim import registry
+
+        if not self.names:
+            raise TensorsimError("models fetch: got no names, expected some of `tensorsim models list`")
+        wanted = [registry.find(name) for name in self.names]
+        for entry in wanted:
+            print(f"{entry.name}: {registry.fetch(entry, self.quiet)}")
+
+
+@dataclass(frozen=True)
+class VerifyModels:
+    """Check shipped and fetched weights against their SHA-256."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim import registry
+
+        wrong = []
+        for entry in registry.entries():
+            if not entry.path.is_file() and not entry.shipped:
+                continue
+            try:
+                digest = registry.verify(entry)
+                print(
+                    f"ok    {entry.name}: {digest}" + ("" if entry.sha256 else " (its maker publishes none)")
+                )
+            except TensorsimError as error:
+                wrong.append(entry.name)
+                print(f"WRONG {error}")
+        if wrong:
+            raise TensorsimError(f"models verify: not in order: {', '.join(wrong)}")
