@@ -49,7 +49,7 @@ class TopDownPose(nn.Module):
 
     Args:
         network: :class:`HRNet`, :class:`OnnxHeatmaps` or any module that maps crops (N, 3, H, W), RGB in [0,
-            1], to heat maps (N, 17, H/4, W/4).
+            1], to heat maps (N, 17, H/4, W/4), or H/s and W/s if it has a ``stride`` s, as :class:`CPM`.
         decode: ``"dark"`` or ``"quarter"``, see :class:`HeatmapDecoder`.
         flip_test: average with the mirror image, see :class:`FlipTest`: better, at twice the cost.
         padding: boxes are enlarged by this factor.
@@ -78,7 +78,7 @@ class TopDownPose(nn.Module):
             crop_size = getattr(network, "input_size", (256, 192))
         self.crop = BoxCrop(crop_size, padding)
         self.network = FlipTest(network) if flip_test else network
-        self.decoder = HeatmapDecoder(decode)
+        self.decoder = HeatmapDecoder(decode, stride=getattr(network, "stride", 4))
         self.crops_per_batch = crops_per_batch
         self.keypoints = len(COCO_KEYPOINTS)
 
