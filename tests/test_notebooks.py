@@ -41,3 +41,11 @@ def test_missing_recordings_are_said_plainly(monkeypatch: pytest.MonkeyPatch, tm
     first = next(cell.source for cell in notebook.cells if cell.cell_type == "code")
     with pytest.raises(FileNotFoundError, match="set TENSORSIM_SHARED_DATA"):
         exec(first, {})
+
+
+def test_every_picture_of_the_physics_is_checked() -> None:
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(ROOT / "notebooks" / "physics_you_can_check.ipynb", as_version=4)
+    pictures = [cell.source for cell in notebook.cells if "plt.subplots(" in cell.source]
+    assert len(pictures) >= 12
+    assert all("\ncheck(" in source or "    check(" in source for source in pictures)

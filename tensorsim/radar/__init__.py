@@ -2,7 +2,7 @@
 
 from tensorsim.radar import metrics
 from tensorsim.radar.antenna import CosineAntenna, TabulatedAntenna
-from tensorsim.radar.array import AngleMapper, AngleMaps
+from tensorsim.radar.array import AngleMapper, AngleMaps, align_transmitters
 from tensorsim.radar.closed_form import RangeBinSynthesizer
 from tensorsim.radar.doppler import DopplerTimeMap, RangeDopplerVideo
 from tensorsim.radar.echo import EchoSynthesizer, SideChannels
@@ -47,6 +47,7 @@ __all__ = [
     "SideChannels",
     "SynchrosqueezedMap",
     "TabulatedAntenna",
+    "align_transmitters",
     "load_radar_yaml",
     "load_scene_yaml",
     "metrics",

@@ -49,6 +49,32 @@ def beam_power(profiles: Tensor, cycles: Tensor) -> Tensor:
     return power.clamp_min(0.0).transpose(-1, -2)
 
 
+def align_transmitters(profiles: Tensor, transmitters: int) -> Tensor:
+    """Profiles (..., V, M, R) of K transmitters in turn as if all had fired at the start of the pulse interval.
+
+    Transmitter k samples the motion k / K of an interval later than the first, which an angle estimator takes for
+    a direction. A linear phase over Doppler, ``exp(-j 2 pi f k / K)`` for f in [-1/2, 1/2) cycles per interval,
+    brings its pulses back: every Doppler at once, up to PRF / 2. Half a dozen pulses at either end, where the
+    transform takes the clip for periodic, stay wrong; so does the range walk within an interval. Differentiable.
+
+    Raises:
+        TensorsimError: real profiles, or a number of channels that is no multiple of the transmitters.
+    """
+    if not profiles.is_complex():
+        raise TensorsimError(f"profiles: got dtype {profiles.dtype}, expected a complex tensor")
+    check_min_rank(profiles, 3, "profiles", "(..., channels, pulses, range bins)")
+    channels = profiles.shape[-3]
+    if transmitters < 1 or channels % transmitters != 0:
+        raise TensorsimError(
+            f"profiles: got {channels} channels for {transmitters} transmitters, expected a multiple of them"
+        )
+    doppler = torch.fft.fftfreq(profiles.shape[-2], dtype=torch.float64, device=profiles.device)
+    turn = torch.arange(channels, device=profiles.device) // (channels // transmitters)
+    angle = (-2 * math.pi / transmitters) * turn.unsqueeze(-1) * doppler
+    shift = torch.polar(torch.ones_like(angle), angle).to(profiles.dtype).unsqueeze(-1)
+    return torch.fft.ifft(torch.fft.fft(profiles, dim=-2) * shift, dim=-2)
+
+
 class AngleMapper(nn.Module):
     """Range-angle and azimuth-time maps of range profiles.
 
@@ -61,14 +87,17 @@ class AngleMapper(nn.Module):
 
     The wavelength is that of the centre of the sweep, whose phase a range profile keeps. Plane waves: ranges
     large beside ``aperture^2 / lambda``. Transmitters in turn: a target at v m/s shifts the phase between
-    neighbours by ``4 pi v / (lambda K PRF)``, which is not taken out; subtract what stands still first
-    (a moving target indicator along M) and keep v small beside ``lambda K PRF / 4``.
+    neighbours by ``4 pi v / (lambda K PRF)``, which is not taken out here: see :func:`align_transmitters`.
+
+    Attributes:
+        azimuth_rad: (D,).
 
     Raises:
         TensorsimError: a radar without an array; azimuths that are not a finite vector; profiles with another
             number of channels, or real ones.
     """
 
+    azimuth_rad: Tensor
     cycles: Tensor
 
     def __init__(self, radar: RadarConfig, azimuth_rad: Tensor, elevation_rad: float = 0.0) -> None:
@@ -85,6 +114,7 @@ class AngleMapper(nn.Module):
         channels = (tx[:, None] + rx).flatten(0, 1)
         cycles = steering_vectors(channels, azimuth, elevation_rad, radar.doppler_wavelength_m)
         self.register_buffer("cycles", cycles - cycles.round(), persistent=False)
+        self.register_buffer("azimuth_rad", azimuth, persistent=False)
         self.channels = channels.shape[0]
 
     def forward(self, profiles: Tensor) -> AngleMaps:

@@ -24,8 +24,9 @@ ABOVE_NOISE_DB = 10.0
 #: Slower cells are floor, furniture and mains hum.
 SLOWEST_M_S = 0.4
 
-#: Power above this multiple of the torso's speed is that of a swinging leg.
-SWING = 1.5
+#: Power above these multiples of the torso's speed is that of a swinging leg. Which multiple separates them best
+#: depends on the gait, so the rhythms above all of them vote.
+SWING = (1.25, 1.5, 1.75)
 
 #: A frame belongs to steady gait when the torso is faster than this part of its 90th percentile.
 STEADY = 0.6
@@ -56,8 +57,9 @@ class GaitParameters(NamedTuple):
 class GaitEstimator(nn.Module):
     """Reads :class:`GaitParameters` from the map of one person who walks or runs.
 
-    The step rate is the strongest modulation, with its first harmonic, between 1.2 and 4.5 Hz of the share of
-    power faster than 1.5 times the torso: a swinging leg puts it there once a step. Not differentiable.
+    The step rate is the strongest modulation, with its first harmonic, between 1.2 and 4.5 Hz of the shares of
+    power faster than 1.25, 1.5 and 1.75 times the torso: a swinging leg puts it there once a step. Not
+    differentiable.
 
     Args:
         speed_m_s: (F,) radial speed of each Doppler bin of the maps, one- or two-sided, in any order.
@@ -115,37 +117,43 @@ class GaitEstimator(nn.Module):
         limb = self.speed_m_s[(share < 0.95).sum(-2).clamp(max=self.speed_m_s.shape[0] - 1)]
         steady = torso > self.steady * torso.quantile(0.9, -1, keepdim=True)
 
-        fast = self.speed_m_s.unsqueeze(-1) > self.swing * torso.unsqueeze(-2)
-        swing = torch.where(fast, power, 0.0).sum(-2) / power.sum(-2).clamp_min(1e-300)
+        whole = power.sum(-2).clamp_min(1e-300)
+        swings: list[Tensor] = []
+        for multiple in self.swing:
+            fast = self.speed_m_s.unsqueeze(-1) > multiple * torso.unsqueeze(-2)
+            swings.append(torch.where(fast, power, 0.0).sum(-2) / whole)
         dtype = doppler_time.dtype
         return GaitParameters(
             torch.where(steady, torso, math.nan).nanmedian(-1)[0].to(dtype),
             torch.where(steady, limb, math.nan).nanquantile(0.9, -1).to(dtype),
-            self._step_rate(swing, steady).to(dtype),
+            self._step_rate(torch.stack(swings), steady).to(dtype),
             torso.to(dtype),
             limb.to(dtype),
         )
 
     def _step_rate(self, swing: Tensor, steady: Tensor) -> Tensor:
-        """Strongest frequency in the band of steps of ``swing`` (..., K), whose trend over 1.2 s is removed.
+        """Strongest frequency in the band of steps of ``swing`` (W, ..., K), whose trend over 1.2 s is removed.
 
         Periodograms of ``log(swing)`` over 4 s, half overlapping, are averaged (Welch): the phase of the steps
-        does not outlast a turn.
+        does not outlast a turn. Those of all W are scaled to the same power and added. ``steady`` (..., K).
         """
-        frames = swing.shape[-1]
+        shares, frames = swing.shape[0], swing.shape[-1]
         signal = (swing + self.quietest).log().reshape(-1, 1, frames)
         half = int(0.6 * self.frame_rate_hz)
         signal = signal - F.avg_pool1d(signal, 2 * half + 1, 1, half, count_include_pad=False)
-        signal = signal * F.avg_pool1d(steady.to(signal.dtype).view_as(signal), 9, 1, 4)
+        weight = steady.to(signal.dtype).expand(swing.shape).reshape(-1, 1, frames)
+        signal = signal * F.avg_pool1d(weight, 9, 1, 4)
         span = min(frames, 4 * self.second)
         window = torch.hann_window(span, periodic=False, dtype=signal.dtype, device=signal.device)
         # Zeros to 0.01 Hz between the samples of the spectrum: the clip may hold a few steps only.
         length = 100 * self.second
         pieces = signal.squeeze(1).unfold(-1, span, max(1, span // 2)) * window
         spectrum = torch.fft.rfft(pieces, length).abs().square().mean(1)
+        spectrum = spectrum / spectrum.sum(-1, keepdim=True).clamp_min(1e-300)
+        spectrum = spectrum.unflatten(0, (shares, spectrum.shape[0] // shares)).sum(0)
         step = self.frame_rate_hz / length
         low, high = math.ceil(self.band[0] / step), math.floor(self.band[1] / step) + 1
         # A harmonic supports its fundamental, so that two bumps a step do not pass for two steps.
         harmonic = spectrum[:, 2 * low : 2 * high : 2]
         peak = (spectrum[:, low:high] + 0.5 * harmonic).argmax(-1) + low
-        return (peak * step).reshape(swing.shape[:-1])
+        return (peak * step).reshape(swing.shape[1:-1])

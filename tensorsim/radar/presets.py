@@ -1,7 +1,8 @@
 """Radars by name, and radars from YAML files.
 
-A file holds fields of :class:`~tensorsim.config.RadarConfig` and, for a scene with a wall, a section with those
-of :class:`~tensorsim.config.WallConfig`; what is not named keeps its default::
+A file holds fields of :class:`~tensorsim.config.RadarConfig` and, for a scene with a wall or a floor that reflects,
+sections with those of :class:`~tensorsim.config.WallConfig` and :class:`~tensorsim.config.FloorConfig`; what is not
+named keeps its default::
 
     carrier_hz: 24.0e9
     bandwidth_hz: 250e6
@@ -11,6 +12,7 @@ of :class:`~tensorsim.config.WallConfig`; what is not named keeps its default::
     rx_m: [0.02, 0.0, 1.0]
     wall:
       relative_permittivity: 4.5
+    floor: {}
 """
 
 import dataclasses
@@ -19,32 +21,38 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig, WallConfig
+from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
 
 
 class RadarScene(NamedTuple):
-    """A radar, and the wall before it.
+    """A radar, the wall before it, and the floor below.
 
     Attributes:
         radar: the radar.
         wall: the wall; None is free space.
+        floor: the floor; None is one that does not reflect.
     """
 
     radar: RadarConfig
     wall: WallConfig | None = None
+    floor: FloorConfig | None = None
 
 
-#: Radars by name. Each number is marked: (D) limit or value of the public data sheet or evaluation board guide,
-#: (T) a typical setting for people, within these limits; antennas stand 1 m above the floor. Check the numbers
-#: against the data sheet of the part at hand where they matter. The simulated pulses are evenly spaced, without
-#: pauses between frames, and the samples complex; the swept band is all sampled, where a real chirp loses some at
-#: its ends.
+#: The parts of a scene beside the radar: sections of a file by name.
+_SECTIONS: dict[str, type] = {"wall": WallConfig, "floor": FloorConfig}
+
+
+#: Radars by name. Each number is marked: (D) limit or value of the public documents of the part, (T) a typical
+#: setting for people, within these limits; antennas stand 1 m above the floor. The documents are the data sheets
+#: of the parts, whose numbers stand beside them, and the guides of the boards; check them where it matters. The
+#: simulated pulses are evenly spaced, without pauses between frames, and the samples complex; the swept band is all
+#: sampled, where a real chirp loses some at its ends.
 PRESETS: dict[str, RadarScene] = {
     # The two scenes of the paper's control panel.
     "free-space": RadarScene(RadarConfig.free_space()),
     "through-wall": RadarScene(RadarConfig.through_wall(), WallConfig()),
-    # Texas Instruments AWR1642 on its BOOST board: 76 to 81 GHz.
+    # Texas Instruments AWR1642 (SWRS203) on its BOOST board: 76 to 81 GHz.
     "ti-awr1642": RadarScene(
         RadarConfig(
             carrier_hz=77e9,  # D: start of the 4 GHz band
@@ -54,11 +62,11 @@ PRESETS: dict[str, RadarScene] = {
             sample_rate_hz=6.25e6,  # D: highest complex rate (5 MHz of intermediate frequency); range 6 m
             tx_m=(-0.01, 0.0, 1.0),  # T: centimetres apart on the board
             rx_m=(0.01, 0.0, 1.0),
-            antenna_gain_dbi=10.5,  # D: board guide, peak
+            antenna_gain_dbi=10.5,  # D: guide of the board, peak
             isolation_db=30.0,  # T
         )
     ),
-    # Texas Instruments AWR1843 on its BOOST board: 76 to 81 GHz.
+    # Texas Instruments AWR1843 (SWRS222) on its BOOST board: 76 to 81 GHz.
     "ti-awr1843": RadarScene(
         RadarConfig(
             carrier_hz=77e9,  # D: start of the 4 GHz band
@@ -68,11 +76,11 @@ PRESETS: dict[str, RadarScene] = {
             sample_rate_hz=12.5e6,  # D: highest complex rate (10 MHz of intermediate frequency); range 9.6 m
             tx_m=(-0.01, 0.0, 1.0),  # T: centimetres apart on the board
             rx_m=(0.01, 0.0, 1.0),
-            antenna_gain_dbi=10.5,  # D: board guide, peak
+            antenna_gain_dbi=10.5,  # D: guide of the board, peak
             isolation_db=30.0,  # T
         )
     ),
-    # Texas Instruments IWR6843 on its ISK board: 60 to 64 GHz.
+    # Texas Instruments IWR6843 (SWRS219) on its ISK board: 60 to 64 GHz.
     "ti-iwr6843": RadarScene(
         RadarConfig(
             carrier_hz=60e9,  # D: start of the 4 GHz band
@@ -82,11 +90,12 @@ PRESETS: dict[str, RadarScene] = {
             sample_rate_hz=12.5e6,  # D: highest complex rate (10 MHz of intermediate frequency); range 9.6 m
             tx_m=(-0.01, 0.0, 1.0),  # T: centimetres apart on the board
             rx_m=(0.01, 0.0, 1.0),
-            antenna_gain_dbi=7.0,  # D: board guide, peak
+            antenna_gain_dbi=7.0,  # D: guide of the board, peak
             isolation_db=30.0,  # T
         )
     ),
-    # Infineon BGT60TR13C: antennas in the package, one transmitter, three receivers in an L; here the corner one.
+    # Infineon BGT60TR13C (data sheet 2.4.9): antennas in the package, one transmitter, three receivers in an L; here
+    # the corner one.
     "infineon-bgt60tr13c": RadarScene(
         RadarConfig(
             carrier_hz=58e9,  # D: 58 to 63.5 GHz
@@ -96,7 +105,7 @@ PRESETS: dict[str, RadarScene] = {
             sample_rate_hz=4e6,  # D: highest rate; real samples, which reach as far as half the bins here; 7.0 m
             tx_m=(-0.0025, 0.0, 1.0),  # T: other side of a package 6.5 mm wide (D)
             rx_m=(0.0025, 0.0, 1.0),
-            antenna_gain_dbi=5.0,  # D
+            antenna_gain_dbi=5.0,  # T
             isolation_db=30.0,  # T
         )
     ),
@@ -169,12 +178,12 @@ def radar_scene(name_or_path: str) -> RadarScene:
 
 
 def load_radar_yaml(path: str | Path) -> RadarConfig:
-    """The radar of a YAML file; see the module for the format and :func:`load_scene_yaml` for the wall as well."""
+    """The radar of a YAML file; see the module for the format and :func:`load_scene_yaml` for the whole scene."""
     return load_scene_yaml(path).radar
 
 
 def load_scene_yaml(path: str | Path) -> RadarScene:
-    """The radar of a YAML file, and its wall if the file has a section ``wall``.
+    """The radar of a YAML file, and its wall and floor if the file has sections ``wall`` and ``floor``.
 
     The fields of the radar may also stand in a section ``radar``. Numbers may be written as in Python: unlike
     plain YAML 1.1, ``77e9`` is one. Nothing in the file is run.
@@ -192,29 +201,31 @@ def load_scene_yaml(path: str | Path) -> RadarScene:
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise TensorsimError(f"{path}: not valid YAML: {error}") from None
     document = _mapping(f"{path}", document)
-    sections = {name: document.pop(name) for name in ("radar", "wall") if name in document}
-    fields = document
-    if "radar" in sections:
-        if fields:
-            raise TensorsimError(
-                f"{path}: got {', '.join(map(str, fields))} beside the section radar, expected them in it"
-            )
-        fields = _mapping(f"{path}: radar", sections["radar"])
-    radar = _build(f"{path}", RadarConfig, fields, ["radar", "wall"])
-    if "wall" not in sections:
-        return RadarScene(radar)
-    return RadarScene(
-        radar, _build(f"{path}: wall", WallConfig, _mapping(f"{path}: wall", sections["wall"]), [])
-    )
+    sections = {
+        name: _mapping(f"{path}: {name}", document.pop(name))
+        for name in ("radar", *_SECTIONS)
+        if name in document
+    }
+    fields = sections.pop("radar", document)
+    if fields is not document and document:
+        raise TensorsimError(
+            f"{path}: got {', '.join(map(str, document))} beside the section radar, expected them in it"
+        )
+    radar = _build(f"{path}", RadarConfig, fields, ["radar", *_SECTIONS])
+    parts = {name: _build(f"{path}: {name}", _SECTIONS[name], part, []) for name, part in sections.items()}
+    return RadarScene(radar, **parts)
 
 
-def save_radar_yaml(path: str | Path, radar: RadarConfig, wall: WallConfig | None = None) -> None:
+def save_radar_yaml(
+    path: str | Path, radar: RadarConfig, wall: WallConfig | None = None, floor: FloorConfig | None = None
+) -> None:
     """Write a file from which :func:`load_scene_yaml` reads the same scene."""
     import yaml
 
     document = _plain(dataclasses.asdict(radar))
-    if wall is not None:
-        document["wall"] = _plain(dataclasses.asdict(wall))
+    for name, part in (("wall", wall), ("floor", floor)):
+        if part is not None:
+            document[name] = _plain(dataclasses.asdict(part))
     Path(path).write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
 
 
@@ -268,16 +279,19 @@ def _build(where: str, config: type, values: dict[Any, Any], sections: list[str]
 
 
 def _like(where: str, value: Any, default: Any) -> Any:
-    """A value of YAML in the type of a field's default: a number, (nested) tuples of numbers, or as it is."""
+    """A value of YAML in the type of a field's default: (nested) tuples of numbers, or a number.
+
+    Where the default is None, a number or none.
+    """
+    if default is None and value is None:
+        return None
     if isinstance(default, tuple):
         if not isinstance(value, list):
             raise TensorsimError(f"{where}: got {value!r}, expected a list of numbers")
         return tuple(_like(where, item, default if isinstance(item, list) else 0.0) for item in value)
-    if isinstance(default, float):
-        try:
-            if isinstance(value, (int, float, str)) and not isinstance(value, bool):
-                return float(value)
-        except ValueError:
-            pass
-        raise TensorsimError(f"{where}: got {value!r}, expected a number")
-    return tuple(value) if isinstance(value, list) else value
+    try:
+        if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+            return float(value)
+    except ValueError:
+        pass
+    raise TensorsimError(f"{where}: got {value!r}, expected a number")

@@ -1,9 +1,12 @@
-"""Scenes that the radar tests share: generated motion, and a recorded walk."""
+"""Inputs that the radar tests share: generated motion, a recorded walk, noise, and stages that take a scene."""
+
+import math
 
 import numpy as np
 import torch
 
 from tensorsim.config import JOINT_RCS_M2, RadarConfig
+from tests.stage import StageTester
 
 #: A radar small enough for finite differences: 24 samples a pulse, Doppler windows of 26 pulses.
 SMALL = RadarConfig(carrier_hz=2e9, bandwidth_hz=0.4e9, chirp_s=40e-6, sample_rate_hz=0.6e6, prf_hz=256.0)
@@ -41,3 +44,57 @@ def joint_rcs():
 
 def tensors(positions, rcs, dtype=torch.float64):
     return torch.as_tensor(positions, dtype=dtype), torch.as_tensor(rcs, dtype=dtype)
+
+
+def complex_noise(*shape, dtype=torch.float32, seed=1):
+    """White circular noise, complex64 or complex128 by the real ``dtype``; the numbers are the same."""
+    x = torch.randn(*shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(seed))
+    return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64)
+
+
+class ProfilesCase(StageTester):
+    """A Doppler transform of :data:`SMALL`, windows of 26 pulses, of profiles (..., M, R); needs ``make``."""
+
+    def inputs(self, batch, dtype):
+        return (complex_noise(*batch, 40, 3, dtype=dtype),)
+
+    def bad_inputs(self):
+        x = self.inputs((), torch.float32)[0]
+        return [
+            ((x.real,), "profiles: got dtype"),
+            ((x[0],), "profiles: got shape"),
+            ((x[:25],), "got 25 pulses .* at least the 26"),
+            ((x[:, :0],), "profiles: got shape"),
+        ]
+
+
+class SceneCase(StageTester):
+    """A stage of :data:`SMALL` that takes positions (..., M, S, 3) and RCS (..., S); needs ``make``."""
+
+    batched_arguments = (0, 1)
+    gradient_arguments = (0, 1)
+    pulses = 7
+    scatterers = 3
+
+    def inputs(self, batch, dtype):
+        clips = [
+            swinging(self.pulses, self.scatterers, SMALL.prf_hz, seed=i) for i in range(math.prod(batch))
+        ]
+        rcs = np.random.default_rng(1).uniform(0.1, 1.0, (*batch, self.scatterers))
+        return tensors(
+            np.stack(clips).reshape(*batch, self.pulses, self.scatterers, 3), rcs.astype(np.float32), dtype
+        )
+
+    def bad_inputs(self):
+        p, rcs = self.inputs((), torch.float32)
+        hole = p.clone()
+        hole[2, 1, 0] = float("nan")
+        return [
+            ((p.long(), rcs), "positions: got dtype"),
+            ((p[0], rcs), "positions: got shape"),
+            ((p[..., :2], rcs), "positions: got shape"),
+            ((p[:0], rcs), "at least one pulse"),
+            ((p, rcs[:2]), "rcs: got shape"),
+            ((p, -rcs), "no negative"),
+            ((hole, rcs), "positions: got NaN"),
+        ]

@@ -11,11 +11,11 @@ from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.antenna import CosineAntenna, TabulatedAntenna, angles
-from tensorsim.radar.array import AngleMapper
+from tensorsim.radar.array import AngleMapper, align_transmitters
 from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.range_profile import RangeProfile
 from tests.radar import reference
-from tests.radar.scenes import SMALL, swinging, tensors
+from tests.radar.scenes import SMALL, SceneCase, complex_noise, swinging, tensors
 from tests.stage import StageTester, assert_same
 
 FREE = RadarConfig.free_space()
@@ -59,18 +59,8 @@ class TestTabulatedAntenna(DirectionCase):
         return TabulatedAntenna(azimuth, elevation, table)
 
 
-class ArrayCase(StageTester):
-    batched_arguments = (0, 1)
-    gradient_arguments = (0, 1)
-
-    def inputs(self, batch, dtype):
-        count = math.prod(batch)
-        p = np.stack([swinging(5, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 5, 3, 3)
-        return tensors(p, np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)).astype(np.float32), dtype)
-
-    def bad_inputs(self):
-        p, rcs = self.inputs((), torch.float32)
-        return [((p, -rcs), "expected no negative"), ((p[..., :2], rcs), "positions: got shape")]
+class ArrayCase(SceneCase):
+    pulses = 5
 
 
 class TestEchoOfAnArray(ArrayCase):
@@ -98,9 +88,7 @@ class TestAngleMapper(StageTester):
         return AngleMapper(half_wave_array(4), torch.linspace(-1, 1, 9))
 
     def inputs(self, batch, dtype):
-        generator = torch.Generator().manual_seed(1)
-        x = torch.randn(*batch, 4, 3, 5, dtype=torch.complex64, generator=generator)
-        return (x.to(torch.complex128 if dtype == torch.float64 else torch.complex64),)
+        return (complex_noise(*batch, 4, 3, 5, dtype=dtype),)
 
     def test_float32_near_float64(self):
         x = self.inputs((2,), torch.float64)[0]
@@ -197,6 +185,56 @@ def test_transmitters_fire_in_turn():
     )
 
 
+def two_by_four(**options):
+    """Two transmitters two wavelengths apart, four receivers: a virtual row of eight around x = 0."""
+    four = half_wave_array(4, **options)
+    return replace(four, tx_m=tuple((k * four.doppler_wavelength_m, 0.0, 0.0) for k in (-0.5, 0.5)))
+
+
+def test_aligned_transmitters_fire_at_once():
+    radar = two_by_four(prf_hz=512.0, bandwidth_hz=0.2e9, sample_rate_hz=1e6)
+    t = torch.arange(256).double() / radar.prf_hz
+    p = torch.stack((0.3 - 0.1 * t, 4.0 - 0.3 * t, 0.2 * t), -1)[:, None]
+    profile, rcs = RangeProfile(radar).double(), f64(1.0)
+    channels = profile(EchoSynthesizer(radar).double()(p, rcs))
+    at_once = [
+        profile(EchoSynthesizer(replace(radar, tx_m=tx, rx_m=radar.rx_m)).double()(p, rcs))
+        for tx in radar.tx_positions_m
+    ]
+    inside = slice(40, -40)
+    expected = torch.cat(at_once)[:, inside]
+    aligned = align_transmitters(channels, 2)
+    assert_same(align_transmitters(channels[:4], 1), channels[:4], atol=1e-12)
+    assert reference.relative(aligned[:, inside], expected) < 0.01
+    assert reference.relative(channels[:, inside], expected) > 0.3
+
+
+@pytest.mark.parametrize("speed", [-0.8, 0.8])
+def test_a_mover_stays_at_its_azimuth(speed):
+    """Unaligned, who approaches on the right seems to be farther to the right, and who leaves farther to the left."""
+    radar = two_by_four(prf_hz=2048.0, bandwidth_hz=0.5e9, sample_rate_hz=1e6)
+    t = torch.arange(200).double() / radar.prf_hz
+    away, degrees = math.radians(15.0), torch.arange(-40.0, 40.25, 0.5)
+    distance = 4.0 - speed * t
+    p = torch.stack((distance * math.sin(away), distance * math.cos(away), 0 * t), -1)[:, None]
+    channels = RangeProfile(radar).double()(EchoSynthesizer(radar).double()(p, f64(1.0)))
+    mapper = AngleMapper(radar, torch.deg2rad(degrees))
+    assert torch.equal(mapper.azimuth_rad, torch.deg2rad(degrees).double())
+    seen = [
+        degrees[mapper(x).range_angle.amax(0).argmax()] for x in (channels, align_transmitters(channels, 2))
+    ]
+    assert float(seen[1]) == pytest.approx(15.0, abs=0.5)
+    assert (float(seen[0]) - 15.0) / speed > 1.0
+
+
+def test_gradient_of_the_alignment():
+    x = complex_noise(4, 5, 2, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: align_transmitters(x, 2), (x,), fast_mode=True)
+    scripted = torch.jit.script(align_transmitters)
+    assert_same(scripted(x.detach(), 2), align_transmitters(x.detach(), 2))
+    assert_same(align_transmitters(x[None].detach(), 2)[0], align_transmitters(x.detach(), 2), atol=1e-12)
+
+
 def test_one_position_in_a_list_is_a_channel():
     p, rcs = tensors(swinging(3, 2, 256.0), np.ones(2))
     single = EchoSynthesizer(SMALL)(p, rcs)
@@ -289,6 +327,8 @@ def test_a_uniform_array_is_a_fourier_transform():
         ),
         (lambda: AngleMapper(FREE, f64(0.0)), "one transmitter and one receiver"),
         (lambda: AngleMapper(ARRAY, f64(math.nan)), "azimuth_rad: got"),
+        (lambda: align_transmitters(complex_noise(5, 3, 2), 2), "got 5 channels for 2 transmitters"),
+        (lambda: align_transmitters(torch.ones(4, 3, 2), 2), "profiles: got dtype"),
         (lambda: AngleMapper(ARRAY, f64(0.0), math.inf), "elevation_rad: got inf"),
     ],
 )

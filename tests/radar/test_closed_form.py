@@ -13,8 +13,8 @@ from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.range_profile import RangeProfile
 from tensorsim.radar.simulator import RadarSimulator
 from tests.radar import reference
-from tests.radar.scenes import SMALL, joint_rcs, recorded_walk, swinging, tensors
-from tests.stage import StageTester, assert_same
+from tests.radar.scenes import SMALL, SceneCase, joint_rcs, recorded_walk, swinging, tensors
+from tests.stage import assert_same
 
 FREE = RadarConfig.free_space()
 THROUGH = RadarConfig.through_wall()
@@ -28,27 +28,12 @@ def synthesizer(radar, window="hamming", near_bins=None, gate_m=None, **scene):
     )
 
 
-class TestRangeBinSynthesizer(StageTester):
-    batched_arguments = (0, 1)
-    gradient_arguments = (0, 1)
+class TestRangeBinSynthesizer(SceneCase):
+    pulses = 6
 
     def make(self):
         wall = WallConfig(center_m=(0.0, 3.0, 1.5))
         return synthesizer(SMALL, wall=wall, multipath=True, leakage=True, wall_echo=True)
-
-    def inputs(self, batch, dtype):
-        count = math.prod(batch)
-        p = np.stack([swinging(6, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 6, 3, 3)
-        return tensors(p, np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)), dtype)
-
-    def bad_inputs(self):
-        p, rcs = self.inputs((), torch.float32)
-        return [
-            ((p[:0], rcs), "at least one pulse"),
-            ((p, rcs[:2]), "rcs: got shape"),
-            ((p, -rcs), "no negative"),
-            ((p * float("nan"), rcs), "NaN"),
-        ]
 
 
 class TestNearBins(TestRangeBinSynthesizer):
@@ -189,8 +174,8 @@ def test_refuses_bad_settings():
         RadarSimulator(FREE, near_bins=4)
 
 
-class TestSimulatorWithRangeBins(StageTester):
-    batched_arguments = (0, 1)
+class TestSimulatorWithRangeBins(SceneCase):
+    pulses = 35
     gradient_arguments = ()  # tested with noise below: without a floor, magnitudes have kinks
     exports = False  # it does; RangeBinSynthesizer shows it in a tenth of the time
 
@@ -199,14 +184,9 @@ class TestSimulatorWithRangeBins(StageTester):
         options = {"multipath": True, "leakage": True, "wall_echo": True, "snr_db": None, "pulse_chunk": 8}
         return RadarSimulator(SMALL, wall, ridge_count=2, engine="range-bins", **options)
 
-    def inputs(self, batch, dtype):
-        count = math.prod(batch)
-        p = np.stack([swinging(35, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 35, 3, 3)
-        return tensors(p, np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)).astype(np.float32), dtype)
-
     def bad_inputs(self):
         p, rcs = self.inputs((), torch.float32)
-        return [((p[:26], rcs), "got 26 pulses"), ((p, rcs[:2]), "rcs: got shape")]
+        return [*super().bad_inputs(), ((p[:26], rcs), "got 26 pulses")]
 
 
 def test_gradients_of_the_doppler_map():

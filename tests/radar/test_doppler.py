@@ -14,34 +14,15 @@ from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.mti import MovingTargetIndicator
 from tensorsim.radar.range_profile import RangeProfile
 from tests.radar import reference
-from tests.radar.scenes import SMALL
-from tests.stage import StageTester
+from tests.radar.scenes import SMALL, ProfilesCase, complex_noise
 
 FREE = RadarConfig.free_space()
 THROUGH = RadarConfig.through_wall()
 
 
-def noise(*shape, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(2)
-    x = torch.randn(*shape, dtype=torch.complex64, generator=generator)
-    return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64)
-
-
-class TestDopplerTimeMap(StageTester):
+class TestDopplerTimeMap(ProfilesCase):
     def make(self):
         return DopplerTimeMap(SMALL)
-
-    def inputs(self, batch, dtype):
-        return (noise(*batch, 40, 5, dtype=dtype),)
-
-    def bad_inputs(self):
-        x = self.inputs((), torch.float32)[0]
-        return [
-            ((x.real,), "profiles: got dtype"),
-            ((x[0],), "profiles: got shape"),
-            ((x[:25],), "got 25 pulses .* at least the 26"),
-            ((x[:, :0],), "profiles: got shape"),
-        ]
 
 
 class TestPaperIntegration(TestDopplerTimeMap):
@@ -51,7 +32,7 @@ class TestPaperIntegration(TestDopplerTimeMap):
 
 class TestCoherentIntegration(TestDopplerTimeMap):
     def make(self):
-        return DopplerTimeMap(SMALL, integration="coherent", gate_m=(0.2, 0.8))  # bins 1 to 3
+        return DopplerTimeMap(SMALL, integration="coherent", gate_m=(0.2, 0.8))  # bins 1 and 2
 
     def bad_inputs(self):
         return [*super().bad_inputs(), ((self.inputs((), torch.float32)[0][:, :1],), "before the gate")]
@@ -67,7 +48,7 @@ class TestRangeDopplerVideo(TestDopplerTimeMap):
     ("radar", "pulses", "frames"), [(FREE, 819 + 82 * 70, 71), (THROUGH, 300, 144), (FREE, 819, 1)]
 )
 def test_map_equals_loop_over_frames(radar, pulses, frames, paper):
-    x = noise(pulses, 7)
+    x = complex_noise(pulses, 7)
     module = DopplerTimeMap(radar, integration="paper" if paper else "noncoherent")
     expected, axis = reference.doppler_time(x.numpy().astype(complex), radar.prf_hz, paper=paper)
     actual = module(x)
@@ -81,7 +62,7 @@ def test_map_equals_scipy():
     from scipy.signal import ShortTimeFFT
     from scipy.signal.windows import hann
 
-    x = noise(3000, 4).numpy().astype(complex)
+    x = complex_noise(3000, 4).numpy().astype(complex)
     module = DopplerTimeMap(FREE)
     stft = ShortTimeFFT(hann(819, sym=False), 82, 8192, fft_mode="centered", mfft=1024)
     expected = stft.stft(x.conj().T, p0=stft.p_min, p1=stft.p_max(3000))  # (R, F, all frames)
@@ -176,14 +157,14 @@ def test_coherent_map_equals_numpy_and_does_not_vanish():
 
 @pytest.mark.parametrize("integration", ["noncoherent", "coherent", "paper"])
 def test_gate_takes_the_bins_inside(integration):
-    x = noise(900, 12)
+    x = complex_noise(900, 12)
     spacing = FREE.range_resolution_m
     gated = DopplerTimeMap(FREE, integration=integration, gate_m=(3 * spacing, 7.4 * spacing))(x)
     np.testing.assert_allclose(gated, DopplerTimeMap(FREE, integration=integration)(x[:, 3:8]), rtol=1e-4)
 
 
 def test_video_is_the_map_before_its_sum_over_range():
-    x = noise(2, 1200, 5)
+    x = complex_noise(2, 1200, 5)
     video, maps = RangeDopplerVideo(FREE)(x), DopplerTimeMap(FREE)(x)
     assert video.shape == (2, 5, 5, 1024)
     np.testing.assert_allclose(video.sum(2).sqrt().transpose(1, 2), maps, rtol=1e-5)

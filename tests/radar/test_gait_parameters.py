@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 import torch
 
+from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.motion.limb_scatterers import LimbScatterers
+from tensorsim.motion.people import nominal_people
+from tensorsim.motion.scatterers import JointScatterers
+from tensorsim.radar.doppler import DopplerTimeMap
+from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.gait_parameters import GaitEstimator
+from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.range_profile import RangeProfile
 from tests.stage import StageTester
 
 SPEED = torch.linspace(-9, 9, 181).double()
@@ -68,6 +77,27 @@ def test_a_second_bump_is_no_second_step():
     power, half = gait(steps=1.7, sharpness=6).square(), round(RATE / 1.7 / 2)
     double = power + 0.6 * power.roll(half, -1)  # a weaker bump between two steps
     assert float(GaitEstimator(SPEED, RATE)(double.sqrt()).step_hz) == pytest.approx(1.7, rel=0.05)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.8, 1.1, 1.4])
+@pytest.mark.parametrize("limbs", [False, True])
+def test_steps_of_generated_walks(speed_m_s, limbs):
+    """Bodies of points and of ellipsoids: knee and ankle of one swing do not pass for two steps."""
+    radar = PRESETS["infineon-bgt24mtr12"].radar
+    walk = ActivityGenerator().generate(
+        "walking", people=nominal_people(1, speed_m_s=speed_m_s), rate_hz=radar.prf_hz
+    )
+    scatterers = LimbScatterers(radar.tx_m, radar.rx_m) if limbs else JointScatterers()
+    scene = scatterers(walk.joints, torch.ones(walk.joints.shape[:2]).double())
+    doppler = DopplerTimeMap(radar, window_s=0.15)
+    maps = doppler(RangeProfile(radar)(EchoSynthesizer(radar)(*scene)))
+    found = GaitEstimator(doppler.doppler_hz * radar.doppler_wavelength_m / 2, doppler.frame_rate_hz)(maps)
+    ankles = [walk.joints[0, :, JOINTS.index(f"{side}_ankle"), 1].numpy() for side in ("right", "left")]
+    gap = ankles[0] - ankles[1]
+    strides = np.abs(np.fft.rfft((gap - gap.mean()) * np.hanning(len(gap)), 1 << 17))
+    step_hz = 2 * np.fft.rfftfreq(1 << 17, 1 / radar.prf_hz)[strides.argmax()]
+    assert float(found.step_hz) == pytest.approx(step_hz, rel=0.05)
+    assert float(found.torso_m_s) == pytest.approx(speed_m_s, rel=0.25 if limbs else 0.45)  # bright points
 
 
 def test_two_sides_are_one():

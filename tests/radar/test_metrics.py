@@ -124,6 +124,18 @@ def test_percentile_envelope_is_differentiable():
     assert torch.autograd.gradcheck(lambda m: tuple(metrics.percentile_envelope(m, axis)), (x,))
 
 
+@pytest.mark.parametrize("scale", ["linear", "db"])
+def test_gradients_against_finite_differences(scale):
+    generator = torch.Generator().manual_seed(8)
+    a, b = (0.2 + torch.rand(12, 13, dtype=torch.float64, generator=generator) for _ in range(2))
+
+    def figures(x, y):
+        pairs = [figure(x, y, scale) for figure in (metrics.psnr, metrics.nmse, metrics.ssim)]
+        return *pairs, metrics.entropy(x)
+
+    assert torch.autograd.gradcheck(figures, (a.requires_grad_(), b.requires_grad_()), fast_mode=True)
+
+
 def test_envelope_rmse_of_a_shift_is_the_shift():
     axis = torch.linspace(-4, 4, 81).double()
     k = torch.arange(30)

@@ -12,7 +12,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.radar.iir import BLOCK, BlockFilter
 from tensorsim.radar.mti import MovingTargetIndicator
 from tests.radar import reference
-from tests.radar.scenes import SMALL
+from tests.radar.scenes import SMALL, complex_noise
 from tests.stage import StageTester
 
 FREE = RadarConfig.free_space()
@@ -22,12 +22,6 @@ METHODS = {
     "mean": {},
     "high-pass": {"radar": FREE, "cutoff_m_s": 0.5, "order": 3},
 }
-
-
-def noise(*shape, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(1)
-    x = torch.randn(*shape, dtype=torch.complex64, generator=generator)
-    return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64)
 
 
 def tone(doppler_hz, pulses, prf_hz=8192.0):
@@ -43,7 +37,7 @@ class TestTwoPulseCanceller(StageTester):
         return MovingTargetIndicator("two-pulse")
 
     def inputs(self, batch, dtype):
-        return (noise(*batch, 9, 6, dtype=dtype),)
+        return (complex_noise(*batch, 9, 6, dtype=dtype),)
 
     def bad_inputs(self):
         x = self.inputs((), torch.float32)[0]
@@ -72,7 +66,7 @@ class TestHighPass(TestTwoPulseCanceller):
         return MovingTargetIndicator("high-pass", SMALL, cutoff_m_s=0.3)
 
     def inputs(self, batch, dtype):
-        return (noise(*batch, 2 * BLOCK + 9, 3, dtype=dtype),)  # three blocks, the last one short
+        return (complex_noise(*batch, 2 * BLOCK + 9, 3, dtype=dtype),)  # three blocks, the last one short
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -146,7 +140,7 @@ def test_high_pass_is_butterworth(order, cutoff):
 @pytest.mark.parametrize("cutoff", [0.02, 0.2, 7.0])
 def test_high_pass_equals_sosfilt(order, cutoff):
     mti = MovingTargetIndicator("high-pass", FREE, cutoff_m_s=cutoff, order=order)
-    x = noise(1500, 2).to(torch.complex128) + (1000 - 300j)  # clutter 60 dB above
+    x = complex_noise(1500, 2).to(torch.complex128) + (1000 - 300j)  # clutter 60 dB above
     sos = signal.butter(order, 2 * cutoff / FREE.doppler_wavelength_m, "highpass", fs=8192, output="sos")
     expected = signal.sosfilt(sos, (x - x[:1]).numpy(), axis=0)
     np.testing.assert_allclose(mti(x), expected, atol=1e-9)
@@ -158,7 +152,7 @@ def test_high_pass_equals_sosfilt(order, cutoff):
 def test_block_filter_equals_torchaudio():
     lfilter = pytest.importorskip("torchaudio").functional.lfilter
     sections = torch.as_tensor(signal.butter(2, 0.1, "highpass", output="sos"))
-    x = noise(300, 4).real[None].double()
+    x = complex_noise(300, 4).real[None].double()
     expected = lfilter(x.transpose(1, 2), sections[0, 3:], sections[0, :3], clamp=False).transpose(1, 2)
     np.testing.assert_allclose(BlockFilter(sections)(x), expected, atol=1e-10)
 
@@ -176,7 +170,7 @@ def test_static_scene_vanishes_and_lengths(method):
 
 
 def test_differences_are_binomial():
-    x = noise(30, 3)
+    x = complex_noise(30, 3)
     actual = MovingTargetIndicator("n-pulse", pulses=4)(x)
     weights = np.array([1, -3, 3, -1])  # of the latest pulse first
     expected = np.stack([np.convolve(column, weights, "valid") for column in x.numpy().T], -1)

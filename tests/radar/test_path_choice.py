@@ -12,29 +12,17 @@ from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.echo import EchoSynthesizer
 from tests.radar import reference
-from tests.radar.scenes import SMALL, swinging, tensors
-from tests.stage import StageTester, assert_same
+from tests.radar.scenes import SMALL, SceneCase, swinging, tensors
+from tests.stage import assert_same
 
 THROUGH = RadarConfig.through_wall()
 BETWEEN = WallConfig(center_m=(0.0, 3.1, 1.5))  # some scatterers in front, some behind
 FLOOR = FloorConfig()
 
 
-class TestEchoWithFloor(StageTester):
-    batched_arguments = (0, 1)
-    gradient_arguments = (0, 1)
-
+class TestEchoWithFloor(SceneCase):
     def make(self):
         return EchoSynthesizer(SMALL, WallConfig((0, 3, 1.5)), multipath=True, floor=FLOOR, pulse_chunk=12)
-
-    def inputs(self, batch, dtype):
-        count = math.prod(batch)
-        p = np.stack([swinging(7, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 7, 3, 3)
-        return tensors(p, np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)).astype(np.float32), dtype)
-
-    def bad_inputs(self):
-        p, rcs = self.inputs((), torch.float32)
-        return [((p, -rcs), "expected no negative"), ((p[..., :2], rcs), "positions: got shape")]
 
 
 def scene(pulses=5, scatterers=4, radar=THROUGH):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig, WallConfig
+from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import (
     PRESETS,
@@ -52,8 +52,8 @@ def test_presets_stay_within_the_data_sheet(name: str) -> None:
 
 
 def test_the_papers_scenes() -> None:
-    assert PRESETS["free-space"] == (RadarConfig.free_space(), None)
-    assert PRESETS["through-wall"] == (RadarConfig.through_wall(), WallConfig())
+    assert PRESETS["free-space"] == RadarScene(RadarConfig.free_space())
+    assert PRESETS["through-wall"] == RadarScene(RadarConfig.through_wall(), WallConfig())
 
 
 def test_cw_sensor_has_160_hz_per_metre_per_second_and_one_range_bin() -> None:
@@ -104,7 +104,8 @@ def test_fields_wall_and_defaults(tmp_path: Path) -> None:
           size_m: [3, 0.1, 2.5]
         """,
     )
-    radar, wall = load_scene_yaml(path)
+    radar, wall, floor = load_scene_yaml(path)
+    assert floor is None
     assert radar == RadarConfig(24e9, 250e6, 256e-6, 2000.0, 250e3, rx_m=(0.02, 0.0, 1.0))
     assert wall == WallConfig(relative_permittivity=4.5, size_m=(3.0, 0.1, 2.5))
     assert load_radar_yaml(str(path)) == radar
@@ -128,7 +129,14 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
 def test_round_trip_of_numbers_that_decimals_do_not_hold(tmp_path: Path) -> None:
     radar = RadarConfig(carrier_hz=77e9 / 3, tx_m=(1 / 3, 0.1, 2 / 7), chirp_s=1e-4 / 3)
     save_radar_yaml(tmp_path / "r.yaml", radar, WallConfig(loss_tangent=1 / 7))
-    assert load_scene_yaml(tmp_path / "r.yaml") == (radar, WallConfig(loss_tangent=1 / 7))
+    assert load_scene_yaml(tmp_path / "r.yaml") == RadarScene(radar, WallConfig(loss_tangent=1 / 7))
+
+
+def test_floor_section(tmp_path: Path) -> None:
+    scene = load_scene_yaml(written(tmp_path, "wall: {}\nfloor: {reflection: -5e-1}\nprf_hz: 4096\n"))
+    assert scene == RadarScene(RadarConfig(prf_hz=4096.0), WallConfig(), FloorConfig(reflection=-0.5))
+    scene = load_scene_yaml(written(tmp_path, "floor: {reflection: null, relative_permittivity: 3}\n"))
+    assert scene == RadarScene(RadarConfig(), None, FloorConfig(relative_permittivity=3.0))
 
 
 def test_several_receivers_become_tuples(tmp_path: Path) -> None:
@@ -145,7 +153,7 @@ def test_several_receivers_become_tuples(tmp_path: Path) -> None:
             "wall: {permittivity: 4}",
             r"yaml: wall: got the key 'permittivity'.* perhaps 'relative_permittivity'",
         ),
-        ("zzz: 1", r"got the key 'zzz', expected one of carrier_hz, .*, wall$"),
+        ("zzz: 1", r"got the key 'zzz', expected one of carrier_hz, .*, wall, floor$"),
         ("1: 2", r"got the key 1, expected"),
         ("carrier_hz: 77 GHz", r"yaml: carrier_hz: got '77 GHz', expected a number"),
         ("carrier_hz: true", r"carrier_hz: got True, expected a number"),
@@ -160,6 +168,10 @@ def test_several_receivers_become_tuples(tmp_path: Path) -> None:
         ("wall: {relative_permittivity: 0.5}", r"yaml: wall: WallConfig.relative_permittivity: got 0.5"),
         ("wall:", r"yaml: wall: got None, expected keys with values"),
         ("wall: 6", r"wall: got 6, expected keys"),
+        ("floor: concrete", r"yaml: floor: got 'concrete', expected keys"),
+        ("floor: {reflection: -2}", r"yaml: floor: FloorConfig.reflection: got -2"),
+        ("floor: {reflection: much}", r"yaml: floor: reflection: got 'much', expected a number"),
+        ("floor: {permittivity: 4}", r"yaml: floor: got the key 'permittivity'"),
         ("radar: {}\nprf_hz: 4096", r"got prf_hz beside the section radar"),
         ("- 1\n- 2", r"yaml: got \[1, 2\], expected keys"),
         ("", r"yaml: got None, expected keys"),
@@ -185,13 +197,12 @@ def test_refuses_what_is_no_text_and_no_file(tmp_path: Path) -> None:
 
 def test_every_field_can_be_set_from_a_file(tmp_path: Path) -> None:
     """Also those that come later."""
-    for config in (RadarConfig(), WallConfig()):
-        names = {field.name for field in dataclasses.fields(config)}
-        radar, wall = (config, None) if isinstance(config, RadarConfig) else (RadarConfig(), config)
-        save_radar_yaml(tmp_path / "all.yaml", radar, wall)
-        assert load_scene_yaml(tmp_path / "all.yaml") == (radar, wall)
-        text = (tmp_path / "all.yaml").read_text()
-        assert all(f"{name}:" in text for name in names)
+    scene = RadarScene(RadarConfig(), WallConfig(), FloorConfig())
+    save_radar_yaml(tmp_path / "all.yaml", *scene)
+    assert load_scene_yaml(tmp_path / "all.yaml") == scene
+    text = (tmp_path / "all.yaml").read_text()
+    for config in scene:
+        assert all(f"{field.name}:" in text for field in dataclasses.fields(config))
 
 
 def test_yaml_is_imported_on_use() -> None:

@@ -10,18 +10,12 @@ from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.range_profile import RangeProfile
+from tensorsim.radar.range_profile import FollowingGate, RangeProfile
 from tests.radar import reference
-from tests.radar.scenes import SMALL
+from tests.radar.scenes import SMALL, complex_noise
 from tests.stage import StageTester
 
 FREE = RadarConfig.free_space()
-
-
-def noise(*shape, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(1)
-    x = torch.randn(*shape, dtype=torch.complex64, generator=generator)
-    return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64)
 
 
 class TestRangeProfile(StageTester):
@@ -29,7 +23,7 @@ class TestRangeProfile(StageTester):
         return RangeProfile(SMALL)
 
     def inputs(self, batch, dtype):
-        return (noise(*batch, 5, 24, dtype=dtype),)
+        return (complex_noise(*batch, 5, 24, dtype=dtype),)
 
     def bad_inputs(self):
         x = self.inputs((), torch.float32)[0]
@@ -41,9 +35,24 @@ class TestRangeProfile(StageTester):
         ]
 
 
+class TestFollowingGate(StageTester):
+    batched_arguments = (0, 1, 2)
+
+    def make(self):
+        return FollowingGate(SMALL, RangeProfile(SMALL).range_m, 0.8)
+
+    def inputs(self, batch, dtype):
+        targets = complex_noise(*batch, 5, 3, 3, dtype=dtype, seed=2).real + torch.tensor([0.0, 1.5, 1.5])
+        rcs = complex_noise(*batch, 5, 3, dtype=dtype, seed=3).abs()
+        return complex_noise(*batch, 5, 12, dtype=dtype), targets.to(dtype), rcs
+
+    def bad_inputs(self):
+        return []  # it stands behind the stages that have checked
+
+
 @pytest.mark.parametrize("window", ["hamming", None])
 def test_profile_equals_numpy(window):
-    x = noise(7, 400)
+    x = complex_noise(7, 400)
     actual = RangeProfile(FREE, window)(x)
     assert actual.shape == (7, 200)
     assert actual.dtype == torch.complex64

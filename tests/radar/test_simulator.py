@@ -17,17 +17,16 @@ from tensorsim.radar.mti import MovingTargetIndicator
 from tensorsim.radar.ridges import RidgeExtractor
 from tensorsim.radar.simulator import RadarSimulator
 from tests.radar import reference
-from tests.radar.scenes import SMALL, joint_rcs, recorded_walk, swinging, tensors
-from tests.stage import StageTester, assert_same
+from tests.radar.scenes import SMALL, SceneCase, joint_rcs, recorded_walk, swinging, tensors
+from tests.stage import assert_same
 
 FREE = RadarConfig.free_space()
 THROUGH = RadarConfig.through_wall()
 SCENES = {"free space": (FREE, None), "through wall": (THROUGH, WallConfig())}
 
 
-class TestRadarSimulator(StageTester):
-    batched_arguments = (0, 1)
-    gradient_arguments = (0, 1)
+class TestRadarSimulator(SceneCase):
+    pulses = 35
 
     def make(self):
         wall = WallConfig(center_m=(0.0, 3.0, 1.5))
@@ -42,25 +41,9 @@ class TestRadarSimulator(StageTester):
             pulse_chunk=8,
         )
 
-    def inputs(self, batch, dtype):
-        count = math.prod(batch)
-        p = np.stack([swinging(35, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 35, 3, 3)
-        rcs = np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)).astype(np.float32)
-        return tensors(p, rcs, dtype)
-
     def bad_inputs(self):
         p, rcs = self.inputs((), torch.float32)
-        hole = p.clone()
-        hole[2, 1, 0] = float("nan")
-        return [
-            ((p[:26], rcs), "got 26 pulses, expected at least 27"),
-            ((p[:0], rcs), "at least one pulse"),
-            ((p[0], rcs), "positions: got shape"),
-            ((p, rcs[:2]), "rcs: got shape"),
-            ((p, -rcs), "no negative"),
-            ((hole, rcs), "NaN"),
-            ((p.long(), rcs), "positions: got dtype"),
-        ]
+        return [*super().bad_inputs(), ((p[:26], rcs), "got 26 pulses, expected at least 27")]
 
     def test_gradients_against_finite_differences(self):
         """With noise of one seed: a magnitude map without a noise floor has kinks, where it is next to zero."""
@@ -81,7 +64,7 @@ class TestSimulatorInFreeSpace(TestRadarSimulator):
         return RadarSimulator(SMALL, snr_db=None, mti="mean", integration="paper", display_rate_hz=50.0)
 
     def bad_inputs(self):
-        return TestRadarSimulator.bad_inputs(self)[1:]
+        return SceneCase.bad_inputs(self)
 
 
 @pytest.mark.parametrize("scene", SCENES)

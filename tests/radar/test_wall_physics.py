@@ -11,10 +11,10 @@ from tensorsim.config import RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.paths import LEARNABLE
+from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.wall import airy, fresnel, refracted_leg, slab_coefficients, wall_tensors
 from tests.radar import reference
-from tests.radar.scenes import SMALL, swinging, tensors
-from tests.stage import StageTester
+from tests.radar.scenes import SMALL, SceneCase, swinging, tensors
 
 THROUGH = RadarConfig.through_wall()
 WALL = WallConfig()
@@ -25,23 +25,12 @@ def f64(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-class ObliqueCase(StageTester):
-    batched_arguments = (0, 1)
-    gradient_arguments = (0, 1)
+class ObliqueCase(SceneCase):
     options: dict = {}  # noqa: RUF012
 
     def make(self):
         wall = WallConfig(center_m=(0.0, 2.2, 1.5))
         return EchoSynthesizer(SMALL, wall, multipath=True, wall_echo=True, pulse_chunk=16, **self.options)
-
-    def inputs(self, batch, dtype):
-        count = math.prod(batch)
-        p = np.stack([swinging(7, 3, 256.0, seed=i) for i in range(count)]).reshape(*batch, 7, 3, 3)
-        return tensors(p, np.random.default_rng(1).uniform(0.1, 1.0, (*batch, 3)).astype(np.float32), dtype)
-
-    def bad_inputs(self):
-        p, rcs = self.inputs((), torch.float32)
-        return [((p, -rcs), "expected no negative"), ((p[..., :2], rcs), "positions: got shape")]
 
 
 class TestObliqueEcho(ObliqueCase):
@@ -209,6 +198,23 @@ def test_gradient_by_each_constant(name, incidence):
     value = getattr(module.paths, name).detach().clone().requires_grad_()
     assert torch.autograd.gradcheck(echo, (value,), eps=1e-7, atol=1e-6, rtol=1e-3)
     assert float(torch.autograd.grad(echo(value).square().sum(), value)[0].abs().max()) > 0
+
+
+@pytest.mark.parametrize("name", LEARNABLE)
+def test_gradient_of_the_maps_by_each_constant(name):
+    """Profiles and Doppler-time map, with noise of one seed: without a floor, magnitudes have kinks."""
+    echo = EchoSynthesizer(SMALL, WallConfig((0, 1, 1)), multipath=True, learnable=(name,))
+    simulator = RadarSimulator(SMALL, echo=echo, snr_db=10.0).double()
+    p, rcs = tensors(swinging(35, 2, SMALL.prf_hz), np.ones(2))
+
+    def maps(value):
+        torch.manual_seed(0)
+        found = torch.func.functional_call(simulator, {f"echo.paths.{name}": value}, (p, rcs))
+        return found.range_time, found.doppler_time
+
+    value = getattr(echo.paths, name).detach().clone().requires_grad_()
+    assert torch.autograd.gradcheck(maps, (value,), eps=1e-7, atol=1e-6, rtol=1e-3, fast_mode=True)
+    assert float(torch.autograd.grad(maps(value)[1].sum(), value)[0].abs().max()) > 0
 
 
 def test_constants_are_buffers_unless_learnable():
