@@ -5,7 +5,7 @@ FMCW echo -> range-time -> Doppler-time -> ridges. ``VideoToDoppler`` is the who
 and ``enhance`` hold the stages.
 """
 
-from tensorsim import enhance, export, motion, radar, vision
+from tensorsim import data, enhance, export, motion, radar, recognition, vision
 from tensorsim.config import (
     ACTIVITIES,
     COCO_KEYPOINTS,
@@ -16,8 +16,8 @@ from tensorsim.config import (
     WallConfig,
 )
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.pipeline import PoseToDoppler, VideoToDoppler, VideoToPose
-from tensorsim.types import Detections, Pose, RadarMaps, Simulation, Tracks
+from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
+from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
 
 __version__ = "0.1.0"
 
@@ -32,16 +32,20 @@ __all__ = [
     "PoseToDoppler",
     "RadarConfig",
     "RadarMaps",
+    "Recognition",
     "Simulation",
     "TensorsimError",
     "TensorsimWarning",
     "Tracks",
+    "VideoToActivity",
     "VideoToDoppler",
     "VideoToPose",
     "WallConfig",
+    "data",
     "enhance",
     "export",
     "motion",
     "radar",
+    "recognition",
     "vision",
 ]

@@ -5,7 +5,10 @@ same interface. ``forward`` works on whole clips in memory and scripts; the meth
 that a long film can be streamed through them piece by piece (see ``tensorsim.cli``).
 """
 
+import os
 import warnings
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,11 +19,16 @@ from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.radar.simulator import RadarSimulator
-from tensorsim.types import Detections, Pose, RadarMaps, Simulation, Tracks
+from tensorsim.recognition.recognizer import ActivityRecognizer
+from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
 from tensorsim.vision.along_time import brief_gaps
+from tensorsim.vision.cpm import CPM
+from tensorsim.vision.hrnet import HRNet
 from tensorsim.vision.kalman import KalmanSmoother
 from tensorsim.vision.lifter import NearestPoseLifter
 from tensorsim.vision.metric_pose import MetricPose
+from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.rtmdet import RTMDet
 from tensorsim.vision.skeleton import coco_to_body
 from tensorsim.vision.topdown import TopDownPose
 from tensorsim.vision.tracker import GNNTracker
@@ -309,8 +317,8 @@ class VideoToDoppler(nn.Module):
 
     def __init__(
         self,
-        detector: nn.Module,
-        pose: nn.Module,
+        detector: nn.Module | None = None,
+        pose: nn.Module | None = None,
         radar: RadarConfig | None = None,
         wall: WallConfig | None = None,
         multipath: bool = False,
@@ -326,10 +334,13 @@ class VideoToDoppler(nn.Module):
         pose_to_doppler: PoseToDoppler | None = None,
     ) -> None:
         super().__init__()
-        self.video_to_pose = (
-            video_to_pose
-            if video_to_pose is not None
-            else VideoToPose(
+        if video_to_pose is None:
+            if detector is None or pose is None:
+                raise TensorsimError(
+                    "VideoToDoppler: got no detector or no pose network, expected both, or video_to_pose; "
+                    "VideoToDoppler.from_pretrained() takes the shipped ones"
+                )
+            video_to_pose = VideoToPose(
                 detector,
                 pose,
                 person_height_m=person_height_m,
@@ -337,7 +348,7 @@ class VideoToDoppler(nn.Module):
                 camera=camera,
                 detection_interval=detection_interval,
             )
-        )
+        self.video_to_pose = video_to_pose
         self.pose_to_doppler = (
             pose_to_doppler
             if pose_to_doppler is not None
@@ -353,6 +364,24 @@ class VideoToDoppler(nn.Module):
                 denoiser=denoiser,
             )
         )
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        detector: str | os.PathLike[str] | None = None,
+        pose: str | os.PathLike[str] | None = None,
+        **options: Any,
+    ) -> "VideoToDoppler":
+        """The whole with trained networks, in evaluation mode.
+
+        Args:
+            detector, pose: paths or names of ``tensorsim models list``; None: the shipped weights.
+            **options: further arguments of the constructor.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network.
+        """
+        return cls(RTMDet.from_pretrained(detector), heatmap_network(pose), **options).eval()
 
     def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Simulation:
         """Simulate what the radar sees of clips.
@@ -382,6 +411,94 @@ class VideoToDoppler(nn.Module):
             maps.ridge_magnitudes,
             maps.snr_db,
         )
+
+
+class VideoToActivity(nn.Module):
+    """Video -> maps -> activity, as one graph: :class:`VideoToDoppler` and a recognizer of its maps.
+
+    A clip shows one activity of about four seconds, as the recognizer was trained on; its people are one scene.
+
+    Args:
+        video_to_doppler: frames to maps.
+        recognizer: :class:`RadarMaps` -> logits (B, classes); see :class:`tensorsim.recognition.ActivityRecognizer`.
+
+    Example:
+        >>> sim = ts.VideoToActivity.from_pretrained()
+        >>> label = ts.ACTIVITIES[int(sim(video, fps).logits[0].argmax())]
+    """
+
+    def __init__(self, video_to_doppler: VideoToDoppler, recognizer: nn.Module) -> None:
+        super().__init__()
+        self.video_to_doppler = video_to_doppler
+        self.recognizer = recognizer
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        detector: str | os.PathLike[str] | None = None,
+        pose: str | os.PathLike[str] | None = None,
+        classifier: str | os.PathLike[str] | None = None,
+        radar: RadarConfig | None = None,
+        **options: Any,
+    ) -> "VideoToActivity":
+        """The whole with trained networks, in evaluation mode.
+
+        Args:
+            detector, pose, classifier: paths or names of ``tensorsim models list``; None: the shipped weights.
+            radar, **options: further arguments of :class:`VideoToDoppler`.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network.
+        """
+        radar = radar if radar is not None else RadarConfig.free_space()
+        return cls(
+            VideoToDoppler.from_pretrained(detector, pose, radar=radar, **options),
+            ActivityRecognizer.from_pretrained(radar, classifier),
+        ).eval()
+
+    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Recognition:
+        """Clips (B, T, 3, H, W) to people, maps and logits; arguments and errors of :class:`VideoToDoppler`."""
+        found = self.video_to_doppler(video, fps, lengths)
+        logits = self.recognizer(
+            RadarMaps(
+                found.range_time,
+                found.range_time_mti,
+                found.doppler_time,
+                found.ridges,
+                found.ridge_magnitudes,
+                found.snr_db,
+            )
+        )
+        return Recognition(
+            found.boxes,
+            found.keypoints,
+            found.keypoint_scores,
+            found.joints,
+            found.valid,
+            found.range_time,
+            found.range_time_mti,
+            found.doppler_time,
+            found.ridges,
+            found.ridge_magnitudes,
+            found.snr_db,
+            logits,
+        )
+
+
+def heatmap_network(source: str | os.PathLike[str] | None = None) -> nn.Module:
+    """The pose network of a file or name: an ``.onnx`` runs in ONNX Runtime; others are CPM or HRNet.
+
+    Args:
+        source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
+
+    Raises:
+        TensorsimError: no such file or name, or weights of another network.
+    """
+    if source is not None and Path(source).suffix == ".onnx":
+        return OnnxHeatmaps(source)
+    if source is not None and "cpm" in Path(source).name:
+        return CPM.from_pretrained(source)
+    return HRNet.from_pretrained(source)
 
 
 def warn_of_empty_clips(valid: Tensor) -> None:

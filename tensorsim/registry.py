@@ -196,46 +196,47 @@ def cache_dir() -> Path:
     return Path(torch.hub.get_dir()) / "tensorsim"
 
 
-def find(name: str, network: str | None = None) -> ModelEntry:
-    """The entry of this name.
+def find(name: str, *networks: str) -> ModelEntry:
+    """The entry of this name, of one of these networks if any are named.
 
     Raises:
-        TensorsimError: no such name; it lists those of the network, and the nearest.
+        TensorsimError: no such name; it lists those of the networks, and the nearest.
     """
     import difflib
 
-    known = {entry.name: entry for entry in entries() if network in (None, entry.network)}
+    known = {entry.name: entry for entry in entries() if not networks or entry.network in networks}
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"; did you mean {near[0]}?" if near else ""
-    what = "weights" if network is None else f"weights of {network}"
+    what = f"weights of {' or '.join(networks)}" if networks else "weights"
     raise TensorsimError(
         f"{what}: got {name!r}, expected a path or one of: {', '.join(sorted(known)) or 'none'}{hint}"
     )
 
 
-def locate(source: str | os.PathLike[str] | None, network: str) -> Path:
+def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
     """Path of the weights that ``from_pretrained`` was asked for, fetched if need be.
 
     Args:
         source: a path (anything with a suffix or a folder in it, or an existing file), the name of an entry, or None
             for the shipped weights.
-        network: name of the class that asks.
+        networks: names of the classes that ask; of shipped weights, those of the first that has any are taken.
 
     Raises:
         TensorsimError: no such name, no such shipped weights, or it cannot be fetched; a path is returned as it is,
             also if nothing is there.
     """
     if source is None:
-        own = [entry for entry in shipped() if entry.network == network and entry.default]
-        if not own:
-            raise TensorsimError(f"{network}: no weights are shipped, expected a path or a name")
-        return own[0].path
+        defaults = {entry.network: entry for entry in shipped() if entry.default}
+        for network in networks:
+            if network in defaults:
+                return defaults[network].path
+        raise TensorsimError(f"{' or '.join(networks)}: no weights are shipped, expected a path or a name")
     path = Path(source)
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path
-    return fetch(find(str(source), network))
+    return fetch(find(str(source), *networks))
 
 
 def fetch(entry: ModelEntry, quiet: bool = False) -> Path:

@@ -125,3 +125,24 @@ class Simulation(NamedTuple):
     ridges: Tensor
     ridge_magnitudes: Tensor
     snr_db: Tensor
+
+
+class Recognition(NamedTuple):
+    """Everything :class:`tensorsim.VideoToActivity` makes of clips: the fields of Simulation, then the label.
+
+    Attributes:
+        logits: (B, classes) in the order of ``tensorsim.ACTIVITIES``.
+    """
+
+    boxes: Tensor
+    keypoints: Tensor
+    keypoint_scores: Tensor
+    joints: Tensor
+    valid: Tensor
+    range_time: Tensor
+    range_time_mti: Tensor
+    doppler_time: Tensor
+    ridges: Tensor
+    ridge_magnitudes: Tensor
+    snr_db: Tensor
+    logits: Tensor

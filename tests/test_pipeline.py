@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 import tensorsim as ts
-from tensorsim.pipeline import PoseToDoppler, VideoToDoppler, VideoToPose
+from tensorsim.errors import TensorsimError
+from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
 
@@ -93,6 +94,27 @@ class TestVideoToDoppler(StageTester):
             ((video, math.nan), "fps: got nan"),
             ((video, fps, torch.tensor([0, 8])), "expected 2 counts from 1 to 8"),
         ]
+
+
+class TestVideoToActivity(TestVideoToDoppler):
+    def make(self) -> VideoToActivity:  # type: ignore[override]
+        torch.manual_seed(0)
+        recognizer = ts.recognition.ActivityRecognizer(RADAR, ts.recognition.SPGNet(), size=32)
+        return VideoToActivity(pipeline(wall=ts.WallConfig()), recognizer).eval()
+
+
+def test_activity_adds_logits_to_the_simulation() -> None:
+    graph, clips = TestVideoToActivity().make(), two_clips()
+    found, simulation = graph(clips, FPS), graph.video_to_doppler(clips, FPS)
+    assert found._fields == (*simulation._fields, "logits")
+    assert_same(tuple(found[:-1]), tuple(simulation))
+    assert found.logits.shape == (2, len(ts.ACTIVITIES))
+    assert not torch.equal(found.logits[0], found.logits[1])
+
+
+def test_networks_must_be_given_or_replaced() -> None:
+    with pytest.raises(TensorsimError, match=r"got no detector.*VideoToDoppler\.from_pretrained\(\)"):
+        VideoToDoppler(RectangleDetector())
 
 
 def test_a_person_who_walks_away_is_where_they_are_and_recedes() -> None:

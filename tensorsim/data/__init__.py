@@ -1,1 +1,19 @@
-"""Video in, results out."""
+"""Video in, synthetic people, motion files, results out."""
+
+from tensorsim.data.camera import camera_on
+from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
+from tensorsim.data.render import PersonRenderer, RenderedVideo
+from tensorsim.data.video import VideoReader, write_video
+
+__all__ = [
+    "Keypoints2D",
+    "Motion",
+    "PersonRenderer",
+    "RenderedVideo",
+    "VideoReader",
+    "camera_on",
+    "load_coco_keypoints",
+    "load_motion",
+    "place",
+    "write_video",
+]

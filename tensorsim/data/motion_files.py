@@ -72,11 +72,13 @@ class Keypoints2D(NamedTuple):
         keypoints: (T, P, 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
         scores: (T, P, 17); 0 where a keypoint was not labelled.
         valid: (T, P) bool, whether the person is in that frame.
+        size: (height, width) of the frames in pixels; None where the file does not say.
     """
 
     keypoints: Tensor
     scores: Tensor
     valid: Tensor
+    size: tuple[int, int] | None = None
 
 
 def load_motion(
@@ -218,6 +220,7 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     path = Path(path)
     files = sorted(path.glob("*.json")) if path.is_dir() else [path]
     people: dict[Any, list[dict[str, Any]]] = {}
+    size = None
     for number, file in enumerate(files):
         try:
             content = json.loads(file.read_text())
@@ -226,6 +229,8 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
         whole = isinstance(content, dict)
         for image in content.get("images", []) if whole else []:
             people.setdefault(number if path.is_dir() else image["id"], [])
+            if "height" in image and "width" in image:
+                size = (int(image["height"]), int(image["width"]))
         people.setdefault(number, []) if path.is_dir() else None
         for person in content.get("annotations", []) if whole else content:
             if not isinstance(person, dict) or len(person.get("keypoints", [])) != 51:
@@ -249,7 +254,7 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     scores = data[..., 2]
     if bool((scores == scores.round()).all()) and float(scores.max()) <= 2:
         scores = (scores > 0).float()
-    return Keypoints2D(data[..., :2], scores, valid)
+    return Keypoints2D(data[..., :2], scores, valid, size)
 
 
 def _plain(name: str) -> str:

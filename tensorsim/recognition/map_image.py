@@ -1,0 +1,178 @@
+"""From a radar map to the picture that a classifier sees: resampled in power, cut to a span, on a scale of [0, 1]."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import RadarConfig
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_positive,
+    check_size,
+    is_exporting,
+)
+
+SCALES = ("db", "linear")
+
+
+def area_weights(start: Tensor, width: float, low: float, high: float, size: int) -> Tensor:
+    """Matrix (size, N) that averages N cells over ``size`` equal pixels between ``low`` and ``high``.
+
+    Cell n covers ``start[n]`` to ``start[n] + width``. Row i holds the shares of pixel i that the cells cover, divided
+    by their sum; a pixel beyond all cells has a row of zeros.
+    """
+    pixel = (high - low) / size
+    left = low + pixel * torch.arange(size, dtype=start.dtype, device=start.device).unsqueeze(-1)
+    overlap = torch.minimum(left + pixel, start + width) - torch.maximum(left, start)
+    # Rounding leaves overlaps of 1e-16 pixels, which a division by their own sum would make a whole one.
+    share = torch.where(overlap > 1e-9 * pixel, overlap, torch.zeros_like(overlap))
+    total = share.sum(-1, keepdim=True)
+    return share / torch.where(total > 0, total, torch.ones_like(total))
+
+
+def scaled(power: Tensor, scale: str, range_db: float) -> Tensor:
+    """Power (..., H, W) as pixels in [0, 1], each picture against its own peak; one of zeros stays 0.
+
+    ``"linear"``: magnitude over peak. ``"db"``: decibels below the peak, ``range_db`` and more below it is 0.
+    """
+    peak = power.amax((-2, -1), keepdim=True)
+    level = power / torch.where(peak > 0, peak, torch.ones_like(peak))
+    if scale == "linear":
+        # The root of 0 has no gradient; 1e-20 is 200 dB down.
+        return torch.where(level > 1e-20, level.clamp_min(1e-20).sqrt(), torch.zeros_like(level))
+    return 1 + 10 * level.clamp_min(10 ** (-range_db / 10)).log10() / range_db
+
+
+class MapToImage(nn.Module):
+    """Magnitude maps to pictures for a classifier.
+
+    Every pixel is the mean power of the part of the map that it covers, so a picture does not depend on how finely
+    the map was sampled. Row 0 is the lowest value of the axis (positive speed = approaching), column 0 the first
+    instant; all columns of the map are spread over the width of the picture.
+
+    Args:
+        axis: (F,) value of each bin, ascending in equal steps; each bin covers a step around its value.
+        span: (low, high) of the axis that the picture shows. What lies beyond the axis is 0.
+        size: height and width in pixels.
+        scale, range_db: see :func:`scaled`.
+
+    Shapes: map (..., F, K) magnitude -> picture (..., 1, size, size) in [0, 1]. Differentiable.
+
+    Example:
+        >>> MapToImage.doppler(radar)(maps.doppler_time)
+        >>> torch.cat([MapToImage.range(radar)(maps.range_time_mti), doppler_image], dim=-3)  # merged, 2 channels
+
+    Raises:
+        TensorsimError: an axis that does not ascend, a span without width, a size below 1, an unknown scale; a map
+            without F rows, with negative values, or NaN.
+    """
+
+    rows: Tensor
+
+    def __init__(
+        self,
+        axis: Tensor,
+        span: tuple[float, float],
+        size: int = 224,
+        scale: str = "db",
+        range_db: float = 40.0,
+    ) -> None:
+        super().__init__()
+        if axis.dim() != 1 or axis.shape[0] < 2 or not bool((axis.diff() > 0).all()):
+            raise TensorsimError(
+                f"MapToImage.axis: got shape {list(axis.shape)}, expected (F,) ascending, F at least 2"
+            )
+        low, high = span
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise TensorsimError(
+                f"MapToImage.span: got {span}, expected two finite numbers, the lower one first"
+            )
+        if size < 1:
+            raise TensorsimError(f"MapToImage.size: got {size}, expected at least 1")
+        if scale not in SCALES:
+            raise TensorsimError(f"MapToImage.scale: got {scale!r}, expected one of {SCALES}")
+        check_positive(range_db, "MapToImage.range_db")
+        self.size, self.scale, self.range_db = size, scale, range_db
+        step = float(axis[-1] - axis[0]) / (axis.shape[0] - 1)
+        rows = area_weights(axis.double() - step / 2, step, low, high, size)
+        self.register_buffer("rows", rows, persistent=False)
+
+    @classmethod
+    def doppler(
+        cls,
+        radar: RadarConfig,
+        bins: int | None = None,
+        speed_m_s: float = 3.8,
+        size: int = 224,
+        scale: str = "db",
+        range_db: float = 40.0,
+    ) -> "MapToImage":
+        """For Doppler-time maps of ``bins`` rows, showing radial speeds up to ``speed_m_s`` either way.
+
+        The span is in speed so that radars of different carriers show alike; 3.8 m/s is what the through-wall preset
+        can tell apart. ``bins`` None is what ``DopplerTimeMap`` makes of its default window.
+        """
+        if bins is None:
+            bins = 1 << (max(round(0.1 * radar.prf_hz), 256) - 1).bit_length()
+        step = radar.prf_hz / bins * radar.doppler_wavelength_m / 2
+        axis = (torch.arange(bins, dtype=torch.float64) - bins // 2) * step
+        return cls(axis, (-speed_m_s, speed_m_s), size, scale, range_db)
+
+    @classmethod
+    def range(
+        cls,
+        radar: RadarConfig,
+        farthest_m: float = 7.5,
+        size: int = 224,
+        scale: str = "db",
+        range_db: float = 40.0,
+    ) -> "MapToImage":
+        """For range-time maps of all range bins of a radar, showing ranges up to ``farthest_m``."""
+        axis = torch.arange(radar.samples_per_chirp // 2, dtype=torch.float64) * radar.range_resolution_m
+        return cls(axis, (0.0, farthest_m), size, scale, range_db)
+
+    @torch.jit.export
+    def average(self, power: Tensor) -> Tensor:
+        """Mean of each pixel's part of (..., F, K): (..., size, size)."""
+        frames = power.shape[-1]
+        start = torch.arange(frames, dtype=torch.float64, device=power.device)
+        columns = area_weights(start, 1.0, 0.0, float(frames), self.size).to(power.dtype)
+        return torch.matmul(torch.matmul(self.rows.to(power.dtype), power), columns.transpose(0, 1))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Magnitudes (..., F, K) to pictures (..., 1, size, size)."""
+        layout = f"(..., {self.rows.shape[1]} bins, frames)"
+        check_floating(maps, "MapToImage")
+        check_min_rank(maps, 2, "MapToImage", layout)
+        check_size(maps, -2, self.rows.shape[1], "MapToImage", layout)
+        check_not_empty(maps, "MapToImage")
+        check_finite(maps, "MapToImage")
+        if not is_exporting() and bool((maps < 0).any()):
+            raise TensorsimError("MapToImage: got negative values, expected magnitudes")
+        return scaled(self.average(maps.square()), self.scale, self.range_db).unsqueeze(-3)
+
+
+def ridge_map(indices: Tensor, magnitudes: Tensor, bins: int) -> Tensor:
+    """A Doppler-time map with nothing but ridges: bins and magnitudes (..., C, K) -> (..., ``bins``, K).
+
+    Where two ridges meet the larger counts. Differentiable by the magnitudes.
+
+    Raises:
+        TensorsimError: shapes that differ, or bins outside of the map.
+    """
+    if indices.shape != magnitudes.shape or indices.dim() < 2:
+        raise TensorsimError(
+            f"ridge_map: got shapes {list(indices.shape)} and {list(magnitudes.shape)}, expected both (..., C, K)"
+        )
+    if not is_exporting() and bool(((indices < 0) | (indices >= bins)).any()):
+        raise TensorsimError(f"ridge_map: got bins outside of 0 to {bins - 1}")
+    shape = list(magnitudes.shape)
+    shape[-2] = bins
+    return torch.zeros(shape, dtype=magnitudes.dtype, device=magnitudes.device).scatter_reduce(
+        -2, indices, magnitudes, "amax"
+    )

@@ -1,0 +1,191 @@
+"""SPNet: six parallel branches of convolutions, three times over, from a picture of a radar map to an activity.
+
+Source: RadHARSimulator V2 (arXiv 2511.09022) and the layer list that its author published. That list has no
+activation at all, so that in evaluation it is an affine map of the pixels; ``activation="none"`` builds it to the
+letter, the default has ReLU where the field puts it.
+"""
+
+import os
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_not_empty
+
+
+def check_pictures(pictures: Tensor, channels: int, name: str) -> None:
+    """Refuse anything but finite real pictures (..., ``channels``, H, W)."""
+    check_floating(pictures, name)
+    if pictures.dim() < 3 or pictures.shape[-3] != channels:
+        raise TensorsimError(
+            f"{name}: got shape {list(pictures.shape)}, expected (..., {channels} channels, height, width)"
+        )
+    check_not_empty(pictures, name)
+    check_finite(pictures, name)
+
+
+def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
+    """Pixels before and after, so that ``ceil(size / stride)`` come out: MATLAB's "same"; an odd one goes after."""
+    total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
+    return total // 2, total - total // 2
+
+
+class SameConv(nn.Module):
+    """A 3x3 convolution whose output is ``ceil(size / stride)``.
+
+    Args:
+        in_channels, out_channels, stride, groups: of the convolution.
+        padding: ``"matlab"``: see :func:`same_padding` (even sizes at stride 2: none before, one after);
+            ``"torch"``: one on every side.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, stride: int = 1, groups: int = 1, padding: str = "matlab"
+    ) -> None:
+        super().__init__()
+        self.matlab = padding == "matlab" and stride > 1  # alike at stride 1
+        self.stride = stride
+        self.conv = nn.Conv2d(
+            in_channels, out_channels, 3, stride, padding=0 if self.matlab else 1, groups=groups
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', ceil(H / stride), ceil(W / stride))."""
+        if self.matlab:
+            top, bottom = same_padding(x.shape[-2], 3, self.stride)
+            left, right = same_padding(x.shape[-1], 3, self.stride)
+            x = F.pad(x, [left, right, top, bottom])
+        return self.conv(x)
+
+
+class ParallelBlock(nn.Module):
+    """Normalisation, six parallel branches of three 3x3 convolutions, their fusion, and a shortcut; halves the size.
+
+    Branch i gives ``p_i = conv(conv(y))`` and ``q_i = conv(p_i)``; the twelve are concatenated and fused by a 1x1
+    convolution. Six branches side by side are one convolution in six groups.
+    """
+
+    branches = 6
+
+    def __init__(self, channels: int, out_channels: int, activation: str, padding: str) -> None:
+        super().__init__()
+        wide = self.branches * channels
+        self.norm = nn.BatchNorm2d(channels)
+        self.enter = nn.Conv2d(channels, channels, 1)
+        self.halve = SameConv(channels, wide, stride=2, padding=padding)
+        self.first = SameConv(wide, wide, groups=self.branches)
+        self.second = SameConv(wide, wide, groups=self.branches)
+        self.fuse = nn.Conv2d(2 * wide, out_channels, 1)
+        self.shortcut = SameConv(channels, out_channels, stride=2, padding=padding)
+        self.act: nn.Module = nn.ReLU() if activation == "relu" else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H / 2, W / 2)."""
+        x = self.act(self.norm(x))
+        p = self.act(self.first(self.act(self.halve(self.act(self.enter(x))))))
+        q = self.act(self.second(p))
+        return self.shortcut(x) + self.fuse(torch.cat([p, q], dim=1))
+
+
+class SPNet(nn.Module):
+    """Pictures of radar maps to activities.
+
+    Args:
+        num_classes: classes.
+        in_channels: 1 for a map, 2 for a range-time and a Doppler-time map merged, 3 for a colour picture.
+        activation: ``"relu"``, or ``"none"`` for the published layer list, which in evaluation is affine.
+        padding: ``"matlab"``, or ``"torch"`` for symmetric padding; see :class:`SameConv`.
+
+    Attributes:
+        mean: (C,) the training pictures' mean of each channel, which is subtracted; part of the weights.
+
+    Shapes: pictures (..., C, H, W) in [0, 1], 224x224 in the paper -> logits (..., num_classes). Differentiable.
+    11 055 660 parameters for 12 classes and 3 channels.
+
+    Example:
+        >>> SPNet.from_pretrained(path)(MapToImage.doppler(radar)(maps.doppler_time)).softmax(-1)
+
+    Raises:
+        TensorsimError: fewer than one class or channel, an unknown activation or padding; pictures of other channels
+            or NaN.
+    """
+
+    mean: Tensor
+
+    def __init__(
+        self, num_classes: int = 12, in_channels: int = 1, activation: str = "relu", padding: str = "matlab"
+    ) -> None:
+        super().__init__()
+        if num_classes < 1 or in_channels < 1:
+            raise TensorsimError(
+                f"SPNet: got {num_classes} classes and {in_channels} channels, expected at least one of each"
+            )
+        if activation not in ("relu", "none"):
+            raise TensorsimError(f"SPNet.activation: got {activation!r}, expected 'relu' or 'none'")
+        if padding not in ("matlab", "torch"):
+            raise TensorsimError(f"SPNet.padding: got {padding!r}, expected 'matlab' or 'torch'")
+        self.num_classes, self.in_channels = num_classes, in_channels
+        self.register_buffer("mean", torch.zeros(in_channels))
+        self.conv1 = SameConv(in_channels, 12, stride=2, padding=padding)
+        self.conv2 = SameConv(12, 24, stride=2, padding=padding)
+        self.block1 = ParallelBlock(24, 96, activation, padding)
+        self.block2 = ParallelBlock(96, 192, activation, padding)
+        self.block3 = ParallelBlock(192, 384, activation, padding)
+        self.conv6 = nn.Conv2d(384, 1024, 1)
+        self.fc1 = nn.Linear(1024, 1024)
+        self.fc2 = nn.Linear(1024, num_classes)
+        self.act: nn.Module = nn.ReLU() if activation == "relu" else nn.Identity()
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.Linear):
+                _glorot(module)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Pictures (..., C, H, W) to logits (..., num_classes)."""
+        check_pictures(pictures, self.in_channels, "SPNet")
+        x = pictures.reshape(-1, self.in_channels, pictures.shape[-2], pictures.shape[-1])
+        x = x - self.mean.view(-1, 1, 1)
+        x = self.conv2(self.act(self.conv1(x)))
+        x = self.act(self.block3(self.block2(self.block1(x))))
+        x = self.act(self.conv6(x)).mean((-2, -1))
+        x = self.fc2(self.act(self.fc1(x)))
+        shape = list(pictures.shape[:-3])
+        shape.append(self.num_classes)
+        return x.reshape(shape)
+
+    @classmethod
+    def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "SPNet":
+        """Build the network that a weight file holds, in evaluation mode.
+
+        Args:
+            source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
+
+        Raises:
+            TensorsimError: no such file or name, or weights of another network.
+        """
+        from tensorsim.registry import locate
+        from tensorsim.weights import load_state_dict, load_strict
+
+        path = locate(source, "SPNet")
+        weights = load_state_dict(path)
+        first, last = weights.get("conv1.conv.weight"), weights.get("fc2.weight")
+        if first is None or first.dim() != 4 or last is None or last.dim() != 2:
+            raise TensorsimError(
+                f"{path}: got the weights {', '.join(sorted(weights)[:3])}, ..., expected those of an SPNet"
+            )
+        network = cls(last.shape[0], first.shape[1])
+        load_strict(network, weights, path)
+        return network.eval()
+
+
+def _glorot(layer: nn.Conv2d | nn.Linear) -> None:
+    """Glorot's uniform weights branch by branch, bias 0: where MATLAB starts."""
+    weight = layer.weight
+    receptive = weight[0, 0].numel()
+    groups = layer.groups if isinstance(layer, nn.Conv2d) else 1
+    inputs = weight.shape[1] * receptive
+    outputs = weight.shape[0] // groups * receptive
+    bound = (6 / (inputs + outputs)) ** 0.5
+    nn.init.uniform_(weight, -bound, bound)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)

@@ -1,0 +1,112 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import tensorsim as ts
+from tensorsim.errors import TensorsimError
+from tensorsim.recognition import ActivityRecognizer, MapToImage, SPGNet, SPNet
+from tensorsim.types import RadarMaps
+from tensorsim.weights import save_weights
+from tests.stage import StageTester
+
+RADAR = ts.RadarConfig.through_wall()
+BINS, RANGES = 256, RADAR.samples_per_chirp // 2
+
+
+def maps(batch: tuple[int, ...], dtype: torch.dtype = torch.float32) -> RadarMaps:
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.rand((*batch, *shape), generator=generator, dtype=dtype) + 0.1
+
+    ridges = torch.randint(BINS, (*batch, 2, 20), generator=generator)
+    return RadarMaps(draw(RANGES, 30), draw(RANGES, 29), draw(BINS, 20), ridges, draw(2, 20), draw())
+
+
+class FromTensors(nn.Module):
+    """The recognizer with the maps it looks at as arguments of their own."""
+
+    def __init__(self, recognizer: ActivityRecognizer) -> None:
+        super().__init__()
+        self.recognizer = recognizer
+
+    def forward(self, mti: Tensor, doppler: Tensor, ridges: Tensor, magnitudes: Tensor) -> Tensor:
+        return self.recognizer(RadarMaps(mti, mti, doppler, ridges, magnitudes, doppler))
+
+
+class Tester(StageTester):
+    inputs_of = "doppler"
+    batched_arguments = (0, 1, 2, 3)
+
+    def make(self) -> nn.Module:
+        torch.manual_seed(0)
+        channels = 2 if self.inputs_of == "merged" else 1
+        return FromTensors(ActivityRecognizer(RADAR, SPGNet(12, channels), self.inputs_of, size=16)).eval()
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        m = maps(batch, dtype)
+        return m.range_time_mti, m.doppler_time, m.ridges, m.ridge_magnitudes
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        m = maps((1,))
+        wrong = (m.range_time_mti, m.doppler_time[:, :-1], m.ridges, m.ridge_magnitudes)
+        return [
+            (wrong, "256"),
+            ((m.range_time_mti, -m.doppler_time, m.ridges, -m.ridge_magnitudes), "negative"),
+        ]
+
+
+class TestDoppler(Tester):
+    gradient_arguments = (1,)
+    gradient_atol = 1e-4
+
+
+class TestRidges(Tester):
+    inputs_of = "ridges"
+    gradient_arguments = (3,)
+    gradient_atol = 1e-4
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        m = maps((1,))
+        return [((m.range_time_mti, m.doppler_time, m.ridges + BINS, m.ridge_magnitudes), "bins outside")]
+
+
+class TestMerged(Tester):
+    inputs_of = "merged"
+    gradient_arguments = (0, 1)
+    gradient_atol = 1e-4
+
+
+def test_pictures_are_those_of_the_maps() -> None:
+    m = maps((2,))
+    doppler = MapToImage.doppler(RADAR, size=16)(m.doppler_time)
+    of_range = MapToImage.range(RADAR, size=16)(m.range_time_mti)
+    assert torch.equal(ActivityRecognizer(RADAR, SPNet(), size=16).picture(m), doppler)
+    merged = ActivityRecognizer(RADAR, SPNet(in_channels=2), "merged", size=16).picture(m)
+    assert torch.equal(merged, torch.cat([of_range, doppler], 1))
+
+
+@pytest.mark.parametrize("network", [SPNet(3), SPGNet(3)])
+def test_weights_say_what_they_were_trained_on(tmp_path: Path, network: nn.Module) -> None:
+    path = tmp_path / "net.safetensors"
+    metadata = {"network": type(network).__name__, "size": "32", "speed_m_s": "2.5", "range_db": "30"}
+    save_weights(network.eval(), path, metadata)
+    loaded = ActivityRecognizer.from_pretrained(RADAR, path)
+    expected = ActivityRecognizer(RADAR, network, size=32, speed_m_s=2.5, range_db=30.0)
+    m = maps((2,))
+    torch.testing.assert_close(loaded(m), expected(m), rtol=0.01, atol=0.01)
+    save_weights(network, path, {"size": "32"})
+    with pytest.raises(TensorsimError, match=r"its header says .*expected network"):
+        ActivityRecognizer.from_pretrained(RADAR, path)
+
+
+def test_bad_arguments() -> None:
+    with pytest.raises(
+        TensorsimError, match="inputs: got 'picture', expected one of doppler, ridges, merged"
+    ):
+        ActivityRecognizer(RADAR, SPNet(), "picture")
+    with pytest.raises(TensorsimError, match="1 input channels, expected 2, as merged has"):
+        ActivityRecognizer(RADAR, SPNet(), "merged")
