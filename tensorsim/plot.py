@@ -68,8 +68,10 @@ def map_figure(
     speed_per_axis: float | None = None,
     half_span: float | None = None,
     dynamic_range_db: float = DYNAMIC_RANGE_DB,
+    reference: np.ndarray | None = None,
+    reference_ridges: np.ndarray | None = None,
 ) -> Figure:
-    """Draw a map (rows, columns) in dB below its peak.
+    """Draw a map (rows, columns) in dB below its peak, and beside it the one that the true motion has.
 
     Args:
         magnitude: (R or F, K) linear magnitude.
@@ -79,48 +81,58 @@ def map_figure(
         speed_per_axis: m/s per unit of ``axis``, for a second scale on the right.
         half_span: show rows from ``-half_span`` to ``half_span`` only.
         dynamic_range_db: what lies further below the peak has the colour of the floor.
+        reference: the map of the true motion, of the same axes.
+        reference_ridges: its ridges.
     """
-    figure = _figure()
-    axes = figure.add_subplot()
+    panels = [(magnitude, ridges, title)]
+    if reference is not None:
+        panels = [
+            (magnitude, ridges, f"{title}, from the film"),
+            (reference, reference_ridges, f"{title}, from the true motion"),
+        ]
+    figure = _figure(width=9.0 if reference is None else 15.0)
+    row = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
     step = float(axis[1] - axis[0])
     span_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 else 1.0
-    image = axes.imshow(
-        decibels(_thin_columns(magnitude), dynamic_range_db),
-        origin="lower",
-        aspect="auto",
-        interpolation="nearest",
-        cmap="turbo",
-        vmin=-dynamic_range_db,
-        vmax=0.0,
-        extent=(
-            float(time_s[0]) - span_s / 2,
-            float(time_s[-1]) + span_s / 2,
-            float(axis[0]) - step / 2,
-            float(axis[-1]) + step / 2,
-        ),
-    )
-    if ridges is not None:
-        for i, ridge in enumerate(ridges):
-            axes.plot(
-                time_s, ridge, ".", color="white", alpha=0.8 - 0.2 * i, markersize=2.0, label=f"ridge {i + 1}"
-            )
-        axes.legend(loc="upper right", fontsize="small", markerscale=3, labelcolor="white", framealpha=0.3)
     low, high = float(axis[0]) - step / 2, float(axis[-1]) + step / 2
+    extent = (float(time_s[0]) - span_s / 2, float(time_s[-1]) + span_s / 2, low, high)
     if half_span is not None:
         low, high = max(low, -half_span), min(high, half_span)
-    axes.set_ylim(low, high)
+    for axes, (levels, lines, heading) in zip(row, panels, strict=True):
+        image = axes.imshow(
+            decibels(_thin_columns(levels), dynamic_range_db),
+            origin="lower",
+            aspect="auto",
+            interpolation="nearest",
+            cmap="turbo",
+            vmin=-dynamic_range_db,
+            vmax=0.0,
+            extent=extent,
+        )
+        if lines is not None:
+            _draw_ridges(axes, time_s, lines)
+        axes.set_ylim(low, high)
+        axes.set_title(heading)
+        axes.set_xlabel("time in s")
+    row[0].set_ylabel(axis_label)
     if speed_per_axis is not None:
         scale = speed_per_axis
-        right = axes.secondary_yaxis(
+        right = row[-1].secondary_yaxis(
             "right",
             functions=(lambda x: np.multiply(x, scale), lambda v: np.divide(v, scale)),
         )
         right.set_ylabel("radial speed in m/s, positive = approaching")
-    axes.set_title(title)
-    axes.set_xlabel("time in s")
-    axes.set_ylabel(axis_label)
-    figure.colorbar(image, ax=axes, label="dB below the peak", pad=0.02 if speed_per_axis is None else 0.1)
+    pad = (0.02 if speed_per_axis is None else 0.1) / len(panels)
+    figure.colorbar(image, ax=list(row), label="dB below the peak", pad=pad)
     return figure
+
+
+def _draw_ridges(axes: Any, time_s: np.ndarray, ridges: np.ndarray) -> None:
+    for i, ridge in enumerate(ridges):
+        axes.plot(
+            time_s, ridge, ".", color="white", alpha=0.8 - 0.2 * i, markersize=2.0, label=f"ridge {i + 1}"
+        )
+    axes.legend(loc="upper right", fontsize="small", markerscale=3, labelcolor="white", framealpha=0.3)
 
 
 def skeleton_figure(joints_m: np.ndarray, valid: np.ndarray, fps: float, poses: int = 6) -> Figure:
@@ -161,6 +173,24 @@ def skeleton_figure(joints_m: np.ndarray, valid: np.ndarray, fps: float, poses: 
     )
     axes.view_init(elev=20, azim=-60)
     axes.legend(loc="upper left")
+    return figure
+
+
+def confusion_figure(counts: np.ndarray, names: list[str], title: str) -> Figure:
+    """Confusion matrix (classes, classes), true class in rows, shaded by the share of the true class."""
+    figure = _figure(6.0, 5.6)
+    axes = figure.add_subplot()
+    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for (row, column), count in np.ndenumerate(counts):
+        if count:
+            colour = "white" if share[row, column] > 0.5 else "black"
+            axes.text(column, row, str(count), ha="center", va="center", color=colour, fontsize=8)
+    axes.set_xticks(range(len(names)), names)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xlabel("predicted")
+    axes.set_ylabel("true")
+    axes.set_title(title)
     return figure
 
 

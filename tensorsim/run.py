@@ -1,15 +1,16 @@
-"""A film through the pipeline, streamed: two passes over the file, so that memory does not grow with its length."""
+"""People to results in a folder: a film streamed in two passes, so that memory does not grow with its length."""
 
 import json
+import math
 import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,8 +20,12 @@ from tqdm import tqdm
 from tensorsim import plot
 from tensorsim.data.video import VideoReader, write_video
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.types import Detections, Pose, RadarMaps
+
+if TYPE_CHECKING:
+    from tensorsim.radar.presets import RadarScene
+    from tensorsim.sources import Source
 
 
 def _bar(name: str, total: int | None, quiet: bool) -> tqdm:
@@ -146,53 +151,98 @@ def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
     )
 
 
-def write_maps(folder: Path, maps: RadarMaps, axes: Axes) -> None:
-    """Write ``maps.npz`` and a PNG per map."""
-    range_time, mti = maps.range_time.numpy(), maps.range_time_mti.numpy()
-    doppler_time = maps.doppler_time.numpy()
-    ridges_hz = axes.doppler_hz[maps.ridges.numpy()]
-    # In the picture a ridge ends where it is no more than noise at the floor of the colours.
-    strong = maps.ridge_magnitudes.numpy() > doppler_time.max(initial=0.0) * 10 ** (
-        -plot.DYNAMIC_RANGE_DB / 20
+def write_maps(folder: Path, maps: RadarMaps, axes: Axes, truth: RadarMaps | None = None) -> None:
+    """Write ``maps.npz`` and a PNG per map.
+
+    Args:
+        folder: where to.
+        maps: on the CPU, without batch dimensions.
+        axes: of the maps.
+        truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
+            every PNG.
+    """
+    save_maps(folder / "maps.npz", maps, axes)
+    if truth is not None:
+        save_maps(folder / "maps_truth.npz", truth, axes)
+    for name, title in (
+        ("range_time", "range-time map"),
+        ("range_time_mti", "range-time map after moving target indication"),
+    ):
+        magnitude = getattr(maps, name).numpy()
+        # What the two-pulse canceller gives lies half a pulse later; nothing is left of it at a display rate.
+        offset = (maps.range_time.shape[1] - magnitude.shape[1]) / 2
+        time_s = (np.arange(magnitude.shape[1]) + offset) / axes.range_time_rate_hz
+        reference = None if truth is None else getattr(truth, name).numpy()
+        plot.save_figure(
+            plot.map_figure(magnitude, time_s, axes.range_m, title, "range in m", reference=reference),
+            folder / f"{name}.png",
+        )
+    both = [maps] if truth is None else [maps, truth]
+    plot.save_figure(
+        plot.map_figure(
+            maps.doppler_time.numpy(),
+            axes.time_s,
+            axes.doppler_hz,
+            "Doppler-time map",
+            "Doppler in Hz, positive = approaching",
+            ridges=_strong_ridges(maps, axes),
+            speed_per_axis=axes.speed_per_hz,
+            half_span=max(_doppler_span(one, axes) for one in both),
+            reference=None if truth is None else truth.doppler_time.numpy(),
+            reference_ridges=None if truth is None else _strong_ridges(truth, axes),
+        ),
+        folder / "doppler_time.png",
     )
+
+
+def save_maps(path: Path, maps: RadarMaps, axes: Axes) -> None:
+    """Write maps and their axes as an npz."""
     np.savez(
-        folder / "maps.npz",
-        range_time=range_time,
-        range_time_mti=mti,
-        doppler_time=doppler_time,
-        ridges_hz=ridges_hz,
+        path,
+        range_time=maps.range_time.numpy(),
+        range_time_mti=maps.range_time_mti.numpy(),
+        doppler_time=maps.doppler_time.numpy(),
+        ridges_hz=axes.doppler_hz[maps.ridges.numpy()],
         range_m=axes.range_m,
         doppler_hz=axes.doppler_hz,
         time_s=axes.time_s,
         range_time_rate_hz=axes.range_time_rate_hz,
     )
-    for name, title, magnitude in (
-        ("range_time", "range-time map", range_time),
-        ("range_time_mti", "range-time map after moving target indication", mti),
-    ):
-        # The same half pulse as above; none is left at a display rate.
-        offset = (range_time.shape[1] - magnitude.shape[1]) / 2
-        time_s = (np.arange(magnitude.shape[1]) + offset) / axes.range_time_rate_hz
-        plot.save_figure(
-            plot.map_figure(magnitude, time_s, axes.range_m, title, "range in m"), folder / f"{name}.png"
-        )
-    # Show the part of the Doppler axis that has something to show.
-    shown = np.abs(axes.doppler_hz)[
-        (plot.decibels(doppler_time, plot.DYNAMIC_RANGE_DB) > -plot.DYNAMIC_RANGE_DB).any(1)
-    ]
-    plot.save_figure(
-        plot.map_figure(
-            doppler_time,
-            axes.time_s,
-            axes.doppler_hz,
-            "Doppler-time map",
-            "Doppler in Hz, positive = approaching",
-            ridges=np.where(strong, ridges_hz, np.nan),
-            speed_per_axis=axes.speed_per_hz,
-            half_span=1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8)),
-        ),
-        folder / "doppler_time.png",
-    )
+
+
+def _strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
+    """Ridges (3, K) in Hz, NaN where one is no more than noise at the floor of the colours."""
+    floor = float(maps.doppler_time.max()) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
+    return np.where(maps.ridge_magnitudes.numpy() > floor, axes.doppler_hz[maps.ridges.numpy()], np.nan)
+
+
+def _doppler_span(maps: RadarMaps, axes: Axes) -> float:
+    """Half of the part of the Doppler axis that has something to show, in Hz."""
+    level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB)
+    shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB).any(1)]
+    return 1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8))
+
+
+def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float | None]]:
+    """How like maps are to those of the true motion: PSNR of linear and dB maps, SSIM, each map over its peak.
+
+    None where a figure is not finite, as for two empty maps.
+    """
+    from tensorsim.radar import metrics
+
+    table = {}
+    for name in ("range_time", "range_time_mti", "doppler_time"):
+        pair = getattr(maps, name), getattr(truth, name)
+        figures = {
+            "psnr_linear_db": metrics.psnr(*pair, scale="linear"),
+            "psnr_of_db_map_db": metrics.psnr(*pair, scale="db"),
+            "ssim_linear": metrics.ssim(*pair, scale="linear"),
+            "ssim_of_db_map": metrics.ssim(*pair, scale="db"),
+        }
+        table[name] = {
+            key: round(float(value), 4) if bool(value.isfinite()) else None for key, value in figures.items()
+        }
+    return table
 
 
 def write_pose(folder: Path, pose: Pose, fps: float) -> None:
@@ -211,16 +261,16 @@ def write_pose(folder: Path, pose: Pose, fps: float) -> None:
 
 
 def write_overlay(
-    folder: Path, reader: VideoReader, pose: Pose, threshold: float, quiet: bool = False
+    folder: Path, chunks: Iterable[Tensor], fps: float, pose: Pose, threshold: float, quiet: bool = False
 ) -> None:
-    """Write ``overlay.mp4``: the film with boxes, ids and skeletons."""
+    """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons."""
     boxes, keypoints = pose.boxes[0].numpy(), pose.keypoints[0].numpy()
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
 
     def drawn() -> Iterator[np.ndarray]:
         index = 0
         with _bar("overlay", valid.shape[1], quiet) as bar:
-            for frames in reader.chunks(8):
+            for frames in chunks:
                 for frame in frames.permute(0, 2, 3, 1).numpy():
                     yield plot.draw_people(
                         frame,
@@ -233,7 +283,20 @@ def write_overlay(
                     index += 1
                     bar.update(1)
 
-    write_video(folder / "overlay.mp4", drawn(), reader.fps)
+    write_video(folder / "overlay.mp4", drawn(), fps)
+
+
+def simulate(
+    source: "Source", stage: PoseToDoppler, folder: Path, seed: int, device: torch.device, quiet: bool = False
+) -> tuple[Pose, RadarMaps]:
+    """Find the people of a source, simulate their maps, and write all but the maps: pose, skeleton and overlay."""
+    pose = source.pose(quiet)
+    warn_of_empty_clips(pose.valid)
+    torch.manual_seed(seed)
+    maps = maps_of_pose(stage, pose, source.fps, device, quiet)
+    write_pose(folder, pose, source.fps)
+    write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
+    return pose, maps
 
 
 def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
@@ -253,6 +316,22 @@ def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def summary_of(
+    source: "Source", scene: "RadarScene", pose: Pose, maps: RadarMaps, seed: int
+) -> dict[str, Any]:
+    """What ``summary.json`` says of every simulation."""
+    snr_db = float(maps.snr_db)
+    return {
+        "source": {"kind": source.kind, **source.about},
+        "people": people_of(pose, source.fps),
+        "frames": pose.valid.shape[2],
+        "fps": source.fps,
+        "seed": seed,
+        "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
+        **{name: None if part is None else asdict(part) for name, part in scene._asdict().items()},
+    }
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ import torch
 import tensorsim as ts
 from tensorsim import cli, run
 from tensorsim.commands import simulate
+from tensorsim.commands.options import RadarOptions
 from tensorsim.data.video import VideoReader
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.presets import PRESETS
@@ -54,10 +55,7 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     weights = tmp_path / "w.onnx"
     weights.write_text("")
 
-    def people(options: simulate.Simulate, *_: Path) -> VideoToPose:
-        return VideoToPose(RectangleDetector(), StandingPose(), person_height_m=options.person_height)
-
-    monkeypatch.setattr(simulate, "_video_to_pose", people)
+    monkeypatch.setattr(simulate, "load_networks", lambda *_: (RectangleDetector(), StandingPose()))
     return ["--detector", str(weights), "--pose", str(weights), "--scene", "through-wall", "--quiet"]
 
 
@@ -113,18 +111,21 @@ def test_simulate_writes_everything(
 
 def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
     """The file's radar replaces the scene's, its wall too; the scene's wall stays where the file has none."""
-    options = simulate.Simulate(walk, tmp_path, scene="through-wall", radar="cw-24ghz")
-    assert simulate._scene(options) == (PRESETS["cw-24ghz"].radar, ts.WallConfig())
-    assert simulate._scene(simulate.Simulate(walk, tmp_path, radar="cw-24ghz")).wall is None
-    assert simulate._scene(simulate.Simulate(walk, tmp_path, radar="through-wall")) == PRESETS["through-wall"]
-    assert simulate._scene(simulate.Simulate(walk, tmp_path)) == PRESETS["free-space"]
+    options = RadarOptions(scene="through-wall", radar="cw-24ghz")
+    assert options.radar_scene() == (PRESETS["cw-24ghz"].radar, ts.WallConfig(), None)
+    assert RadarOptions(radar="cw-24ghz").radar_scene().wall is None
+    assert RadarOptions(radar="through-wall").radar_scene() == PRESETS["through-wall"]
+    assert RadarOptions().radar_scene() == PRESETS["free-space"]
 
     file = tmp_path / "my.yaml"
-    file.write_text("carrier_hz: 3e9\nbandwidth_hz: 500e6\nprf_hz: 200\nwall: {loss_tangent: 0.01}\n")
+    file.write_text(
+        "carrier_hz: 3e9\nbandwidth_hz: 500e6\nprf_hz: 200\nwall: {loss_tangent: 0.01}\nfloor: {}\n"
+    )
     cli.main(["simulate", str(walk), "--out", str(tmp_path / "out"), "--radar", str(file), *stand_ins])
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["radar"]["carrier_hz"] == 3e9
     assert summary["wall"]["loss_tangent"] == 0.01
+    assert summary["floor"]["relative_permittivity"] == 5.24
     assert summary["config"]["radar"] == str(file)
     maps = np.load(tmp_path / "out" / "maps.npz")
     assert maps["range_time"].shape == (200, 500)
@@ -158,7 +159,7 @@ def test_a_bad_radar_is_refused_before_work_starts(
 
 
 def test_help_names_every_preset() -> None:
-    help_text = inspect.getsource(simulate.Simulate)
+    help_text = inspect.getsource(RadarOptions)
     assert all(name in help_text for name, scene in PRESETS.items() if not scene.radar.has_array)
 
 

@@ -1,5 +1,6 @@
 """What README says, works as it is written."""
 
+import json
 import os
 import re
 import shutil
@@ -7,7 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import tensorsim as ts
+from tests.bvh import write_bvh
+from tests.film import STANDING
+from tests.test_sources import coco_json
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -22,6 +29,12 @@ def test_python_without_files_runs() -> None:
     assert "torch.Size([4, 1024, " in done.stdout
 
 
+def test_generated_motion_becomes_maps_and_film() -> None:
+    (block,) = (b for b in blocks("python") if "ActivityGenerator" in b)
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=True)
+    assert "torch.Size([5, 3, 180, 320])" in done.stdout
+
+
 @pytest.mark.slow
 def test_commands_run_verbatim(tmp_path: Path, shared_data: Path) -> None:
     import cv2
@@ -34,6 +47,12 @@ def test_commands_run_verbatim(tmp_path: Path, shared_data: Path) -> None:
     for _ in range(7 * 24):
         writer.write(cv2.resize(reader.read()[1], (640, 360)))
     writer.release()
+    walk = ts.motion.ActivityGenerator().generate("walking", duration_s=1.0).joints.numpy()
+    write_bvh(tmp_path / "walk.bvh", walk[0], 30.0)
+    np.savez(tmp_path / "capture.npz", first=walk[0], second=walk[0])
+    standing = 300 * np.array(STANDING)[None, None] + np.linspace(100, 150, 30)[None, :, None, None]
+    people = coco_json(standing, np.ones((1, 30, 17)), size=(480, 640))
+    (tmp_path / "keypoints.json").write_text(json.dumps(people))
     environment = dict(
         os.environ,
         TENSORSIM_DETECTOR="rtmdet_nano_person.onnx",
@@ -49,9 +68,10 @@ def test_commands_run_verbatim(tmp_path: Path, shared_data: Path) -> None:
     assert len(commands) >= 5
     for command in commands:
         subprocess.run(command, shell=True, check=True, cwd=tmp_path, env=environment)
-        if "simulate clip" in command:
-            assert len(list((tmp_path / "out").iterdir())) == 8
-            shutil.rmtree(tmp_path / "out")
+        for folder, files in (("out", 8), ("demo", 11)):
+            if f"--out {folder}/" in command:
+                assert len(list((tmp_path / folder).iterdir())) == files
+                shutil.rmtree(tmp_path / folder)
     block = blocks("python")[0] + "\nimport torch\nassert out.doppler_time.shape[0] == 1\n"
     setup = (
         "import torch\nfrom tensorsim.data.video import VideoReader\nreader = VideoReader('clip.mp4')\n"

@@ -1,66 +1,64 @@
-"""``tensorsim simulate``: a video to what a radar would have seen of it."""
+"""``tensorsim simulate``: a video, or motion that is known, to what a radar would have seen of it."""
 
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tensorsim.commands.networks import network_path
+from tensorsim.commands.networks import default_networks, load_networks
+from tensorsim.commands.options import RadarOptions
 from tensorsim.errors import TensorsimError
 
-#: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
-FULL_RATE_PULSES = 1 << 17
-DISPLAY_RATE_HZ = 256.0
+if TYPE_CHECKING:
+    import torch
+
+    from tensorsim.pipeline import VideoToPose
+    from tensorsim.sources import Source
+
+#: Options that say something of some kinds of source only.
+_MEANT_FOR = {
+    "detector": ("video",),
+    "pose": ("video",),
+    "person_height": ("video", "keypoints"),
+    "camera_fov": ("video", "keypoints"),
+    "position": ("video", "keypoints"),
+    "image_size": ("keypoints",),
+    "clip": ("motion",),
+    "heading": ("motion",),
+}
 
 
 @dataclass(frozen=True)
-class Simulate:
-    """Turn a video into what a radar would have seen.
+class Simulate(RadarOptions):
+    """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
 
     Writes maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
     """
 
-    video: tyro.conf.Positional[Path]
-    """Any video that OpenCV decodes."""
+    source: tyro.conf.Positional[Path]
+    """A video that OpenCV decodes; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or COCO
+    keypoints of a video as .json, or a folder with one per frame."""
     out: Path
     """Folder for the results; its files appear together, when all are complete."""
-    detector: Path | None = None
-    """Person detector: RTMDet as .pth, .safetensors or .onnx. Default: $TENSORSIM_DETECTOR."""
-    pose: Path | None = None
-    """COCO-17 heat maps: HRNet as .pth or .safetensors, or any such network as .onnx. Default: $TENSORSIM_POSE."""
-    scene: Literal["free-space", "through-wall"] = "free-space"
-    """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath."""
-    radar: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
-    infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, free-space, through-wall) or a YAML file with fields of
-    RadarConfig; a wall that it comes with replaces the scene's."""
+    detector: str | None = None
+    """Person detector: RTMDet as .pth, .safetensors or .onnx, or a name of `tensorsim models list`. Default:
+    $TENSORSIM_DETECTOR, else the shipped one."""
+    pose: str | None = None
+    """COCO-17 heat maps: HRNet as .pth, .safetensors or name, or any such network as .onnx. Default: $TENSORSIM_POSE,
+    else the shipped one."""
     person_height: tuple[float, ...] = (1.80, 1.70)
     """Body heights in metres in order of appearance; the last one serves the rest."""
     initial_distance: tuple[float, ...] | None = None
-    """Distances of the people in metres when they first appear; calibrates the focal length."""
+    """Distances of the people in metres when they first appear. Of a video they calibrate the focal length; captured
+    motion is moved so that the first person starts there (default: where the file has it, if in front of the
+    radar)."""
     camera_fov: float = 60.0
     """Horizontal field of view of the camera in degrees, when no initial distance is given."""
     position: Literal["camera", "paper"] = "camera"
     """Camera model, or the paper's pixel displacement (no motion along the optical axis)."""
-    motion: Literal["smooth", "paper"] = "smooth"
-    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay."""
-    integration: Literal["noncoherent", "paper"] = "noncoherent"
-    """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler."""
-    wall_paths: Literal["series", "paper"] = "series"
-    """Bounces inside the wall: complete to first order, or the paper's."""
-    multipath: bool | None = None
-    """Wall bounces; default on behind a wall."""
-    leakage: bool = False
-    """Direct signal from transmitter to receiver."""
-    wall_echo: bool = False
-    """Static mirror reflection of the wall."""
-    snr: float = 50.0
-    """Signal-to-noise ratio in dB of the people's echo, per IF sample."""
-    denoiser: Path | None = None
-    """DnCNN weights (.pth or .safetensors) to clean the shown maps."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -69,153 +67,116 @@ class Simulate:
     """Where to stop."""
     stride: int = 1
     """Keep every n-th frame."""
-    seed: int = 0
-    """Seed of the noise."""
-    device: str = "auto"
-    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
-    quiet: bool = False
-    """No progress bars."""
+    image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
+    """Pixels of the pictures that keypoints were found in, where their file does not say."""
+    clip: str | None = None
+    """Which motion of a file with several: the name of an array, or subject and action as in "S1/Walking"."""
+    heading: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
+    """Turn of captured motion about the vertical, counter-clockwise seen from above."""
 
     def run(self) -> None:
         """Do it."""
-        _check_numbers(self)
-        detector_path = network_path(self.detector, "detector", "TENSORSIM_DETECTOR")
-        pose_path = network_path(self.pose, "pose", "TENSORSIM_POSE")
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
-
-        scene = _scene(self)
+        self.check(self.out)
 
         import torch
 
         from tensorsim import run
-        from tensorsim.data.video import VideoReader
         from tensorsim.device import usable_device
-        from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
+        from tensorsim.sources import KINDS, kind_of
 
+        kind = kind_of(self.source)
+        for field in fields(self):
+            unlike = getattr(self, field.name) != field.default
+            if unlike and kind not in _MEANT_FOR.get(field.name, KINDS):
+                meant = " or ".join(KINDS[k] for k in _MEANT_FOR[field.name])
+                name = field.name.replace("_", "-")
+                raise TensorsimError(f"--{name}: got it for {KINDS[kind]}, expected it for {meant} only")
+        scene = self.radar_scene()
         device = usable_device(self.device)
         with run.collected_warnings() as messages, torch.inference_mode():
-            reader = VideoReader(
-                self.video, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
-            )
-            people: VideoToPose = _video_to_pose(self, detector_path, pose_path).to(device).eval()
-            length_s = 0.0 if reader.frame_count is None else reader.frame_count / reader.fps
-            maps_stage: PoseToDoppler = _pose_to_doppler(self, scene, length_s).to(device).eval()
+            source, networks = self._source(kind, device)
+            length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
+            stage = self.pose_to_doppler(scene, length_s).to(device).eval()
             with run.complete_or_nothing(self.out) as folder:
-                pose = run.pose_of_film(people, reader, device, self.quiet)
-                warn_of_empty_clips(pose.valid)
-                torch.manual_seed(self.seed)
-                maps = run.maps_of_pose(maps_stage, pose, reader.fps, device, self.quiet)
-                run.write_maps(folder, maps, run.axes_of(maps_stage, maps))
-                run.write_pose(folder, pose, reader.fps)
-                run.write_overlay(folder, reader, pose, people.keypoint_threshold, self.quiet)
-                config = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
-                config |= {"detector": str(detector_path), "pose": str(pose_path)}
-                snr_db = float(maps.snr_db)
-                run.write_summary(
-                    folder,
-                    {
-                        "people": run.people_of(pose, reader.fps),
-                        "frames": pose.valid.shape[2],
-                        "fps": reader.fps,
-                        "seed": self.seed,
-                        "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
-                        "radar": asdict(maps_stage.simulator.radar),
-                        "wall": None if scene.wall is None else asdict(scene.wall),
-                        "config": config,
-                        "warnings": messages,
-                    },
-                )
+                pose, maps = run.simulate(source, stage, folder, self.seed, device, self.quiet)
+                run.write_maps(folder, maps, run.axes_of(stage, maps))
+                summary = run.summary_of(source, scene, pose, maps, self.seed) | {
+                    "config": self.described() | networks,
+                    "warnings": messages,
+                }
+                run.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         print(f"{self.out}: {pose.valid.shape[1]} people in {pose.valid.shape[2]} frames")
 
+    def check(self, out: Path) -> None:
+        """Refuse options that cannot work, before anything heavy is imported."""
+        super().check(out)
+        for name, values in (
+            ("person-height", self.person_height),
+            ("initial-distance", self.initial_distance),
+            ("image-size", self.image_size),
+        ):
+            if values is not None and (
+                len(values) == 0 or not all(math.isfinite(v) and v > 0 for v in values)
+            ):
+                unit = "pixels" if name == "image-size" else "metres"
+                raise TensorsimError(f"--{name}: got {values}, expected positive numbers of {unit}")
+        if not 0 < self.camera_fov < 180:
+            raise TensorsimError(f"--camera-fov: got {self.camera_fov}, expected degrees between 0 and 180")
+        if not math.isfinite(self.heading):
+            raise TensorsimError(f"--heading: got {self.heading}, expected a finite number of degrees")
+        if self.position == "paper" and self.initial_distance is None:
+            raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
 
-def _check_numbers(options: Simulate) -> None:
-    for name, values in (
-        ("person-height", options.person_height),
-        ("initial-distance", options.initial_distance),
-    ):
-        if values is not None and (len(values) == 0 or not all(math.isfinite(v) and v > 0 for v in values)):
-            raise TensorsimError(f"--{name}: got {values}, expected positive numbers of metres")
-    if not 0 < options.camera_fov < 180:
-        raise TensorsimError(f"--camera-fov: got {options.camera_fov}, expected degrees between 0 and 180")
-    if not math.isfinite(options.snr):
-        raise TensorsimError(f"--snr: got {options.snr}, expected a finite number of dB")
-    if options.position == "paper" and options.initial_distance is None:
-        raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
+    def _source(self, kind: str, device: "torch.device") -> "tuple[Source, dict[str, str]]":
+        """The people of this kind of source, and the files of the networks that find them."""
+        from tensorsim import sources
+        from tensorsim.data.video import VideoReader
 
-
-def _video_to_pose(options: Simulate, detector_path: Path, pose_path: Path):  # type: ignore[no-untyped-def]
-    from tensorsim.config import CameraConfig
-    from tensorsim.pipeline import VideoToPose
-    from tensorsim.vision.hrnet import HRNet
-    from tensorsim.vision.kalman import KalmanSmoother
-    from tensorsim.vision.metric_pose import MetricPose
-    from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
-    from tensorsim.vision.rtmdet import RTMDet
-
-    detector = RTMDet.from_pretrained(detector_path)
-    network = OnnxHeatmaps(pose_path) if pose_path.suffix == ".onnx" else HRNet.from_pretrained(pose_path)
-    return VideoToPose(
-        detector,
-        network,
-        metric_pose=MetricPose(
-            CameraConfig(horizontal_fov_rad=math.radians(options.camera_fov)),
-            person_height_m=options.person_height,
-            initial_distance_m=options.initial_distance,
-            mode=options.position,
-        ),
-        smoother=KalmanSmoother(mode="forward" if options.motion == "paper" else "rts"),
-    )
-
-
-def _scene(options: Simulate):  # type: ignore[no-untyped-def]
-    from tensorsim.radar.presets import PRESETS, RadarScene, radar_scene
-
-    scene = PRESETS[options.scene]
-    if options.radar is None:
-        return scene
-    try:
-        chosen = radar_scene(options.radar)
-    except TensorsimError as error:
-        raise TensorsimError(f"--radar: {error}") from None
-    if chosen.radar.has_array:
-        raise TensorsimError(
-            f"--radar: {options.radar} has several antennas, expected one transmitter and one receiver: the maps "
-            "of this command have no antenna dimension"
+        cut = sources.Cut(self.start, self.end, self.stride)
+        if kind == "motion":
+            if not self.source.exists():
+                raise TensorsimError(f"{self.source}: no such file, expected motion capture")
+            if self.initial_distance is not None and len(self.initial_distance) > 1:
+                raise TensorsimError(
+                    f"--initial-distance: got {self.initial_distance} for motion capture, expected that of the "
+                    "first person: the others keep their places beside it"
+                )
+            start_m = None if self.initial_distance is None else self.initial_distance[0]
+            turn = math.radians(self.heading)
+            return sources.motion_source(self.source, self.clip, self.fps, turn, start_m, cut), {}
+        if kind == "keypoints":
+            size = None if self.image_size is None else (self.image_size[1], self.image_size[0])
+            stage = self._video_to_pose(None, None)
+            return sources.keypoint_source(self.source, stage, self.fps, size, cut), {}
+        detector, pose = default_networks(self.detector, self.pose)
+        reader = VideoReader(
+            self.source, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
         )
-    return RadarScene(chosen.radar, chosen.wall if chosen.wall is not None else scene.wall)
+        stage = self._video_to_pose(*load_networks(detector, pose)).to(device).eval()
+        files = {"detector": str(detector), "pose": str(pose)}
+        return sources.film_source(reader, stage, device), files
 
+    def _video_to_pose(
+        self, detector: "torch.nn.Module | None", pose: "torch.nn.Module | None"
+    ) -> "VideoToPose":
+        """The stage from frames, or without networks from keypoints, to joints in the world."""
+        from torch import nn
 
-def _pose_to_doppler(options: Simulate, scene, length_s: float):  # type: ignore[no-untyped-def]
-    from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
-    from tensorsim.motion.resample import PoseResampler
-    from tensorsim.motion.savgol import SavitzkyGolay
-    from tensorsim.pipeline import PoseToDoppler
-    from tensorsim.radar.simulator import RadarSimulator
+        from tensorsim.config import CameraConfig
+        from tensorsim.pipeline import VideoToPose
+        from tensorsim.vision.kalman import KalmanSmoother
+        from tensorsim.vision.metric_pose import MetricPose
 
-    radar, wall = scene
-    behind_wall = wall is not None
-    simulator = RadarSimulator(
-        radar,
-        wall=wall,
-        multipath=behind_wall if options.multipath is None else options.multipath,
-        leakage=options.leakage,
-        wall_echo=options.wall_echo,
-        wall_paths=options.wall_paths,
-        snr_db=options.snr,
-        integration=options.integration,
-        display_rate_hz=DISPLAY_RATE_HZ if length_s * radar.prf_hz > FULL_RATE_PULSES else None,
-    )
-    denoiser = None if options.denoiser is None else MapDenoiser(DnCNN.from_pretrained(options.denoiser))
-    if options.motion == "paper":
-        # The panel's smoothing ratio of 0.25, read as a quarter of a second of pulses.
-        window = round(0.25 * radar.prf_hz) // 2 * 2 + 1
-        return PoseToDoppler(
-            simulator,
-            resampler=PoseResampler(radar.prf_hz, method="linear"),
-            pulse_smoother=SavitzkyGolay(window, 3),
-            denoiser=denoiser,
+        return VideoToPose(
+            nn.Identity() if detector is None else detector,
+            nn.Identity() if pose is None else pose,
+            metric_pose=MetricPose(
+                CameraConfig(horizontal_fov_rad=math.radians(self.camera_fov)),
+                person_height_m=self.person_height,
+                initial_distance_m=self.initial_distance,
+                mode=self.position,
+            ),
+            smoother=KalmanSmoother(mode="forward" if self.motion == "paper" else "rts"),
         )
-    return PoseToDoppler(simulator, denoiser=denoiser)

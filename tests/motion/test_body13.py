@@ -1,14 +1,20 @@
 """The 13-scatterer body against the published table."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
-from tensorsim.config import JOINTS
+from tensorsim.config import JOINTS, RadarConfig
+from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.body import BodyPose, forward_kinematics
 from tensorsim.motion.body13 import NODES, Body13Scatterers
+from tensorsim.motion.resample import PoseResampler
+from tensorsim.motion.scatterers import JointScatterers
+from tensorsim.pipeline import PoseToDoppler
+from tensorsim.radar.simulator import RadarSimulator
 from tests.stage import StageTester
 
 
@@ -77,3 +83,23 @@ def test_learnable() -> None:
     assert gradient is not None
     assert bool((gradient > 0).all())
     assert not list(Body13Scatterers().parameters())
+
+
+def test_generated_motion_as_13_scatterers() -> None:
+    """Maps of the torso alone are those of a point at the torso: 0.6 of the way from the hips to the neck."""
+    motion = ActivityGenerator().generate("walking", batch=2, duration_s=1.0, rate_hz=30.0)
+    radar = replace(RadarConfig.through_wall(), prf_hz=256.0)
+    body = Body13Scatterers()
+    weak = [1.0] + [1e-12] * 12
+    body.points = JointScatterers(weak)
+    simulator = RadarSimulator(radar, snr_db=None)
+    maps = PoseToDoppler(simulator, scatterers=body)(motion.joints[:, None], motion.valid[:, None], 30.0)
+    assert maps.doppler_time.shape[0] == 2
+
+    hips = motion.joints[:, :, [JOINTS.index("right_hip"), JOINTS.index("left_hip")]].mean(dim=2)
+    torso = 0.6 * motion.joints[:, :, JOINTS.index("neck")] + 0.4 * hips
+    pulses = PoseResampler(radar.prf_hz)(torso[:, :, None], 30.0)
+    expected = simulator(pulses, torch.ones(pulses.shape[:-1], dtype=pulses.dtype))
+    torch.testing.assert_close(
+        maps.doppler_time, expected.doppler_time, rtol=1e-4, atol=1e-4 * float(maps.doppler_time.max())
+    )

@@ -1,0 +1,170 @@
+"""``tensorsim demo``: a person whose motion is known is filmed, and the film's maps are compared with the true ones."""
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tensorsim.commands.networks import default_networks, load_networks
+from tensorsim.commands.options import RadarOptions
+from tensorsim.errors import TensorsimError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from tensorsim.data.render import RenderedVideo
+    from tensorsim.types import Pose
+
+FILM_FPS = 30.0
+#: The true motion is worked out this many times per frame of the film.
+MOMENTS_PER_FRAME = 8
+HEIGHT, WIDTH = 360, 640
+#: Distances at which a whole body fits into the picture of an ordinary lens.
+NEAR_M, FAR_M = 3.0, 6.0
+#: At half the height of a body the camera sees all of it without much of a tilt, as someone filming would hold it.
+CAMERA_M = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Demo(RadarOptions):
+    """Film a rendered person and turn the film into what a radar would have seen. Needs no file.
+
+    Writes what `simulate` writes, film.mp4, and the truth: maps_truth.npz, pose_truth.npz; every picture of a map
+    shows that of the film beside that of the true motion, and summary.json says how far they are apart.
+    """
+
+    activity: str = "walking"
+    """What the person does: walking, punching, kicking, grabbing, sitting down, standing up, rotating, sitting to
+    walking, walking to sitting, falling to walking, walking to falling, or empty."""
+    out: Path = Path("demo")
+    """Folder for the results; its files appear together, when all are complete."""
+    detector: str | None = None
+    """Person detector, see `tensorsim simulate`. Default: $TENSORSIM_DETECTOR, else the shipped one."""
+    pose: str | None = None
+    """COCO-17 heat maps, see `tensorsim simulate`. Default: $TENSORSIM_POSE, else the shipped one."""
+    duration: float = 4.0
+    """Length of the film in seconds."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.motion.activities import activity_index
+
+        self.check(self.out)
+        activity = activity_index(self.activity)
+        if not 0.5 <= self.duration <= 60:
+            raise TensorsimError(f"--duration: got {self.duration}, expected seconds from 0.5 to 60")
+        detector, pose_network = default_networks(self.detector, self.pose)
+        scene = self.radar_scene()
+
+        import numpy as np
+        import torch
+
+        from tensorsim import run
+        from tensorsim.config import ACTIVITIES
+        from tensorsim.data.camera import camera_on
+        from tensorsim.data.render import PersonRenderer
+        from tensorsim.data.video import VideoReader, write_video
+        from tensorsim.device import usable_device
+        from tensorsim.motion.activities import ActivityGenerator
+        from tensorsim.motion.people import PeopleConfig
+        from tensorsim.pipeline import VideoToPose
+        from tensorsim.sources import drawn_by, film_source
+        from tensorsim.vision.kalman import KalmanSmoother
+
+        device = usable_device(self.device)
+        with run.collected_warnings() as messages, torch.inference_mode():
+            networks = load_networks(detector, pose_network)
+            maps_stage = self.pose_to_doppler(scene, self.duration).to(device).eval()
+            true_stage = (
+                replace(self, motion="smooth").pose_to_doppler(scene, self.duration).to(device).eval()
+            )
+            frames = round(self.duration * FILM_FPS)
+            motion = ActivityGenerator(
+                PeopleConfig(start_range_m=(NEAR_M, FAR_M), keep_range_m=(NEAR_M, FAR_M))
+            )
+            truth = motion.generate(
+                activity,
+                seed=self.seed,
+                duration_s=frames / FILM_FPS,
+                rate_hz=FILM_FPS * MOMENTS_PER_FRAME,
+            )
+            height_m = float(truth.people.height_m[0])
+            camera = camera_on(truth.joints, torch.ones_like(truth.valid), HEIGHT, WIDTH, position_m=CAMERA_M)
+            if not self.quiet:
+                print(f"rendering {frames} frames of {ACTIVITIES[activity]} ...", file=sys.stderr)
+            film = PersonRenderer(camera, HEIGHT, WIDTH)(
+                truth.joints[:, ::MOMENTS_PER_FRAME], self.seed, valid=truth.valid[:, ::MOMENTS_PER_FRAME]
+            )
+            people = VideoToPose(
+                *networks,
+                person_height_m=(height_m,),
+                camera=camera,
+                smoother=KalmanSmoother(mode="forward" if self.motion == "paper" else "rts"),
+            )
+            with run.complete_or_nothing(self.out) as folder:
+                write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
+                source = film_source(VideoReader(folder / "film.mp4"), people.to(device).eval(), device)
+                pose, maps = run.simulate(source, maps_stage, folder, self.seed, device, self.quiet)
+                torch.manual_seed(self.seed)
+                true_maps = run.maps_of_pose(
+                    true_stage,
+                    true_pose(truth.joints, truth.valid),
+                    FILM_FPS * MOMENTS_PER_FRAME,
+                    device,
+                    self.quiet,
+                )
+                run.write_maps(folder, maps, run.axes_of(maps_stage, maps), true_maps)
+                np.savez(
+                    folder / "pose_truth.npz",
+                    joints_m=film.joints.numpy(),
+                    keypoints_px=film.keypoints.numpy(),
+                    visibility=film.visibility.numpy(),
+                    boxes_px=film.boxes.numpy(),
+                    valid=truth.valid[:, ::MOMENTS_PER_FRAME].numpy(),
+                    fps=FILM_FPS,
+                )
+                likeness = run.similarity(maps, true_maps)
+                summary = run.summary_of(source, scene, pose, maps, self.seed) | {
+                    "activity": ACTIVITIES[activity],
+                    "person_height_m": round(height_m, 4),
+                    **drawn_by(camera, (HEIGHT, WIDTH)),
+                    "film_against_truth": likeness | joint_errors(pose, film),
+                    "config": self.described() | {"detector": str(detector), "pose": str(pose_network)},
+                    "warnings": messages,
+                }
+                run.write_summary(folder, summary)
+        for message in messages:
+            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        figures = likeness["doppler_time"]
+        print(
+            f"{self.out}: {ACTIVITIES[activity]}, {pose.valid.shape[1]} people found; Doppler-time map from the film "
+            f"against that of the true motion: PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']}"
+        )
+
+
+def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":
+    """Known joints (P, T, 14, 3) and who is there (P, T) as a Pose of one clip; nobody has seen it in a picture."""
+    from tensorsim.types import Pose
+
+    people, frames = valid.shape
+    blank = joints.new_zeros(1, people, frames, 17, 2).float()
+    return Pose(blank[..., :2, :].flatten(-2), blank, blank[..., 0], joints[None].float(), valid[None])
+
+
+def joint_errors(pose: "Pose", film: "RenderedVideo") -> dict[str, Any]:
+    """How far the joints that were found are from the true ones, for the person found longest; None without."""
+    import torch
+
+    found = pose.valid[0]
+    if not bool(found.any()) or not bool(film.valid.any()):
+        return {"joint_error_m": None, "range_error_m": None}
+    best = int(found.sum(dim=1).argmax())
+    both = found[best] & film.valid[0]
+    estimate, truth = pose.joints[0, best, both], film.joints[0, both]
+    root, true_root = estimate[:, (8, 11)].mean(dim=1), truth[:, (8, 11)].mean(dim=1)
+    posture = (estimate - root[:, None]) - (truth - true_root[:, None])
+    away = (root - true_root)[:, 1]
+    return {
+        "joint_error_m": round(float(torch.linalg.vector_norm(posture, dim=-1).mean()), 4),
+        "range_error_m": round(float(away.abs().mean()), 4),
+    }

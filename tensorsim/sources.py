@@ -1,0 +1,244 @@
+"""Where the people of a simulation come from: a film, keypoints of one, or motion that is known."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim import run
+from tensorsim.config import CameraConfig
+from tensorsim.data.camera import camera_on, keypoint_boxes, seen_keypoints
+from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
+from tensorsim.data.video import VideoReader
+from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.pipeline import VideoToPose
+from tensorsim.types import Pose, Tracks
+from tensorsim.vision.along_time import nearest_valid
+
+#: Size of the picture on which people without a film are drawn, and its grey.
+CANVAS = (360, 640)
+_GREY = 40
+#: Motion that comes nearer to the radar than this, or passes behind it, is moved away unless its place is given.
+NEAREST_M = 1.5
+
+#: What the simulation of a path starts from.
+KINDS = {"video": "a video", "keypoints": "COCO keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
+
+
+@dataclass(frozen=True)
+class Source:
+    """People and the pictures to draw them on.
+
+    Attributes:
+        kind: one of :data:`KINDS`.
+        fps: frames per second.
+        frame_count: expected number of frames, None if it is not known.
+        pose: finds the people, with or without progress bars (``quiet``); the Pose of one clip on the CPU.
+        frames: the pictures, in chunks (n, 3, H, W) uint8 RGB.
+        threshold: score from which a keypoint is drawn.
+        about: what the summary says of the source beside its kind.
+    """
+
+    kind: str
+    fps: float
+    frame_count: int | None
+    pose: Callable[[bool], Pose]
+    frames: Callable[[], Iterable[Tensor]]
+    threshold: float
+    about: dict[str, Any]
+
+
+def kind_of(path: Path) -> str:
+    """The kind of source that a path is, by its suffix; a folder is one of keypoints if it has any JSON."""
+    if path.is_dir():
+        return "keypoints" if any(path.glob("*.json")) else "video"
+    return {".bvh": "motion", ".npz": "motion", ".json": "keypoints"}.get(path.suffix.lower(), "video")
+
+
+def film_source(reader: VideoReader, stage: VideoToPose, device: torch.device) -> Source:
+    """People of a film, found by the networks of ``stage``."""
+    return Source(
+        "video",
+        reader.fps,
+        reader.frame_count,
+        lambda quiet: run.pose_of_film(stage, reader, device, quiet),
+        lambda: reader.chunks(8),
+        stage.keypoint_threshold,
+        {},
+    )
+
+
+class Cut(NamedTuple):
+    """Which frames to keep: those at ``start_s <= k / fps < end_s``, every ``stride``-th of them."""
+
+    start_s: float | None = None
+    end_s: float | None = None
+    stride: int = 1
+
+    def frames(self, count: int, fps: float, path: Path) -> slice:
+        """The frames of ``count`` at ``fps`` as a slice.
+
+        Raises:
+            TensorsimError: a stride below 1, an end that is not above the start, or fewer than 2 frames left.
+        """
+        if self.stride < 1:
+            raise TensorsimError(f"stride: got {self.stride}, expected 1 or more")
+        start = 0.0 if self.start_s is None else self.start_s
+        end = math.inf if self.end_s is None else self.end_s
+        if not 0 <= start < end:
+            raise TensorsimError(f"start, end: got {start} and {end} s, expected 0 <= start < end")
+        first = min(count, math.ceil(start * fps - 1e-6))
+        stop = count if end == math.inf else min(count, math.ceil(end * fps - 1e-6))
+        kept = len(range(first, stop, self.stride))
+        if kept < 2:
+            raise TensorsimError(
+                f"{path}: got {kept} of its {count} frames at {fps:g} fps, expected at least 2: motion needs "
+                "two moments"
+            )
+        return slice(first, stop, self.stride)
+
+
+def keypoint_source(
+    path: Path,
+    stage: VideoToPose,
+    fps: float | None,
+    size: tuple[int, int] | None = None,
+    cut: Cut = Cut(),  # noqa: B008  # immutable
+) -> Source:
+    """People whose COCO keypoints are known; only lifting, placing and smoothing of ``stage`` run.
+
+    Args:
+        path: see :func:`~tensorsim.data.motion_files.load_coco_keypoints`.
+        stage: its networks are not used.
+        fps: frames per second; no such file tells them.
+        size: (height, width) of the pictures; None where the file says it.
+        cut: the frames to keep.
+
+    Raises:
+        TensorsimError: no frame rate, no size, a file that cannot be read.
+    """
+    if fps is None:
+        raise TensorsimError(f"{path}: got keypoints without a frame rate, expected --fps")
+    check_positive(fps, "fps")
+    found = load_coco_keypoints(path)
+    size = found.size if size is None else size
+    if size is None:
+        raise TensorsimError(
+            f"{path}: got keypoints without the size of their pictures, expected --image-size"
+        )
+    kept = cut.frames(found.valid.shape[0], fps, path)
+    pose = _lifted(found, stage, kept, size, fps / cut.stride)
+    count = pose.valid.shape[2]
+    return Source(
+        "keypoints",
+        fps / cut.stride,
+        count,
+        lambda quiet: pose,
+        lambda: blank_frames(count, size),
+        stage.keypoint_threshold,
+        {"image_size": list(size)},
+    )
+
+
+def _lifted(found: Keypoints2D, stage: VideoToPose, kept: slice, size: tuple[int, int], fps: float) -> Pose:
+    """The Pose of known keypoints."""
+    keypoints = found.keypoints[kept].transpose(0, 1)
+    scores = found.scores[kept].transpose(0, 1)
+    matched = found.valid[kept].transpose(0, 1)
+    somebody = matched.any(dim=-1)
+    keypoints, scores, matched = keypoints[somebody], scores[somebody], matched[somebody]
+    # As for tracks: somebody who is missed for some frames is still there.
+    valid = (matched.cumsum(-1) > 0) & (matched.flip(-1).cumsum(-1).flip(-1) > 0)
+    nearest = nearest_valid(matched)[..., None].expand(-1, -1, 4)
+    boxes = keypoint_boxes(keypoints, scores).gather(1, nearest) * valid[..., None]
+    tracks = Tracks(boxes[None], valid[None], matched[None])
+    return stage.lift(tracks, keypoints[None], scores[None], size[0], size[1], fps)
+
+
+def motion_source(
+    path: Path,
+    clip: str | None = None,
+    fps: float | None = None,
+    heading_rad: float = 0.0,
+    start_range_m: float | None = None,
+    cut: Cut = Cut(),  # noqa: B008
+) -> Source:
+    """People of a motion file.
+
+    The pictures are empty; on them people are drawn as a camera at the radar would see them if it were turned and
+    zoomed to have them all in its picture.
+
+    Args:
+        path, clip, fps: see :func:`~tensorsim.data.motion_files.load_motion`.
+        heading_rad: turn about the vertical, counter-clockwise seen from above.
+        start_range_m: y of the first person's hips in the first frame; None keeps the places of the file if these
+            are in front of the radar, else moves the people as near as :data:`NEAREST_M`.
+        cut: the frames to keep.
+
+    Raises:
+        TensorsimError: a file that cannot be read, an unknown clip, or nobody in it.
+    """
+    motion = load_motion(path, clip, fps)
+    kept = cut.frames(motion.valid.shape[1], motion.fps, path)
+    motion = Motion(motion.joints[:, kept], motion.valid[:, kept], motion.fps / cut.stride)
+    present = motion.valid.any(dim=1)
+    if not bool(present.any()):
+        raise TensorsimError(f"{path}: got nobody in these frames, expected at least one person")
+    motion = place(
+        Motion(motion.joints[present], motion.valid[present], motion.fps), start_range_m, heading_rad
+    )
+    moved = False
+    if start_range_m is None:
+        nearest = float(motion.joints[motion.valid][..., 1].min())
+        moved = nearest < NEAREST_M
+        if moved:
+            motion = _in_front(motion, nearest)
+    camera = camera_on(motion.joints, motion.valid, *CANVAS)
+    keypoints, scores = seen_keypoints(motion.joints, motion.valid, camera, *CANVAS)
+    pose = Pose(
+        keypoint_boxes(keypoints, scores)[None],
+        keypoints[None],
+        scores[None],
+        motion.joints[None],
+        motion.valid[None],
+    )
+    count = motion.valid.shape[1]
+    return Source(
+        "motion",
+        motion.fps,
+        count,
+        lambda quiet: pose,
+        lambda: blank_frames(count, CANVAS),
+        0.5,
+        {"moved_in_front_of_the_radar": moved, **drawn_by(camera, CANVAS)},
+    )
+
+
+def _in_front(motion: Motion, nearest: float) -> Motion:
+    """People moved so that none comes nearer than :data:`NEAREST_M` and their paths are centred on x = 0."""
+    hips = motion.joints[motion.valid][:, (8, 11), 0]
+    shift = motion.joints.new_tensor([-float(hips.min() + hips.max()) / 2, NEAREST_M - nearest, 0.0])
+    return motion._replace(joints=(motion.joints + shift) * motion.valid[..., None, None])
+
+
+def drawn_by(camera: CameraConfig, size: tuple[int, int]) -> dict[str, Any]:
+    """What the summary says of a camera."""
+    return {
+        "camera": {
+            "position_m": list(camera.position_m),
+            "horizontal_fov_deg": round(math.degrees(camera.horizontal_fov_rad), 2),
+            "pitch_deg": round(math.degrees(camera.pitch_rad), 2),
+            "yaw_deg": round(math.degrees(camera.yaw_rad), 2),
+            "image_size": list(size),
+        }
+    }
+
+
+def blank_frames(count: int, size: tuple[int, int]) -> Iterator[Tensor]:
+    """Empty pictures, one by one."""
+    for _ in range(count):
+        yield torch.full((1, 3, *size), _GREY, dtype=torch.uint8)

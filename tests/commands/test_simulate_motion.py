@@ -1,0 +1,160 @@
+"""``tensorsim simulate`` on motion files and keypoints: the outputs of a video, and the maps of that very motion."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import tensorsim as ts
+from tensorsim import cli
+from tensorsim.commands.options import RadarOptions
+from tensorsim.data.camera import camera_on, seen_keypoints
+from tests.bvh import write_bvh
+from tests.test_cli import FILES
+from tests.test_sources import coco_json
+
+FPS = 30.0
+QUICK = ["--scene", "through-wall", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def motion() -> ts.motion.GeneratedMotion:
+    """Somebody who walks."""
+    return ts.motion.ActivityGenerator().generate("walking", seed=3, rate_hz=FPS)
+
+
+@pytest.fixture(scope="module")
+def walk(motion: ts.motion.GeneratedMotion) -> np.ndarray:
+    """(45, 14, 3) metres: its first 1.5 s."""
+    return motion.joints[0, :45].numpy()
+
+
+def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
+    write_bvh(tmp_path / "walk.bvh", walk, FPS)
+    out = tmp_path / "out"
+    cli.main(["simulate", str(tmp_path / "walk.bvh"), "--out", str(out), "--snr", "80", *QUICK])
+    assert {p.name for p in out.iterdir()} == FILES
+    maps, pose = np.load(out / "maps.npz"), np.load(out / "pose.npz")
+    assert np.abs(pose["joints_m"][0, ..., :2] - walk[..., :2]).max() < 1e-5
+    assert float(pose["fps"]) == pytest.approx(FPS)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["source"]["kind"] == "motion"
+    assert summary["frames"] == 45
+    assert summary["config"]["detector"] is None
+
+    simulator = ts.radar.RadarSimulator(
+        ts.RadarConfig.through_wall(), ts.WallConfig(), multipath=True, snr_db=None
+    )
+    joints = torch.from_numpy(pose["joints_m"])[None]
+    valid = torch.ones(1, 1, 45, dtype=torch.bool)
+    expected = ts.PoseToDoppler(simulator)(joints, valid, FPS).doppler_time[0].numpy()
+    assert maps["doppler_time"] == pytest.approx(expected, abs=2e-3 * float(expected.max()))
+
+
+def test_place_heading_and_part(walk: np.ndarray, tmp_path: Path) -> None:
+    np.savez(tmp_path / "two.npz", first=walk, second=walk * 0.9, fps=FPS)
+    arguments = ["simulate", str(tmp_path / "two.npz"), "--out", str(tmp_path / "out"), "--clip", "first"]
+    arguments += ["--initial-distance", "3.5", "--heading", "90", "--start", "0.5", "--stride", "2", *QUICK]
+    cli.main(arguments)
+    pose = np.load(tmp_path / "out" / "pose.npz")
+    assert pose["joints_m"].shape == (1, 15, 14, 3)
+    assert float(pose["fps"]) == 15.0
+    hips = pose["joints_m"][0][:, (8, 11), :2].mean(axis=1)
+    assert hips[0] == pytest.approx([0.0, 3.5], abs=1e-5)
+    way = walk[43, (8, 11), :2].mean(axis=0) - walk[15, (8, 11), :2].mean(axis=0)
+    assert hips[-1] - hips[0] == pytest.approx([-way[1], way[0]], abs=1e-4), "a quarter turn to the left"
+
+
+def test_keypoints_give_what_a_video_gives(
+    motion: ts.motion.GeneratedMotion, walk: np.ndarray, tmp_path: Path
+) -> None:
+    joints, valid = torch.from_numpy(walk)[None], torch.ones(1, 45, dtype=torch.bool)
+    # The command takes a camera that looks level along +y.
+    camera = ts.CameraConfig(horizontal_fov_rad=camera_on(joints, valid, 720, 720).horizontal_fov_rad * 1.6)
+    keypoints, scores = seen_keypoints(joints, valid, camera, 720, 720)
+    folder = tmp_path / "keypoints"
+    folder.mkdir()
+    whole = coco_json(keypoints.numpy(), scores.numpy())
+    for t in range(45):
+        people = [a for a in whole["annotations"] if a["image_id"] == t]
+        (folder / f"{t:03}.json").write_text(json.dumps({"annotations": people}))
+    out = tmp_path / "out"
+    fov = str(np.degrees(camera.horizontal_fov_rad))
+    height = str(float(motion.people.height_m[0]))
+    arguments = ["simulate", str(folder), "--out", str(out), "--fps", "30", "--image-size", "720", "720"]
+    cli.main([*arguments, "--camera-fov", fov, "--person-height", height, *QUICK])
+    assert {p.name for p in out.iterdir()} == FILES
+    pose = np.load(out / "pose.npz")
+    np.testing.assert_allclose(pose["keypoints_px"], keypoints.numpy(), atol=1e-3)
+    found = pose["joints_m"][0][:, (8, 11), 1].mean(axis=1)
+    truth = walk[:, (8, 11), 1].mean(axis=1)
+    assert found - truth == pytest.approx(0 * truth, abs=0.4)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["source"] == {"kind": "keypoints", "image_size": [720, 720]}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("walk.npz", ["--detector", "x.onnx"], r"--detector: got it for motion capture .* for a video only"),
+        ("walk.npz", ["--camera-fov", "50"], r"--camera-fov: got it for motion capture .* a video or COCO"),
+        ("walk.npz", ["--image-size", "9", "9"], "--image-size: got it for motion capture"),
+        ("walk.json", ["--heading", "9"], "--heading: got it for COCO keypoints"),
+        ("walk.mp4", ["--clip", "a"], "--clip: got it for a video"),
+        ("walk.json", ["--image-size", "0", "9"], "--image-size: got .* positive numbers of pixels"),
+        ("walk.npz", ["--heading", "nan"], "--heading: got nan"),
+        ("walk.npz", ["--initial-distance", "1", "2"], "--initial-distance: got .* the first person"),
+        ("walk.npz", ["--clip", "nothing"], "got key 'nothing', expected one of joints"),
+        ("walk.npz", ["--stride", "40"], "got 1 of its 30 frames"),
+        ("nothing.bvh", [], "nothing.bvh: no such file"),
+        ("nothing.json", ["--fps", "30"], "nothing.json: got a file that cannot be read"),
+        ("walk.json", [], "walk.json: got keypoints without a frame rate, expected --fps"),
+        ("walk.json", ["--fps", "30"], "walk.json: got a file that cannot be read as JSON"),
+    ],
+)
+def test_bad_options_are_refused_before_work_starts(
+    name: str, options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "walk.npz", joints=np.ones((30, 14, 3)), fps=FPS)
+    (tmp_path / "walk.json").write_text("no JSON")
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["simulate", str(tmp_path / name), "--out", str(tmp_path / "out"), *options, *QUICK])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert re.search(message, error), error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_body_has_its_scatterers(walk: np.ndarray) -> None:
+    joints = torch.from_numpy(walk).float()[None, None]
+    valid = torch.ones(1, 1, 45, dtype=torch.bool)
+    scenes = {}
+    for body, count in (("joints", 14), ("limbs", 36), ("version1", 13)):
+        options = RadarOptions(body=body, scene="through-wall")  # type: ignore[arg-type]
+        stage = options.pose_to_doppler(options.radar_scene(), 1.5)
+        points, rcs = stage.scene(stage.resampler.coefficients(joints, FPS), valid, FPS, 0, 100)
+        assert points.shape == (1, 100, count, 3)
+        scenes[body] = points[0, 0], rcs[0, 0]
+    # Version 1 has a torso of its own instead of neck and hips; its limbs end at the same joints.
+    knee = ts.JOINTS.index("right_knee")
+    torch.testing.assert_close(scenes["version1"][0][3], scenes["joints"][0][knee])
+    assert float(scenes["version1"][1].sum()) == pytest.approx(4.2)
+
+
+@pytest.mark.parametrize("clip", ["kick", "crawl"])
+def test_captured_motion(clip: str, shared_data: Path, tmp_path: Path) -> None:
+    file = shared_data / "mocap" / "deepmimic_14joints.npz"
+    cli.main(["simulate", str(file), "--clip", clip, "--out", str(tmp_path / "out"), *QUICK])
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+    pose = np.load(tmp_path / "out" / "pose.npz")
+    with np.load(file) as capture:
+        bones = np.linalg.norm(capture[clip][:, 8] - capture[clip][:, 9], axis=-1)
+    assert np.linalg.norm(pose["joints_m"][0, :, 8] - pose["joints_m"][0, :, 9], axis=-1) == pytest.approx(
+        bones, abs=1e-5
+    )
+    assert pose["joints_m"][..., 1].min() > 1.49
+    assert pose["keypoint_scores"].min() == 1, "the whole body is drawn"

@@ -1,0 +1,222 @@
+"""People from films, keypoints and motion files: what is kept, where they are put, what is drawn."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import tensorsim as ts
+from tensorsim.data.camera import camera_on, seen_keypoints
+from tensorsim.data.video import VideoReader, write_video
+from tensorsim.errors import TensorsimError
+from tensorsim.sources import CANVAS, NEAREST_M, Cut, keypoint_source, kind_of, motion_source
+from tests.bvh import write_bvh
+
+FPS = 30.0
+
+
+@pytest.fixture(scope="module")
+def walk() -> np.ndarray:
+    """(45, 14, 3) metres of somebody who walks."""
+    return ts.motion.ActivityGenerator().generate("walking", seed=3, rate_hz=FPS).joints[0, :45].numpy()
+
+
+def coco_json(
+    keypoints: np.ndarray, scores: np.ndarray, size: tuple[int, int] | None = None
+) -> dict[str, Any]:
+    """Keypoints (P, T, 17, 2) with scores (P, T, 17) as annotations of a video, entries without scores left out."""
+    annotations = [
+        {
+            "image_id": t,
+            "track_id": p,
+            "keypoints": np.concatenate([keypoints[p, t], scores[p, t, :, None]], axis=1).ravel().tolist(),
+        }
+        for p in range(len(keypoints))
+        for t in range(keypoints.shape[1])
+        if scores[p, t].any()
+    ]
+    shape = {} if size is None else {"height": size[0], "width": size[1]}
+    return {"images": [{"id": t, **shape} for t in range(keypoints.shape[1])], "annotations": annotations}
+
+
+def lifter(camera: ts.CameraConfig, height_m: float) -> ts.VideoToPose:
+    return ts.VideoToPose(nn.Identity(), nn.Identity(), person_height_m=(height_m,), camera=camera)
+
+
+def test_kinds(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "0.json").write_text("[]")
+    names = {"a.BVH": "motion", "a.npz": "motion", "a.json": "keypoints", "frames": "keypoints"}
+    names |= {"a.mp4": "video", "a": "video", ".": "video"}
+    assert {name: kind_of(tmp_path / name) for name in names} == names
+
+
+@pytest.mark.parametrize("cut", [Cut(), Cut(0.5), Cut(None, 1.0), Cut(0.31, 1.29, 3), Cut(0, math.inf, 7)])
+def test_a_cut_keeps_the_frames_that_a_film_keeps(tmp_path: Path, cut: Cut) -> None:
+    path = tmp_path / "film.avi"
+    write_video(path, (np.full((16, 16, 3), 12 * k, np.uint8) for k in range(20)), 10.0)
+    reader = VideoReader(path, start_s=cut.start_s, end_s=cut.end_s, stride=cut.stride)
+    levels = torch.cat(list(reader.chunks(9))).float().mean(dim=(1, 2, 3))
+    kept = (levels / 12).round().int().tolist()
+    assert kept == list(range(20))[cut.frames(20, 10.0, path)]
+
+
+@pytest.mark.parametrize(
+    ("cut", "message"),
+    [
+        (Cut(stride=0), "stride: got 0"),
+        (Cut(-1.0), "start, end: got -1.0"),
+        (Cut(1.0, 0.5), "start, end: got 1.0 and 0.5"),
+        (Cut(math.nan), "start, end: got nan"),
+        (Cut(1.95), "got 0 of its 20 frames"),
+        (Cut(stride=20), "got 1 of its 20 frames"),
+    ],
+)
+def test_a_cut_that_leaves_nothing_is_refused(cut: Cut, message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        cut.frames(20, 10.0, Path("x"))
+
+
+def test_bvh_of_generated_motion_comes_back(walk: np.ndarray, tmp_path: Path) -> None:
+    write_bvh(tmp_path / "walk.bvh", walk, FPS)
+    source = motion_source(tmp_path / "walk.bvh")
+    assert source.fps == pytest.approx(FPS)
+    assert source.frame_count == 45
+    pose = source.pose(True)
+    assert pose.valid.all()
+    # Placing puts the lowest ankle at its height over the floor, where the generator had it within 2 cm.
+    shift = pose.joints[0, 0].numpy() - walk
+    assert np.abs(shift - [0, 0, shift[0, 0, 2]]).max() < 1e-5
+    assert abs(shift[0, 0, 2]) < 0.03
+    assert source.about["moved_in_front_of_the_radar"] is False
+
+
+def test_who_comes_too_near_is_moved_away_unless_placed(walk: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "walk.npz"
+    np.savez(path, joints=walk - [3.0, 5.0, 0.0], fps=FPS)
+    source = motion_source(path)
+    joints = source.pose(True).joints[0, 0]
+    assert float(joints[..., 1].min()) == pytest.approx(NEAREST_M, abs=1e-5)
+    hips = joints[:, (8, 11), 0]
+    assert float(hips.min() + hips.max()) == pytest.approx(0, abs=1e-5)
+    assert source.about["moved_in_front_of_the_radar"] is True
+    placed = motion_source(path, start_range_m=4.0, heading_rad=math.pi).pose(True).joints[0, 0]
+    assert float(placed[0, (8, 11), 1].mean()) == pytest.approx(4.0, abs=1e-5)
+    turned = placed[-1, (8, 11), :2].mean(0) - placed[0, (8, 11), :2].mean(0)
+    original = walk[-1, (8, 11), :2].mean(0) - walk[0, (8, 11), :2].mean(0)
+    np.testing.assert_allclose(turned.numpy(), -original, atol=1e-5)
+
+
+def test_cut_clip_and_people_who_are_never_there(walk: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "many.npz"
+    people = np.stack([walk, walk + np.array([0.5, 1.0, 0.0]), walk * 0.0])
+    valid = np.ones((3, 45), bool)
+    valid[1, :20] = False
+    valid[2] = False
+    np.savez(path, joints=people, joints_fps=FPS, valid=valid, other=walk)
+    source = motion_source(path, "joints", cut=Cut(0.5, None, 3))
+    pose = source.pose(True)
+    assert source.fps == pytest.approx(10.0)
+    assert pose.valid.tolist() == valid[None, :2, 15::3].tolist()
+    assert pose.joints.isfinite().all()
+    assert pose.keypoint_scores[0, 1, :1].max() == 0
+    np.testing.assert_allclose(
+        (pose.joints[0, 0, 4, 3] - pose.joints[0, 0, 0, 3]).numpy(), walk[27, 3] - walk[15, 3], atol=1e-5
+    )
+    with pytest.raises(TensorsimError, match="expected one of joints, other"):
+        motion_source(path, "nothing")
+    with pytest.raises(TensorsimError, match="nobody in these frames"):
+        motion_source(_never_there(tmp_path, walk))
+
+
+def _never_there(folder: Path, walk: np.ndarray) -> Path:
+    np.savez(folder / "empty.npz", joints=walk, fps=FPS, valid=np.zeros((1, 45), bool))
+    return folder / "empty.npz"
+
+
+def test_drawn_people_are_where_the_summary_says_the_camera_sees_them(
+    walk: np.ndarray, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "walk.npz", joints=walk, fps=FPS)
+    source = motion_source(tmp_path / "walk.npz")
+    pose, about = source.pose(True), source.about["camera"]
+    camera = ts.CameraConfig(
+        horizontal_fov_rad=math.radians(about["horizontal_fov_deg"]),
+        pitch_rad=math.radians(about["pitch_deg"]),
+        yaw_rad=math.radians(about["yaw_deg"]),
+        position_m=tuple(about["position_m"]),
+    )
+    keypoints = seen_keypoints(pose.joints[0], pose.valid[0], camera, *about["image_size"])[0]
+    torch.testing.assert_close(pose.keypoints[0], keypoints, atol=0.1, rtol=0)
+    assert pose.keypoint_scores.min() == 1
+    frames = torch.cat(list(source.frames()))
+    assert frames.shape == (45, 3, *CANVAS)
+    assert frames.dtype == torch.uint8
+
+
+@pytest.fixture(scope="module")
+def filmed(walk: np.ndarray) -> tuple[ts.CameraConfig, np.ndarray, np.ndarray]:
+    """A camera and the keypoints (1, 45, 17, 2) and scores that it sees of the walk."""
+    joints, valid = torch.from_numpy(walk)[None], torch.ones(1, 45, dtype=torch.bool)
+    camera = camera_on(joints, valid, *CANVAS)
+    keypoints, scores = seen_keypoints(joints, valid, camera, *CANVAS)
+    return camera, keypoints.numpy(), scores.numpy()
+
+
+def test_true_keypoints_lead_back_to_the_motion(
+    walk: np.ndarray, filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    camera, keypoints, scores = filmed
+    path = tmp_path / "walk.json"
+    path.write_text(json.dumps(coco_json(keypoints, scores, CANVAS)))
+    people = ts.motion.ActivityGenerator().generate("walking", seed=3, rate_hz=FPS).people
+    source = keypoint_source(path, lifter(camera, float(people.height_m[0])), FPS)
+    joints = source.pose(True).joints[0, 0].numpy()
+    assert source.frame_count == 45
+    assert torch.cat(list(source.frames())).shape == (45, 3, *CANVAS)
+    error = np.linalg.norm(joints - walk, axis=-1)
+    assert error.mean() < 0.35, "one camera, range by apparent size"
+    away = joints[:, (8, 11), 1].mean(1) - walk[:, (8, 11), 1].mean(1)
+    assert np.abs(away).mean() < 0.3
+    assert np.abs(away - away.mean()).max() < 0.2, "range follows the walk"
+
+
+def test_gaps_of_a_track_are_bridged_and_frames_are_cut(
+    filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    camera, keypoints, scores = filmed
+    scores = scores.copy()
+    scores[0, :4] = 0
+    scores[0, 20:24] = 0
+    path = tmp_path / "walk.json"
+    path.write_text(json.dumps(coco_json(keypoints, scores)))
+    source = keypoint_source(path, lifter(camera, 1.75), 60.0, CANVAS, Cut(0.0, None, 2))
+    pose = source.pose(True)
+    assert source.fps == 30.0
+    assert pose.valid[0, 0].tolist() == [False] * 2 + [True] * 21
+    assert pose.keypoint_scores[0, 0, 10:12].max() == 0
+    assert (pose.boxes[0, 0, 2:, 2] > pose.boxes[0, 0, 2:, 0]).all(), "a box in every frame of the track"
+    steps = pose.joints[0, 0, 3:].diff(dim=0).norm(dim=-1).amax(dim=-1)
+    assert float(steps.max()) < 0.3, "coasts through the gap"
+
+
+@pytest.mark.parametrize(
+    ("fps", "size", "message"),
+    [(None, CANVAS, "expected --fps"), (0.0, CANVAS, "fps: got 0.0"), (30.0, None, "expected --image-size")],
+)
+def test_keypoints_need_a_rate_and_a_size(
+    filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray],
+    tmp_path: Path,
+    fps: float | None,
+    size: tuple[int, int] | None,
+    message: str,
+) -> None:
+    path = tmp_path / "walk.json"
+    path.write_text(json.dumps(coco_json(filmed[1], filmed[2])))
+    with pytest.raises(TensorsimError, match=message):
+        keypoint_source(path, lifter(filmed[0], 1.75), fps, size)
