@@ -1,6 +1,6 @@
 """A seeded sampler of human poses: what people in activity videos do, family by family.
 
-The shipped pose library is made by it (``python -m tensorsim.motion.pose_sampler``).
+The shipped pose library is made of it and of the activities (``tensorsim library build --generate N``).
 """
 
 import math
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import BodyPose, forward_kinematics, mirror
+from tensorsim.motion.body import BodyPose, Proportions, forward_kinematics, mirror
 
 _DEGREE = math.pi / 180
 
@@ -32,12 +32,24 @@ class _Draw:
         z = torch.randn(self.count, *tail, generator=self.generator, dtype=torch.float64)
         return degrees * _DEGREE * z
 
+    def deviation(self, standard: float) -> Tensor:
+        """One relative deviation per segment, (count, 7)."""
+        tail = (self.count, len(Proportions._fields))
+        z = torch.randn(*tail, generator=self.generator, dtype=torch.float64)
+        return standard * z.clamp(-2, 2)
+
     def stack(self, *ranges: tuple[float, float], tail: tuple[int, ...] = ()) -> Tensor:
         """Angles (count, *tail, len(ranges)), one range each."""
         return torch.stack([self.angle(low, high, *tail) for low, high in ranges], dim=-1)
 
 
-def _gait(draw: _Draw, stride: Tensor, swing_knee: Tensor, elbow: tuple[float, float]) -> BodyPose:
+def _gait(
+    draw: _Draw,
+    stride: Tensor,
+    swing_knee: Tensor,
+    elbow: tuple[float, float],
+    pitch: tuple[float, float],
+) -> BodyPose:
     """A random phase of a gait cycle with hip excursion ``stride`` and flexion ``swing_knee`` in swing."""
     right = draw.number(0.0, 1.0)
     phase = torch.stack([right, right + 0.5], dim=-1)  # the legs are half a cycle apart
@@ -60,18 +72,18 @@ def _gait(draw: _Draw, stride: Tensor, swing_knee: Tensor, elbow: tuple[float, f
         shoulder=shoulder,
         elbow=draw.angle(elbow[0], elbow[1], 1) + 0.4 * arm_swing.clamp(min=0),
         trunk=torch.stack(
-            [draw.angle(0, 10) + 0.1 * stride, draw.jitter(2.0), -0.15 * (hip[:, 0] - hip[:, 1])], dim=-1
+            [draw.angle(*pitch) + 0.1 * stride, draw.jitter(2.0), -0.15 * (hip[:, 0] - hip[:, 1])], dim=-1
         ),
         pelvis=torch.stack([draw.jitter(2.0), 0.1 * (hip[:, 0] - hip[:, 1])], dim=-1),
     )
 
 
 def _walk(draw: _Draw) -> BodyPose:
-    return _gait(draw, draw.angle(8, 32), draw.angle(25, 70), (3, 40))
+    return _gait(draw, draw.angle(8, 32), draw.angle(25, 70), (3, 40), (-14, 10))
 
 
 def _run(draw: _Draw) -> BodyPose:
-    return _gait(draw, draw.angle(28, 55), draw.angle(70, 125), (60, 115))
+    return _gait(draw, draw.angle(28, 55), draw.angle(70, 125), (40, 115), (-8, 14))
 
 
 def _any_arms(draw: _Draw) -> tuple[Tensor, Tensor]:
@@ -88,6 +100,7 @@ def _stand(draw: _Draw) -> BodyPose:
         knee=knee,
         shoulder=draw.stack((-15, 25), (3, 25), (-10, 50), tail=(2,)),
         elbow=draw.angle(0, 50, 2),
+        trunk=draw.stack((-12, 12), (-4, 4), (-8, 8)),
     )
 
 
@@ -219,15 +232,16 @@ _FAMILIES: tuple[tuple[Callable[[_Draw], BodyPose], float], ...] = (
 )
 
 
-def sample_poses(count: int, seed: int = 0) -> Tensor:
+def sample_poses(count: int, seed: int = 0, limb_deviation: float = 0.0) -> Tensor:
     """Random human poses: gait phases, standing, reaching, punching, kicking, sitting, falling, jumping.
 
     Args:
         count: number of poses, at least one per family (13).
         seed: the same seed gives the same poses.
+        limb_deviation: standard deviation of the length of each segment, as a share of it, cut at 2 deviations.
 
     Returns:
-        (count, 14, 3) float64 in body heights, facing +y, relative to the middle of the hips.
+        (count, 14, 3) float64 in body heights of the mean body, facing +y, relative to the middle of the hips.
     """
     if count < len(_FAMILIES):
         raise TensorsimError(f"sample_poses: got count {count}, expected at least {len(_FAMILIES)}")
@@ -246,7 +260,9 @@ def sample_poses(count: int, seed: int = 0) -> Tensor:
             hip=pose.hip + draw.jitter(1.5, 2, 2),
             shoulder=pose.shoulder + draw.jitter(2.0, 2, 3),
         )
-        poses.append(mirrored_half(forward_kinematics(pose)))
+        limbs = (1 + draw.deviation(limb_deviation)).unbind(-1)
+        body = Proportions(*(mean * limb for mean, limb in zip(Proportions(), limbs, strict=True)))
+        poses.append(mirrored_half(forward_kinematics(pose, proportions=body)))
     return torch.cat(poses)
 
 
@@ -254,21 +270,3 @@ def mirrored_half(joints: Tensor) -> Tensor:
     """Every second pose of (L, 14, 3) replaced by its mirror image: neither hand is preferred."""
     odd = torch.arange(joints.shape[0], device=joints.device)[:, None, None] % 2 == 1
     return torch.where(odd, mirror(joints), joints)
-
-
-def main() -> None:
-    """Write sampled poses as a library: ``poses`` (count, 14, 3) float16 in a safetensors file."""
-    import argparse
-
-    from safetensors.torch import save_file
-
-    parser = argparse.ArgumentParser(prog="python -m tensorsim.motion.pose_sampler", description=main.__doc__)
-    parser.add_argument("file", help="safetensors file to write")
-    parser.add_argument("--count", type=int, default=8000, help="number of poses (default 8000)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the sampler (default 0)")
-    options = parser.parse_args()
-    save_file({"poses": sample_poses(options.count, options.seed).half()}, options.file)
-
-
-if __name__ == "__main__":
-    main()

@@ -21,66 +21,8 @@ from tensorsim.errors import (
 )
 from tensorsim.types import Lifted
 from tensorsim.vision.along_time import nearest_valid
-from tensorsim.vision.pose_library import all_headings, load_pose_library, standardise_poses, turn
-
-
-def normalise_weights(weights: Tensor) -> Tensor:
-    """Weights (..., J) summing to one over the joints; all zero stays all zero."""
-    return weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
-
-
-def nearest_poses(
-    keypoints: Tensor, weights: Tensor, library: Tensor, yaws: int, neighbours: int, chunk: int
-) -> Tensor:
-    """Exact search for the library poses whose projections fit best.
-
-    A pose p fits key points k with scale a > 0 and translation b by ``min sum_j w_j |k_j - a p_j - b|^2``,
-    which is ``Skk - Skp^2 / Spp`` with weighted, centred sums; poses that only fit mirrored (Skp <= 0) do not
-    count. With equal weights the order is that of the distances between centred poses of unit norm. Every sum
-    is a matrix product, evaluated ``chunk`` frame-pose pairs at a time with a running top k, which bounds the
-    memory to about 24 bytes a pair.
-
-    Args:
-        keypoints: (N, 14, 2) pixels, v down.
-        weights: (N, 14), not negative.
-        library: (L, 14, 3) standardised poses.
-        yaws: headings at which each is tried.
-        neighbours: how many to return.
-        chunk: frame-pose pairs evaluated at once.
-
-    Returns:
-        (N, neighbours) int64 indices into ``all_headings(library, yaws)``, best first. Not differentiable.
-    """
-    frames = 256
-    step = max(chunk // (frames * yaws), 1)
-    w = normalise_weights(weights)
-    centred = (keypoints - (w[..., None] * keypoints).sum(dim=-2, keepdim=True)) * w[..., None]
-    # Unit norm of the key points keeps float32 in range; it does not change the order.
-    centred = centred / (centred.square().sum(dim=(-2, -1), keepdim=True) + 1e-12).sqrt()
-    flat = torch.cat([centred[..., 0], centred[..., 1]], dim=-1)
-
-    best_gain = torch.full(
-        (keypoints.shape[0], neighbours), -1.0, dtype=keypoints.dtype, device=keypoints.device
-    )
-    best = torch.zeros((keypoints.shape[0], neighbours), dtype=torch.int64, device=keypoints.device)
-    for start in range(0, library.shape[0], step):
-        poses = all_headings(library[start : start + step].to(keypoints.dtype), yaws)
-        x, v = poses[..., 0].t(), -poses[..., 2].t()
-        xv, square = torch.cat([x, v]), x.square() + v.square()
-        count = min(neighbours, poses.shape[0])
-        for row in range(0, keypoints.shape[0], frames):
-            part = w[row : row + frames]
-            cross = torch.mm(flat[row : row + frames], xv).clamp_(min=0.0)
-            spread = (
-                torch.mm(part, square).sub_(torch.mm(part, x).square_()).sub_(torch.mm(part, v).square_())
-            )
-            gain, index = cross.square_().div_(spread.clamp_(min=1e-6)).topk(count, dim=-1)
-            gain = torch.cat([best_gain[row : row + frames], gain], dim=-1)
-            index = torch.cat([best[row : row + frames], index + start * yaws], dim=-1)
-            gain, keep = gain.topk(neighbours, dim=-1)
-            best_gain[row : row + frames] = gain
-            best[row : row + frames] = index.gather(-1, keep)
-    return best
+from tensorsim.vision.pose_library import load_pose_library, standardise_poses
+from tensorsim.vision.pose_search import PoseSearch, normalise_weights
 
 
 def fit_poses(keypoints: Tensor, weights: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -134,8 +76,8 @@ def smooth_assignment(emission: Tensor, transition: Tensor) -> Tensor:
 class NearestPoseLifter(nn.Module):
     """3D poses for the joints of tracked people, from the nearest poses of a pool.
 
-    Each frame takes the ``neighbours`` best matches of :func:`nearest_poses`, weighted by how well they fit
-    and, with ``temporal`` > 0, by how well they agree with those of the frames before and after
+    Each frame takes the ``neighbours`` best matches of :class:`tensorsim.vision.pose_search.PoseSearch`, weighted
+    by how well they fit and, with ``temporal`` > 0, by how well they agree with those of the frames before and after
     (:func:`smooth_assignment`), so that depths do not flip between frames that look alike. ``neighbours=1``
     is the paper's nearest match.
 
@@ -147,7 +89,7 @@ class NearestPoseLifter(nn.Module):
         tolerance: relative error (square root of ``distance``) at which a candidate loses its weight.
         temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
             body heights and by 1 % of the size; 0 treats frames alone.
-        chunk: frame-pose pairs compared at once, which bounds the memory: about 24 bytes a pair.
+        chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair.
 
     Shape:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
@@ -158,8 +100,6 @@ class NearestPoseLifter(nn.Module):
     Raises:
         TensorsimError: other shapes, NaN, negative weights, or no frames.
     """
-
-    library: Tensor
 
     def __init__(
         self,
@@ -184,12 +124,12 @@ class NearestPoseLifter(nn.Module):
         check_positive(tolerance, "NearestPoseLifter.tolerance")
         if not 0 <= temporal < float("inf"):
             raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
-        self.yaws, self.neighbours, self.tolerance = yaws, neighbours, tolerance
-        self.temporal, self.chunk, self.search_joints = temporal, chunk, search_joints
+        self.neighbours, self.tolerance = neighbours, tolerance
+        self.temporal, self.search_joints = temporal, search_joints
         # Per frame, at 30 frames a second: a limb that moves at 1.6 m/s, in body heights; somebody 4 m away who
         # walks at 1.2 m/s, in relative size. Sizes that change faster than bodies can move are wrong matches.
         self.change, self.size_change = 0.03, 0.01
-        self.register_buffer("library", poses, persistent=False)
+        self.search = PoseSearch(poses, yaws, neighbours, chunk)
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
         """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
@@ -218,19 +158,12 @@ class NearestPoseLifter(nn.Module):
         weights = weights.gather(1, source[..., None].expand_as(weights)).to(keypoints.dtype)
 
         with torch.no_grad():
-            index = nearest_poses(
-                keypoints.flatten(0, 1),
-                weights.flatten(0, 1),
-                self.library,
-                self.yaws,
-                self.neighbours,
-                self.chunk,
-            ).reshape(tracks, frames, self.neighbours)
+            index = self.search(keypoints.flatten(0, 1), weights.flatten(0, 1))
+            index = index.reshape(tracks, frames, self.neighbours)
             # A few joints fit many poses: such a frame chooses among those of the nearest better one.
             known = nearest_valid(seen.gather(1, source) >= self.search_joints)
             index = index.gather(1, known[..., None].expand_as(index))
-        base = self.library[torch.div(index, self.yaws, rounding_mode="floor")].to(keypoints.dtype)
-        poses = turn(base, (index % self.yaws).to(keypoints.dtype) * (2 * math.pi / self.yaws))
+        poses = self.search.poses(index).to(keypoints.dtype)
         scale, placed, distance = fit_poses(keypoints[:, :, None], weights[:, :, None], poses)
 
         share = self._share(poses, scale, distance, placeable)

@@ -1,41 +1,53 @@
-"""Nearest-match search: time and memory against NumPy in the same run.
+"""Search for nearest poses: time and memory against faiss and NumPy in the same run.
 
-python tests/benchmarks/bench_lifter.py [poses] [frames]
+python -m tests.benchmarks.bench_lifter [poses] [frames] [--threads N]
+
+Faiss is no dependency: `pip install faiss-cpu`. Its exact search (IndexFlatL2) compares the same 28 numbers, centred
+projections of unit norm. Two pools: people at all headings, searched with walking people, and random numbers, in
+which no search can leave anything out.
 """
 
+import argparse
 import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from tensorsim.vision.lifter import nearest_poses
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.vision.pose_library import all_headings, standardise_poses
+from tensorsim.vision.pose_search import PoseSearch, seen_along_depth
+
+try:
+    import faiss
+except ImportError:
+    faiss = None  # type: ignore[assignment]
+
+YAWS = 24
 
 
-def median_seconds(function: Callable[[], object], repeats: int) -> float:
-    times = []
+def seconds(functions: list[Callable[[], object]], repeats: int) -> list[float]:
+    """Median time of each, taken in turn so that a busy machine hits all alike."""
+    times: list[list[float]] = [[] for _ in functions]
     for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+        for function, spent in zip(functions, times, strict=True):
+            start = time.perf_counter()
+            function()
+            spent.append(time.perf_counter() - start)
+    return [statistics.median(spent) for spent in times]
 
 
 def numpy_search(keypoints: np.ndarray, library: np.ndarray, block: int = 65536) -> np.ndarray:
-    """The paper's search (equal weights): blocks of normalised projections, running argmin."""
-    k = keypoints - keypoints.mean(axis=1, keepdims=True)
-    k = (k / np.linalg.norm(k, axis=(1, 2), keepdims=True)).reshape(len(k), -1)
-    best, index = np.full(len(k), np.inf, np.float32), np.zeros(len(k), np.int64)
+    """The paper's search (equal weights) in blocks with a running argmin."""
+    best, index = np.full(len(keypoints), np.inf, np.float32), np.zeros(len(keypoints), np.int64)
     for start in range(0, len(library), block):
-        p = library[start : start + block][..., [0, 2]] * np.array([1, -1], np.float32)
-        p = p - p.mean(axis=1, keepdims=True)
-        p = (p / np.linalg.norm(p, axis=(1, 2), keepdims=True)).reshape(len(p), -1)
-        distance = 2 - 2 * (k @ p.T)
+        distance = 2 - 2 * (keypoints @ library[start : start + block].T)
         found = distance.argmin(axis=1)
-        value = distance[np.arange(len(k)), found]
+        value = distance[np.arange(len(keypoints)), found]
         index = np.where(value < best, found + start, index)
         best = np.minimum(best, value)
     return index
@@ -45,22 +57,63 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def main() -> None:
-    poses = int(sys.argv[1]) if len(sys.argv) > 1 else 1_877_420
-    frames = int(sys.argv[2]) if len(sys.argv) > 2 else 120
+def people(poses: int, frames: int) -> tuple[Tensor, Tensor]:
+    """Sampled poses at all headings, and a walk: (poses, 14, 3) and (frames, 14, 3)."""
+    library = all_headings(standardise_poses(sample_poses(poses // YAWS + 1)).float(), YAWS)[:poses]
+    walk = ActivityGenerator().generate("walking", seed=5, duration_s=frames / 30).joints[0]
+    return library, walk.float()
+
+
+def noise(poses: int, frames: int) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
-    library = torch.randn(poses, 14, 3, generator=generator).mul_(0.2)
-    keypoints = torch.randn(frames, 14, 2, generator=generator)
-    weights = torch.ones(frames, 14)
+    return torch.randn(poses, 14, 3, generator=generator), torch.randn(frames, 14, 3, generator=generator)
+
+
+def compare(name: str, library: Tensor, seen: Tensor, neighbours: int) -> None:
+    keypoints = torch.stack([seen[..., 0], -seen[..., 2]], dim=-1)
+    points, queries = seen_along_depth(library).numpy(), seen_along_depth(seen).numpy()
+    equal = torch.ones(keypoints.shape[:2])
+    varied = torch.rand(keypoints.shape[:2], generator=torch.Generator().manual_seed(1))
+    start = time.perf_counter()
+    search = PoseSearch(library, 1, neighbours, 2**22)
+    built = time.perf_counter() - start
     before = peak_mib()
-    ours = median_seconds(lambda: nearest_poses(keypoints, weights, library, 1, 1, 2**22), 3)
+    answer = search(keypoints, equal).numpy()
     extra = peak_mib() - before
-    peer = median_seconds(lambda: numpy_search(keypoints.numpy(), library.numpy()), 3)
-    answer = nearest_poses(keypoints, weights, library, 1, 1, 2**22)[:, 0].numpy()
-    same = np.mean(answer == numpy_search(keypoints.numpy(), library.numpy()))
-    print(f"{poses} poses x {frames} frames, {torch.get_num_threads()} threads")
-    print(f"nearest_poses {ours:.2f} s, extra memory {extra:.0f} MiB over the pool")
-    print(f"NumPy blocks  {peer:.2f} s, ratio {peer / ours:.2f}, same answer in {100 * same:.1f} % of frames")
+    peers: dict[str, Callable[[], np.ndarray]] = {}
+    if neighbours == 1:
+        peers["NumPy"] = lambda: numpy_search(queries, points)[:, None]
+    if faiss is not None:
+        flat = faiss.IndexFlatL2(28)
+        flat.add(points)
+        peers["faiss"] = lambda: flat.search(queries, neighbours)[1]
+    took = seconds([lambda: search(keypoints, equal), *peers.values()], 5)
+    (weighted,) = seconds([lambda: search(keypoints, varied)], 1)
+    print(
+        f"{name}, {neighbours} nearest: {took[0]:.3f} s; pool sorted once in {built:.1f} s; +{extra:.0f} MiB peak"
+    )
+    for (peer, ask), time_s in zip(peers.items(), took[1:], strict=True):
+        same = 100 * np.mean(answer == ask())
+        print(f"  {peer} {time_s:.3f} s, ratio {time_s / took[0]:.2f}, same answers {same:.2f} %")
+    print(f"  with a weight per joint and frame: {weighted:.3f} s", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("poses", type=int, nargs="?", default=1_877_420)
+    parser.add_argument("frames", type=int, nargs="?", default=120)
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    print(f"{options.poses} poses x {options.frames} frames, {options.threads} threads")
+    if faiss is None:
+        print("faiss is not installed (pip install faiss-cpu): compared with NumPy only")
+    else:
+        faiss.omp_set_num_threads(options.threads)
+    for name, make in (("people", people), ("random numbers", noise)):
+        library, seen = make(options.poses, options.frames)
+        for neighbours in (1, 32):
+            compare(name, library, seen, neighbours)
 
 
 if __name__ == "__main__":

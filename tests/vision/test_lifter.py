@@ -16,7 +16,7 @@ from tensorsim.motion.body import BodyPose, forward_kinematics, mirror
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.types import Lifted
 from tensorsim.vision.along_time import nearest_valid
-from tensorsim.vision.lifter import NearestPoseLifter, fit_poses, nearest_poses, smooth_assignment
+from tensorsim.vision.lifter import NearestPoseLifter, fit_poses, smooth_assignment
 from tensorsim.vision.pose_library import (
     all_headings,
     body_height,
@@ -24,6 +24,7 @@ from tensorsim.vision.pose_library import (
     mid_hip,
     standardise_poses,
 )
+from tensorsim.vision.pose_search import PoseSearch
 from tests.stage import StageTester
 
 LIBRARY = sample_poses(60, seed=1)
@@ -92,59 +93,13 @@ def test_refuses_bad_settings(options: dict[str, Any], message: str) -> None:
         NearestPoseLifter(**options)
 
 
-# ---- the search ----------------------------------------------------------------------------------------
-
-
-def brute_force(keypoints: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """The paper in NumPy: project along depth, centre, unit scale, Euclidean distance. (frames, poses)."""
-
-    def normalised(x: np.ndarray) -> np.ndarray:
-        x = x - x.mean(axis=1, keepdims=True)
-        return (x / np.linalg.norm(x, axis=(1, 2), keepdims=True)).reshape(len(x), -1)
-
-    k, p = normalised(keypoints), normalised(np.stack([poses[..., 0], -poses[..., 2]], axis=-1))
-    return np.linalg.norm(k[:, None] - p[None], axis=-1)
-
-
-@pytest.mark.parametrize("chunk", [1, 1000, 2**22])
-def test_equal_weights_give_the_nearest_neighbour_of_normalised_poses(chunk: int) -> None:
-    library = standardise_poses(sample_poses(300, seed=4))
-    keypoints = projected(sample_poses(40, seed=5)) + 5 * torch.randn(40, 14, 2, dtype=torch.float64)
-    index = nearest_poses(keypoints, torch.ones(40, 14, dtype=torch.float64), library, 8, 3, chunk)
-    distance = brute_force(keypoints.numpy(), all_headings(library, 8).numpy())
-    assert np.array_equal(index.numpy(), np.argsort(distance, axis=1)[:, :3])
-
-
-def test_weights_count_exactly_as_in_weighted_least_squares() -> None:
-    library = standardise_poses(sample_poses(100, seed=4))
-    generator = torch.Generator().manual_seed(3)
-    keypoints = projected(sample_poses(13, seed=6)) + 5 * torch.randn(
-        13, 14, 2, generator=generator, dtype=torch.float64
-    )
-    weights = torch.rand(13, 14, generator=generator, dtype=torch.float64)
-    weights[:, 4:7] = 0.0  # hidden, and wherever they are must not matter
-    index = nearest_poses(keypoints, weights, library, 4, 1, 5000)[:, 0]
-    elsewhere = keypoints.clone()
-    elsewhere[:, 4:7] = 1e4
-    assert torch.equal(nearest_poses(elsewhere, weights, library, 4, 1, 5000)[:, 0], index)
-
-    poses = all_headings(library, 4).numpy()
-    for frame in range(13):
-        errors = []
-        root = np.sqrt(np.repeat(weights[frame].numpy(), 2))
-        for pose in poses:
-            p = np.stack([pose[:, 0], -pose[:, 2]], axis=-1)
-            a = np.stack([p.ravel(), np.tile([1.0, 0.0], 14), np.tile([0.0, 1.0], 14)], axis=1)
-            b = keypoints[frame].numpy().ravel()
-            solution = np.linalg.lstsq(root[:, None] * a, root * b, rcond=None)[0]
-            errors.append(np.sum((root * (b - a @ solution)) ** 2) if solution[0] > 0 else np.inf)
-        assert int(np.argmin(errors)) == int(index[frame])
+# ---- the fit ---------------------------------------------------------------------------------------------
 
 
 def test_a_pose_that_fits_only_upside_down_is_no_match() -> None:
     library = standardise_poses(sample_poses(400, seed=8))
     upside_down = projected(library[:1]) * -1.0
-    index = nearest_poses(upside_down, torch.ones(1, 14, dtype=torch.float64), library, 1, 1, 1000)
+    index = PoseSearch(library, 1, 1, 1000)(upside_down, torch.ones(1, 14, dtype=torch.float64))
     scale, _, distance = fit_poses(upside_down, torch.ones(1, 14, dtype=torch.float64), library[:1])
     assert int(index) != 0
     assert float(scale) == 0.0
@@ -159,31 +114,6 @@ def test_fit_is_the_closed_form_similarity() -> None:
     torch.testing.assert_close(scale, torch.full((13,), 120.0, dtype=torch.float64))
     torch.testing.assert_close(placed, shifted)
     assert float(distance.max()) < 1e-12
-
-
-@pytest.mark.slow
-def test_a_large_library_is_searched_in_bounded_memory() -> None:
-    library = torch.randn(1_877_420, 14, 3) * 0.2
-    keypoints, weights = torch.randn(120, 14, 2), torch.rand(120, 14)
-
-    def largest(chunk: int) -> int:
-        with torch.profiler.profile(profile_memory=True) as profile:
-            nearest_poses(keypoints, weights, library[:60_000], 1, 8, chunk)
-        held = peak = 0
-        for event in profile.profiler.kineto_results.events():
-            if event.name() == "[memory]":
-                held += event.nbytes()
-                peak = max(peak, held)
-        return peak
-
-    assert largest(2**20) < 24 * 2**20 + 32 * 2**20
-    index = nearest_poses(keypoints, weights, library, 1, 1, 2**22)[:, 0]
-    assert index.shape == (120,)
-    rows = torch.arange(0, len(library), 97)  # spot check: nothing in a sample is better
-    best = fit_poses(keypoints, weights, library[index])[2]
-    for frame in range(0, 120, 40):
-        others = fit_poses(keypoints[frame], weights[frame], library[rows])[2]
-        assert float(best[frame]) <= float(others.min()) + 1e-6
 
 
 # ---- conventions ---------------------------------------------------------------------------------------

@@ -1,0 +1,102 @@
+"""``tensorsim library build``: a pool of poses for nearest-match lifting."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from tensorsim.errors import TensorsimError
+
+#: What motion files are called.
+SUFFIXES = (".bvh", ".npz")
+
+
+@dataclass(frozen=True)
+class BuildLibrary:
+    """Build a pool of poses for lifting, from motion files or from tensorsim's own generator.
+
+    Poses are brought to one body height, one heading (the lifter turns them to all) and both sides; of poses that
+    are nearly alike one is kept.
+    """
+
+    sources: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Motion files (.bvh, .npz), folders that are searched for them, or patterns such as 'mocap/**/*.bvh'."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("pose_library.safetensors")
+    """File to write."""
+    generate: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Poses of the activities and the pose sampler to add."""
+    most: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Poses to keep at most, chosen at random; memory of the lifter is about 2 KB a pose."""
+    tolerance: float = 0.015
+    """Poses nearer than this are duplicates: root mean square over the joints, in body heights."""
+    seed: int = 0
+    """Seed of the generator and of what is chosen."""
+    quiet: bool = False
+    """No progress bars."""
+
+    def run(self) -> None:
+        """Do it."""
+        files = _files(self.sources)
+        if not files and self.generate == 0:
+            raise TensorsimError("library build: got nothing to build from, expected SOURCES or --generate N")
+        if self.generate < 0:
+            raise TensorsimError(f"--generate: got {self.generate}, expected a number of poses")
+        if self.most is not None and self.most < 1:
+            raise TensorsimError(f"--most: got {self.most}, expected at least 1")
+        if self.out.suffix != ".safetensors" or self.out.is_dir():
+            raise TensorsimError(f"--out: got {self.out}, expected the name of a .safetensors file")
+
+        import torch
+        from safetensors.torch import save_file
+        from tqdm import tqdm
+
+        from tensorsim.training import pose_pool
+
+        generator = torch.Generator().manual_seed(self.seed)
+        parts = []
+        for file in tqdm(files, desc="read", unit="file", disable=self.quiet or not files):
+            parts.append(pose_pool.with_mirror_images(pose_pool.recorded_poses(file)))
+        if self.generate:
+            parts.append(pose_pool.generated_poses(self.generate, self.seed))
+        poses = torch.cat(parts)
+        given = len(poses)
+        poses = poses[torch.randperm(given, generator=generator)]
+        poses = pose_pool.without_near_duplicates(
+            poses, self.tolerance, lambda blocks: tqdm(blocks, desc="compare", disable=self.quiet)
+        )
+        different = len(poses)
+        poses = poses[: self.most]
+
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        handle, scratch = tempfile.mkstemp(dir=self.out.parent, prefix=f".{self.out.name}-")
+        os.close(handle)
+        try:
+            save_file({"poses": poses.half().contiguous()}, scratch)
+            os.chmod(scratch, 0o644)
+            os.replace(scratch, self.out)
+        finally:
+            Path(scratch).unlink(missing_ok=True)
+        print(f"{self.out}: {len(poses)} poses, of {different} that differ, of {given}")
+
+
+def _files(sources: tuple[Path, ...]) -> list[Path]:
+    """Files of paths, folders and patterns, each once, in the order given."""
+    import glob
+
+    found: dict[Path, None] = {}
+    for source in sources:
+        if source.is_dir():
+            files = sorted(f for f in source.rglob("*") if f.suffix.lower() in SUFFIXES)
+        elif source.is_file():
+            files = [source]
+        else:
+            files = sorted(Path(f) for f in glob.glob(str(source), recursive=True))
+        if not files:
+            raise TensorsimError(
+                f"library build: got {source}, expected motion files ({', '.join(SUFFIXES)})"
+            )
+        found.update(dict.fromkeys(files))
+    return list(found)

@@ -1,0 +1,130 @@
+"""Pools of poses for nearest-match lifting, from recorded or generated motion, without near-duplicates."""
+
+import math
+import zipfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from tensorsim.config import JOINTS
+from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.motion.body import mirror
+from tensorsim.motion.people import PeopleConfig
+from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.vision.pose_library import standardise_poses, turn
+
+#: Standard deviation of the lengths of segments in generated pools, as a share of them: skeletons that people
+#: and networks draw differ by more than bodies do.
+LIMB_DEVIATION = 0.05
+#: Frames taken of a generated clip of 4 s.
+_MOMENTS = 20
+
+
+def facing_away(poses: Tensor) -> Tensor:
+    """Poses (L, 14, 3) turned about the vertical so that the right side of hips and shoulders points along +x.
+
+    A pose lying on its side, whose line from left to right has no direction seen from above, is kept as it is.
+    """
+
+    def across(joint: str) -> Tensor:
+        return poses[:, JOINTS.index(f"right_{joint}")] - poses[:, JOINTS.index(f"left_{joint}")]
+
+    line = across("hip") + across("shoulder")
+    return turn(poses, -torch.atan2(line[:, 1], line[:, 0]))
+
+
+def generated_poses(count: int, seed: int) -> Tensor:
+    """Poses of tensorsim's own: a third from the eleven activities that show somebody, the rest sampled.
+
+    Args:
+        count: number of poses, at least 330.
+        seed: the same seed gives the same poses.
+
+    Returns:
+        (count, 14, 3) float64, standardised, facing +y, of bodies of many proportions, both sides alike.
+    """
+    if count < 330:
+        raise TensorsimError(f"generated poses: got a count of {count}, expected at least 330")
+    people = PeopleConfig(limb_deviation=LIMB_DEVIATION, variation=0.2, heading_rad=0.0)
+    actors = ActivityGenerator(people)
+    generator = torch.Generator().manual_seed(seed)
+    clips = math.ceil(count / 3 / 11 / _MOMENTS)
+    acted = []
+    for activity in range(1, 12):
+        motion = actors.generate(activity, clips, generator, rate_hz=_MOMENTS / 4)
+        acted.append(motion.joints.flatten(0, 1))
+    chosen = torch.cat(acted)
+    chosen = chosen[torch.randperm(len(chosen), generator=generator)[: count // 3]]
+    sampled = sample_poses(count - len(chosen), seed, LIMB_DEVIATION)
+    return facing_away(standardise_poses(torch.cat([chosen, sampled])))
+
+
+def recorded_poses(file: Path) -> Tensor:
+    """All poses of a motion capture file that :func:`tensorsim.data.motion_files.load_motion` reads.
+
+    Of an npz with several arrays of joints all are taken.
+
+    Returns:
+        (L, 14, 3) float64, standardised, facing +y.
+
+    Raises:
+        TensorsimError: a file that cannot be read, or without people.
+    """
+    import numpy as np
+
+    from tensorsim.data.motion_files import load_motion
+
+    keys: list[str | None] = [None]
+    if file.suffix.lower() == ".npz" and file.is_file():
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                if not {"joints_m", "joints", "Jtr", "positions_3d"} & set(arrays.files):
+                    keys = [k for k in arrays.files if arrays[k].ndim in (3, 4)] or [None]
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            raise TensorsimError(f"{file}: got a file that cannot be read as npz ({error})") from error
+    poses = []
+    for key in keys:
+        motion = load_motion(file, key=key, fps=30.0)  # a pool of poses knows no time
+        poses.append(motion.joints[motion.valid].double())
+    if sum(len(p) for p in poses) == 0:
+        raise TensorsimError(f"{file}: got nobody in any frame, expected poses")
+    return facing_away(standardise_poses(torch.cat(poses)))
+
+
+def with_mirror_images(poses: Tensor) -> Tensor:
+    """Poses (L, 14, 3) and their mirror images, (2 L, 14, 3)."""
+    return torch.cat([poses, mirror(poses)])
+
+
+def without_near_duplicates(
+    poses: Tensor, tolerance: float, progress: Callable[[Iterable[Tensor]], Iterable[Tensor]] = iter
+) -> Tensor:
+    """Poses no two of which are nearer than a tolerance; the first of every such group is kept.
+
+    Args:
+        poses: (L, 14, 3) body heights.
+        tolerance: body heights, root mean square over the joints.
+        progress: wraps the blocks of 1024 poses that are worked off, to show how far it is.
+
+    Returns:
+        (K, 14, 3), in the order of the poses. Every pose left out is within the tolerance of one that is kept.
+    """
+    check_positive(tolerance, "tolerance")
+    radius = tolerance * math.sqrt(len(JOINTS))
+    kept = poses[:1]
+    for block in progress(poses.split(1024)):
+        flat = block.flatten(1)
+        new = torch.ones(len(block), dtype=torch.bool)
+        for old in kept.flatten(1).split(8192):
+            new &= torch.cdist(flat, old).amin(dim=1) >= radius
+        block, flat = block[new], flat[new]
+        near = torch.cdist(flat, flat) < radius
+        left = torch.ones(len(block), dtype=torch.bool)
+        for i in range(len(block)):
+            if left[i]:
+                left[i + 1 :] &= ~near[i, i + 1 :]
+        kept = torch.cat([kept, block[left]])
+    return kept
