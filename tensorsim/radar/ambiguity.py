@@ -45,10 +45,10 @@ class SpeedCheck:
         if positions.shape[-3] < 2 or positions.numel() == 0:
             return
         rcs = rcs.detach().double()
-        present = torch.where(rcs > 0, mean_range(positions.detach(), self.radar), 0.0)
-        self.farthest = max(self.farthest, float(present.max()))
+        distance = mean_range(positions.detach(), self.radar)
+        self.farthest = max(self.farthest, float(torch.where(rcs > 0, distance, 0.0).max()))
         weight = torch.minimum(rcs[..., 1:, :], rcs[..., :-1, :])
-        speed = torch.where(weight > 0, radial_speed(positions.detach(), self.radar).abs(), 0.0)
+        speed = torch.where(weight > 0, distance.diff(dim=-2).abs() * self.radar.prf_hz, 0.0)
         self.weighted = self.weighted + (weight * speed).sum((-2, -1)).cpu()
         self.weight = self.weight + weight.sum((-2, -1)).cpu()
         self.fastest = max(self.fastest, float(speed.max()))

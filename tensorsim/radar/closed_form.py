@@ -1,14 +1,16 @@
-"""Range bins in closed form: what the Fourier transform over fast time makes of each path, without its IF.
+"""Range profiles in closed form: the bins of each path without making the IF and transforming it.
 
-A path of delay tau and gain g is a tone at the beat bin ``b = mu tau N / fs``, so bin k of its range profile is
+The IF of a path is a tone at bin ``b = mu tau N / fs``. With its phase s and the phase of the bins counted from
+mid-chirp, its windowed transform is real but for s:
 
-    X[k] = g exp(j 2 pi (fc tau - mu tau^2 / 2)) W(k - b),    W(x) = sum over n of w[n] exp(-j 2 pi x n / N)
+    X[k] = exp(-j pi k (N - 1) / N) sum over paths of s W(k - b),
+    W(x) = sum over n of w[n] cos(2 pi x (n - (N - 1) / 2) / N)
 
-W is the transform of the window: one Dirichlet kernel ``sin(pi x) / sin(pi x / N)`` for the rectangle, three for
-Hamming and Hann, five for Blackman (Harris, *On the use of windows for harmonic analysis with the DFT*, 1978).
-Evaluated as printed it is 0 / 0 at the peak of every target. But with ``b = n + f``, n whole and ``|f| <= 1/2``,
-and the phase counted from mid-chirp, W is so smooth in f that a Chebyshev series of few terms is exact to the last
-digit (its coefficients fall like the Bessel functions ``J_j(pi / 2)``): a small table, for any window.
+for a symmetric window. W is one Dirichlet kernel ``sin(pi x) / sin(pi x / N)`` for the rectangle, three for Hamming
+and Hann, five for Blackman (Harris, *On the use of windows for harmonic analysis with the DFT*, 1978). Evaluated as
+printed it is 0 / 0 at the peak of every target. But with ``b = n + f``, n whole and ``|f| <= 1/2``, W is so smooth
+in f that a Chebyshev series of few terms is exact to the last digit (its coefficients fall like the Bessel functions
+``J_j(pi / 2)``): a small table, for any window.
 """
 
 import math
@@ -17,7 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.radar.echo import EchoSynthesizer, check_scene, phasor
+from tensorsim.radar.echo import EchoSynthesizer, check_scene, phasor, tone_sum
+from tensorsim.radar.noise import energy
 from tensorsim.radar.range_profile import RangeProfile
 
 #: Terms of the Chebyshev series: J_11(pi / 2) = 2e-9 and J_17(pi / 2) = 4e-17.
@@ -25,27 +28,21 @@ TERMS_FLOAT32, TERMS_FLOAT64 = 11, 17
 
 
 def kernel_table(window: Tensor, offsets: Tensor, terms: int) -> Tensor:
-    """Chebyshev coefficients (terms, D) complex128 of ``W(m - f) exp(-j 2 pi f (N - 1) / (2 N))`` in ``2 f``.
+    """Chebyshev coefficients (terms, D) float64 of ``W(m - f)`` in ``2 f``.
 
     Args:
-        window: (N,) float64.
+        window: (N,) float64, symmetric.
         offsets: (D,) whole bins m.
         terms: length of the series.
     """
     samples = window.shape[0]
     centred = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
     angle = math.pi * (torch.arange(terms, dtype=torch.float64) + 0.5) / terms
-    fraction = 0.5 * angle.cos()  # Chebyshev nodes
-    # exp(-j 2 pi m n / N): the product is reduced in whole numbers before it becomes a phase.
-    turns = torch.remainder(torch.outer(offsets.long(), torch.arange(samples)), samples).double() / samples
-    whole = torch.polar(window.expand_as(turns), -2 * math.pi * turns)
-    tones = torch.polar(
-        torch.ones(terms, samples).double(), 2 * math.pi / samples * torch.outer(fraction, centred)
-    )
-    values = torch.matmul(tones, whole.transpose(0, 1))
+    distance = offsets - 0.5 * angle.cos().unsqueeze(-1)  # at the Chebyshev nodes
+    values = torch.matmul((2 * math.pi / samples * distance.unsqueeze(-1) * centred).cos(), window)
     transform = (2 / terms) * torch.cos(torch.outer(torch.arange(terms, dtype=torch.float64), angle))
     transform[0] *= 0.5
-    return torch.matmul(transform.to(values.dtype), values)
+    return torch.matmul(transform, values)
 
 
 def chebyshev(x: Tensor, terms: int) -> Tensor:
@@ -56,48 +53,75 @@ def chebyshev(x: Tensor, terms: int) -> Tensor:
     return torch.stack(series, -1)
 
 
-def bin_sum(
+def mid_chirp_tones(
     delay_s: Tensor,
     gain: Tensor,
     carrier_hz: float,
     slope_hz_per_s: float,
     sample_rate_hz: float,
     samples: int,
-    table: Tensor,
-) -> Tensor:
-    """All N bins of the spectrum of windowed beat tones.
+    real: torch.dtype,
+) -> tuple[Tensor, Tensor]:
+    """Beat bins (L, P) float64, in [0, N), and complex amplitudes (L, P) at mid-chirp of paths.
 
     Args:
         delay_s: (L, P) float64.
         gain: (L, P) complex128.
         carrier_hz, slope_hz_per_s, sample_rate_hz: fc, mu, fs.
         samples: N.
-        table: (J, D) from :func:`kernel_table` for the D bins around a path, the middle one (D // 2) at it;
-            complex in the precision of the result.
-
-    Returns:
-        (L, N) complex. The bins form a circle, as those of any discrete transform.
+        real: precision of the amplitudes, torch.float32 or float64.
     """
     beat = slope_hz_per_s * samples / sample_rate_hz * delay_s
+    beat = beat - samples * (beat.detach() / samples).floor()
+    cycles = carrier_hz * delay_s - 0.5 * slope_hz_per_s * delay_s.square()
+    cycles = cycles + beat * ((samples - 1) / (2 * samples))
+    strength = phasor((cycles - cycles.round()).to(real))
+    return beat, strength * gain.to(strength.dtype)
+
+
+def bin_sum(beat: Tensor, strength: Tensor, samples: int, table: Tensor) -> Tensor:
+    """All N bins (L, N) of the spectrum of windowed tones, their phase counted from mid-chirp.
+
+    Args:
+        beat: (L, P) float64, in [0, N).
+        strength: (L, P) complex, at mid-chirp.
+        samples: N.
+        table: (J, D) from :func:`kernel_table` for the D bins around a tone, the middle one (D // 2) at it; real,
+            in the precision of the result.
+    """
     whole = beat.detach().round()
-    fraction = beat - whole
-    phase = carrier_hz * delay_s - 0.5 * slope_hz_per_s * delay_s.square()
-    phase = phase + fraction * ((samples - 1) / (2 * samples))
-    real = torch.float32 if table.dtype == torch.complex64 else torch.float64
-    strength = phasor((phase - phase.round()).to(real)) * gain.to(table.dtype)
-    series = chebyshev((2 * fraction).to(real), table.shape[0]) * strength.unsqueeze(-1)  # (L, P, J)
-    spread = torch.matmul(series, table).flatten(1)  # (L, P * D)
+    series = chebyshev((2 * (beat - whole)).to(table.dtype), table.shape[0])  # (L, P, J)
+    spread = (torch.matmul(series, table) * strength.unsqueeze(-1)).flatten(1)  # (L, P * D)
     width = table.shape[1]
-    offsets = torch.arange(width, device=delay_s.device)
-    place = (torch.remainder(whole, samples).long().unsqueeze(-1) + offsets).flatten(1)
-    ring = torch.zeros([spread.shape[0], samples + width], dtype=table.dtype, device=delay_s.device)
+    place = (whole.long().unsqueeze(-1) + torch.arange(width, device=beat.device)).flatten(1)
+    ring = torch.zeros([spread.shape[0], samples + width], dtype=spread.dtype, device=beat.device)
     ring = ring.scatter_add(1, place, spread)
-    # Place p of the ring is bin p - width // 2: bring its two ends, if used, round to the other side.
-    before = width // 2
-    low, middle, high = ring[:, :before], ring[:, before : before + samples], ring[:, before + samples :]
-    low = torch.nn.functional.pad(low, [samples - before, 0])
-    high = torch.nn.functional.pad(high, [0, samples - high.shape[1]])
-    return middle + low + high
+    # Place p of the ring is bin p - width // 2: bring its two ends, if used, round to the other side. Half a sample
+    # off a whole one, mid-chirp of an even N sees the other sign there.
+    before, sign = width // 2, 1 - 2 * ((samples - 1) % 2)
+    bins = ring[:, before : before + samples]
+    bins[:, samples - before :].add_(ring[:, :before], alpha=sign)
+    bins[:, : width - before].add_(ring[:, before + samples :], alpha=sign)
+    return bins
+
+
+def tone_energy(beat: Tensor, strength: Tensor, samples: int) -> Tensor:
+    """Sum over N samples of ``|sum of tones|^2``: (..., P) float64 beat bins, (..., P) complex at mid-chirp -> (...).
+
+    Every pair of tones adds ``2 Re(s_i conj(s_j)) sin(pi d) / sin(pi d / N)``, d the difference of their bins; there
+    are P (P - 1) / 2 pairs.
+    """
+    parts = torch.view_as_real(strength)
+    own = samples * parts.square().sum((-2, -1))
+    center = (beat - beat.detach().mean(-1, keepdim=True)).to(parts.dtype)
+    rows = torch.cat((center.unsqueeze(-1), parts), -1).movedim((-2, -1), (0, 1))  # (P, 3, ...)
+    pair = torch.triu_indices(rows.shape[0], rows.shape[0], 1, device=beat.device)
+    a, b = rows.index_select(0, pair[0]), rows.index_select(0, pair[1])
+    angle = (a[:, 0] - b[:, 0]) * (math.pi / samples)
+    half = angle.sin()
+    apart = half.abs() > 1e-9
+    kernel = torch.where(apart, (samples * angle).sin() / torch.where(apart, half, 1.0), float(samples))
+    return own + 2 * ((a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]) * kernel).sum(0)
 
 
 class RangeBinSynthesizer(nn.Module):
@@ -126,7 +150,7 @@ class RangeBinSynthesizer(nn.Module):
     """
 
     table: Tensor
-    noise_factor: Tensor
+    bin_cycles: Tensor
 
     def __init__(self, echo: EchoSynthesizer, profile: RangeProfile, near_bins: int | None = None) -> None:
         super().__init__()
@@ -148,16 +172,10 @@ class RangeBinSynthesizer(nn.Module):
         self.truncation = math.sqrt(max(0.0, 1 - self._energy(table) / self._total(profile.window)))
         if len(offsets) == samples:
             self.truncation = 0.0
-        self.register_buffer("table", torch.view_as_real(table).clone(), persistent=False)
-        # White noise of variance 1 in the IF has the covariance sum w[n]^2 exp(-j 2 pi (k - l) n / N) in the bins.
-        # Counted from mid-chirp it is real, and circular noise does not mind the phase of a bin.
+        self.register_buffer("table", table, persistent=False)
         bins = torch.arange(profile.first_bin, profile.last_bin + 1, dtype=torch.float64)
-        centred = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
-        lag = (2 * math.pi / samples) * torch.outer(bins - bins[0], centred)
-        row = (lag.cos() * profile.window.double().square()).sum(1)
-        difference = (bins[:, None] - bins[None, :]).abs().long()
-        value, vector = torch.linalg.eigh(row[difference])
-        self.register_buffer("noise_factor", vector * value.clamp_min(0).sqrt(), persistent=False)
+        cycles = torch.remainder(-bins * ((samples - 1) / (2 * samples)), 1.0)
+        self.register_buffer("bin_cycles", cycles, persistent=False)
 
     @staticmethod
     @torch.jit.unused
@@ -169,38 +187,59 @@ class RangeBinSynthesizer(nn.Module):
     def _energy(table: Tensor) -> float:
         """Energy of all columns, the mean over fractions f."""
         fraction = (torch.arange(64, dtype=torch.float64) + 0.5) / 64 - 0.5
-        series = chebyshev(2 * fraction, table.shape[0]).to(table.dtype)
-        return float(torch.matmul(series, table).abs().square().sum(-1).mean())
+        return float(torch.matmul(chebyshev(2 * fraction, table.shape[0]), table).square().sum(-1).mean())
 
     @torch.jit.export
-    def target_bins(self, positions: Tensor, rcs: Tensor) -> Tensor:
-        """Profiles of the targets alone, unchecked and in one go: (..., S, 3) m and (..., S) m^2 -> (..., R)."""
+    def tones(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
+        """Beat bins and amplitudes of the P paths, unchecked: (..., S, 3) m, (..., S) m^2 -> (..., P)."""
         paths = self.echo.paths(positions.double(), rcs.double(), None)
-        terms = self.terms_float64 if self.echo.fine.dtype == torch.float64 else self.terms_float32
-        bins = bin_sum(
-            paths.delay_s.flatten(-2).flatten(0, -2),
-            paths.gain.flatten(-2).flatten(0, -2),
+        return self._tones(paths.delay_s.flatten(-2), paths.gain.flatten(-2))
+
+    def _tones(self, delay_s: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
+        return mid_chirp_tones(
+            delay_s,
+            gain,
             self.echo.carrier_hz,
             self.echo.slope_hz_per_s,
             self.echo.sample_rate_hz,
             self.profile.samples,
-            torch.view_as_complex(self.table[:terms].to(self.echo.fine.dtype)),
+            self.echo.fine.dtype,
         )
-        return bins[:, self.profile.first_bin : self.profile.last_bin + 1].unflatten(
-            0, list(positions.shape[:-2])
+
+    @torch.jit.export
+    def bins(self, beat: Tensor, strength: Tensor) -> Tensor:
+        """Profiles (..., R) of :meth:`tones` (..., P)."""
+        real = self.echo.fine.dtype
+        terms = self.terms_float64 if real == torch.float64 else self.terms_float32
+        table = self.table[:terms].to(real)
+        ring = bin_sum(beat.flatten(0, -2), strength.flatten(0, -2), self.profile.samples, table)
+        bins = ring[:, self.profile.first_bin : self.profile.last_bin + 1] * phasor(self.bin_cycles).to(
+            ring.dtype
         )
+        return bins.unflatten(0, list(beat.shape[:-1]))
+
+    @torch.jit.export
+    def energy(self, beat: Tensor, strength: Tensor, total: bool) -> Tensor:
+        """Energy (...) over the N samples of :meth:`tones` (..., P); ``total`` adds the static paths to them."""
+        if total:
+            static = self.echo.paths.static()
+            fixed = self._tones(static.delay_s, static.gain)
+            lead = list(beat.shape[:-1]) + [-1]  # noqa: RUF005 (TorchScript)
+            beat = torch.cat((beat, fixed[0].expand(lead)), -1)
+            strength = torch.cat((strength, fixed[1].expand(lead)), -1)
+        samples = self.profile.samples
+        if beat.shape[-1] ** 2 <= 16 * samples:
+            return tone_energy(beat, strength, samples)
+        # So many pairs cost more than all samples.
+        start = beat * (-(samples - 1) / (2 * samples))
+        first = strength * phasor((start - start.round()).to(self.echo.fine.dtype))
+        sums = tone_sum(first, beat / samples, self.echo.coarse, self.echo.fine)[..., :samples]
+        return energy(sums.unsqueeze(-2))
 
     @torch.jit.export
     def static_bins(self) -> Tensor:
         """Profile (R,) of what does not move and is switched on: leakage and wall echo."""
         return self.profile(self.echo.static_echo().unsqueeze(0))[0]
-
-    @torch.jit.export
-    def color(self, white: Tensor) -> Tensor:
-        """White complex noise (..., R) to the noise of the bins when every IF sample has the variance of it."""
-        factor = self.noise_factor.to(torch.view_as_real(white).dtype)
-        parts = torch.view_as_real(white).transpose(-1, -2)  # (..., 2, R)
-        return torch.view_as_complex(torch.matmul(parts, factor.T).transpose(-1, -2).contiguous())
 
     def forward(self, positions: Tensor, rcs: Tensor) -> Tensor:
         """(..., M, S, 3) metres and (..., S) or (..., M, S) m^2 to profiles (..., M, R)."""
@@ -210,5 +249,6 @@ class RangeBinSynthesizer(nn.Module):
         chunks: list[Tensor] = []
         for start in range(0, pulses.shape[0], self.echo.pulse_chunk):
             stop = start + self.echo.pulse_chunk
-            chunks.append(self.target_bins(pulses[start:stop], rcs[start:stop]) + static)
+            beat, strength = self.tones(pulses[start:stop], rcs[start:stop])
+            chunks.append(self.bins(beat, strength) + static)
         return torch.cat(chunks).unflatten(0, list(positions.shape[:-2]))

@@ -99,12 +99,12 @@ class DopplerFrames(nn.Module):
             )
         return flatten_batch(profiles, 2).transpose(1, 2)
 
-    def power(self, frames: Tensor) -> Tensor:
-        """Real and imaginary power (..., F, 2) of frames (..., L), Doppler ascending."""
+    def spectrum(self, frames: Tensor) -> Tensor:
+        """Real and imaginary part (..., F, 2) of the transform of frames (..., L), Doppler ascending."""
         window = self.shifting_window.to(torch.real(frames).dtype)
         # |FFT(conj x)[f]| = |FFT(x)[-f]|, and a transform with the other sign puts -f at f.
         spectrum = torch.fft.ifft(frames * window, self.bins, norm="forward")
-        return torch.view_as_real(spectrum.resolve_conj()).square()
+        return torch.view_as_real(spectrum.resolve_conj())
 
 
 class DopplerTimeMap(DopplerFrames):
@@ -175,9 +175,10 @@ class DopplerTimeMap(DopplerFrames):
             blocks: list[Tensor] = []
             for first in range(0, frames.shape[2], columns):
                 block = frames[clip : clip + clips, :, first : first + columns]
-                power = self.power(block[:, :step]).sum(1)
-                for near in range(step, block.shape[1], step):
-                    power = power + self.power(block[:, near : near + step]).sum(1)
+                power = torch.real(series).new_zeros([])
+                for near in range(0, block.shape[1], step):
+                    for part in self.spectrum(block[:, near : near + step]).unbind(1):
+                        power = torch.addcmul(power, part, part)
                 blocks.append(safe_sqrt(power[..., 0] + power[..., 1]))
             maps.append(torch.cat(blocks, 1))
         return unflatten_batch(torch.cat(maps).transpose(1, 2), list(profiles.shape[:-2]))
@@ -204,5 +205,5 @@ class RangeDopplerVideo(DopplerFrames):
         step = max(1, self.block_size // (frames.shape[0] * frames.shape[2] * self.bins))
         blocks: list[Tensor] = []
         for first in range(0, frames.shape[1], step):
-            blocks.append(self.power(frames[:, first : first + step]).sum(-1))
+            blocks.append(self.spectrum(frames[:, first : first + step]).square().sum(-1))
         return unflatten_batch(torch.cat(blocks, 1), list(profiles.shape[:-2]))

@@ -70,7 +70,42 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
 def phasor(cycles: Tensor) -> Tensor:
     """``exp(j 2 pi cycles)`` as complex."""
     angle = cycles * (2 * math.pi)
-    return torch.view_as_complex(torch.stack((angle.cos(), angle.sin()), -1))
+    return torch.complex(angle.cos(), angle.sin())
+
+
+def tones(first: Tensor, step: Tensor, index: Tensor) -> Tensor:
+    """``first exp(j 2 pi step n)`` for n of ``index``: (...) complex, (...) cycles, (N,) 0, 1, ... -> (..., N).
+
+    The exponential factors over ``n = Q n1 + n2``: about ``2 sqrt(N)`` sines and cosines and N products.
+    """
+    fine = math.ceil(math.sqrt(index.shape[0]))
+    step = step.unsqueeze(-1)
+    outer = first.unsqueeze(-1) * phasor(step * index[::fine])
+    inner = phasor(step * index[:fine])
+    return (outer.unsqueeze(-1) * inner.unsqueeze(-2)).flatten(-2)[..., : index.shape[0]]
+
+
+def tone_sum(first: Tensor, step: Tensor, coarse: Tensor, fine: Tensor) -> Tensor:
+    """Sum over P tones of ``first exp(j 2 pi step n)`` for n = 0, 1, ..., N1 Q - 1.
+
+    The exponential factors over ``n = Q n1 + n2``, so the sum is a product of two small matrices per pulse
+    instead of N exponentials per tone.
+
+    Args:
+        first: (L, P) complex.
+        step: (L, P) cycles in float64; wrapped to one before they take the precision of the result.
+        coarse: (N1,) 0, 1, ..., N1 - 1 in the real precision of the result.
+        fine: (Q,) 0, 1, ..., Q - 1 likewise.
+
+    Returns:
+        (L, N1 * Q) complex.
+    """
+    stride = step * fine.shape[0]
+    step = (step - step.round()).to(fine.dtype)
+    stride = (stride - stride.round()).to(fine.dtype)
+    right = tones(torch.ones_like(first), step, fine)  # (L, P, Q)
+    left = tones(first, stride, coarse)  # (L, P, N1)
+    return torch.matmul(left.transpose(-1, -2), right).flatten(-2)
 
 
 def beat_sum(
@@ -84,9 +119,8 @@ def beat_sum(
 ) -> Tensor:
     """Sum over paths of ``gain exp(j 2 pi (fc tau + mu tau n / fs - mu tau^2 / 2))`` for n = 0, 1, ...
 
-    The exponential factors over ``n = Q n1 + n2``, so the sum is a product of two small matrices per pulse
-    instead of N exponentials per path. Phases are wrapped to one cycle in float64 before they take the
-    precision of the result: at 77 GHz a float32 phase would leave a floor at -60 dB.
+    Phases are wrapped to one cycle in float64 before they take the precision of the result: at 77 GHz a float32
+    phase would leave a floor at -60 dB.
 
     Args:
         delay_s: (L, P) float64.
@@ -94,22 +128,15 @@ def beat_sum(
         carrier_hz: fc, the start of the sweep.
         slope_hz_per_s: mu.
         sample_rate_hz: fs.
-        coarse: (N1,) 0, 1, ..., N1 - 1 in the real precision of the result.
-        fine: (Q,) 0, 1, ..., Q - 1 likewise.
+        coarse, fine: see :func:`tone_sum`.
 
     Returns:
         (L, N1 * Q) complex.
     """
     start = carrier_hz * delay_s - 0.5 * slope_hz_per_s * delay_s.square()
-    step = slope_hz_per_s / sample_rate_hz * delay_s
-    stride = step * fine.shape[0]
-    start = (start - start.round()).to(fine.dtype)
-    step = (step - step.round()).to(fine.dtype)
-    stride = (stride - stride.round()).to(fine.dtype)
-    left = phasor(start.unsqueeze(-2) + coarse.unsqueeze(-1) * stride.unsqueeze(-2))  # (L, N1, P)
-    right = phasor(step.unsqueeze(-1) * fine)  # (L, P, Q)
-    left = left * gain.to(left.dtype).unsqueeze(-2)
-    return torch.matmul(left, right).flatten(-2)
+    first = phasor((start - start.round()).to(fine.dtype))
+    first = first * gain.to(first.dtype)
+    return tone_sum(first, slope_hz_per_s / sample_rate_hz * delay_s, coarse, fine)
 
 
 def dispersed_sum(
@@ -262,12 +289,19 @@ class EchoSynthesizer(nn.Module):
         pulses = positions.flatten(0, -3)
         step = self._step(positions)
         static = self.static_echo()
+        echo = static.new_empty(list(static.shape[:-2]) + [pulses.shape[0], self.samples])  # noqa: RUF005 (TorchScript)
         chunks: list[Tensor] = []
         for start in range(0, pulses.shape[0], self.pulse_chunk):
             stop = start + self.pulse_chunk
             ahead = None if step is None else step[start:stop]
-            chunks.append(self.target_echo(pulses[start:stop], rcs[start:stop], ahead) + static)
-        echo = torch.cat(chunks, -2).unflatten(-2, list(positions.shape[:-2]))
+            chunk = self.target_echo(pulses[start:stop], rcs[start:stop], ahead) + static
+            if chunk.requires_grad:  # a write into a slice would cost the backward pass a copy of the whole
+                chunks.append(chunk)
+            else:
+                echo[..., start:stop, :] = chunk
+        if len(chunks) > 0:
+            echo = torch.cat(chunks, -2)
+        echo = echo.unflatten(-2, list(positions.shape[:-2]))
         return echo.movedim(0, -3) if self.paths.has_array else echo
 
     def _step(self, positions: Tensor) -> Tensor | None:

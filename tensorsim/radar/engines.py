@@ -1,51 +1,49 @@
-"""The two ways from scatterers to noisy range profiles, with one interface.
+"""The two ways from scatterers to range profiles free of noise, with one interface.
 
-    engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2, power (B,)) -> profiles (B, m, R), energy (B,)
+    engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2) -> profiles (B, m, R), energy (B,)
 
-``power`` is the variance of the receiver noise per IF sample of each clip, ``energy`` that of the noise that was
-drawn, for as many samples as the IF has. Arguments are not checked: the simulator has done that.
+``energy`` is that of the signal that the receiver noise refers to, over m pulses and the N samples of their IF.
+Arguments are not checked: the simulator has done that.
 """
 
-import torch
 from torch import Tensor, nn
 
 from tensorsim.radar.closed_form import RangeBinSynthesizer
 from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.noise import ReceiverNoise, energy
+from tensorsim.radar.noise import energy
 from tensorsim.radar.range_profile import RangeProfile
 
 
 class TimeEngine(nn.Module):
-    """By way of the IF: echo, noise, Fourier transform over fast time."""
+    """By way of the IF: echo and Fourier transform over fast time.
 
-    def __init__(self, echo: EchoSynthesizer, noise: ReceiverNoise, profile: RangeProfile) -> None:
+    ``total``: the energy is that of echo and static paths together, and not of the echo alone.
+    """
+
+    def __init__(self, echo: EchoSynthesizer, profile: RangeProfile, total: bool) -> None:
         super().__init__()
-        self.echo, self.noise, self.profile = echo, noise, profile
+        self.echo, self.profile, self.total = echo, profile, total
 
-    def forward(self, positions: Tensor, rcs: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
         """See the module."""
-        samples = self.echo.target_echo(positions, rcs) + self.echo.static_echo()
-        drawn = torch.zeros_like(power)
-        if not self.noise.noiseless:
-            noise = self.noise.draw(samples, power)
-            drawn = energy(noise).to(power.dtype)
-            samples += noise
-        return self.profile(samples), drawn
+        echo = self.echo.target_echo(positions, rcs)
+        samples = echo
+        if len(self.echo.paths.static_ways) > 0:
+            samples = echo + self.echo.static_echo()
+        return self.profile(samples), energy(samples if self.total else echo)
 
 
 class RangeBinEngine(nn.Module):
-    """In closed form, with noise that is drawn in the bins and has the covariance of windowed white noise there."""
+    """In closed form; ``total`` as above."""
 
-    def __init__(self, bins: RangeBinSynthesizer, noise: ReceiverNoise) -> None:
+    def __init__(self, bins: RangeBinSynthesizer, total: bool) -> None:
         super().__init__()
-        self.bins, self.noise = bins, noise
+        self.bins, self.total = bins, total
 
-    def forward(self, positions: Tensor, rcs: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
         """See the module."""
-        profiles = self.bins.target_bins(positions, rcs) + self.bins.static_bins()
-        drawn = torch.zeros_like(power)
-        if not self.noise.noiseless:
-            white = self.noise.draw(profiles, power)
-            drawn = energy(white).to(power.dtype) * (self.bins.profile.samples / white.shape[-1])
-            profiles = profiles + self.bins.color(white)
-        return profiles, drawn
+        beat, strength = self.bins.tones(positions, rcs)
+        profiles = self.bins.bins(beat, strength)
+        if len(self.bins.echo.paths.static_ways) > 0:
+            profiles = profiles + self.bins.static_bins()
+        return profiles, self.bins.energy(beat, strength, self.total).sum(-1)

@@ -28,6 +28,50 @@ def decibels(signal_power: Tensor, noise_power: Tensor) -> Tensor:
     return torch.where(noise_power > 0, ratio, torch.full_like(ratio, float("inf")))
 
 
+class ProfileNoise(nn.Module):
+    """What white noise in the IF becomes in range profiles, drawn there: no IF and no Fourier transform.
+
+    White noise of variance v in the N samples of a pulse is white of variance N v in the N bins. A window w turns
+    that into its circular convolution with ``W(m) / N``, W the transform of the window, of which a handful of values
+    are not next to nothing: three for Hamming and Hann, five for Blackman, one for the rectangle. The others, less
+    than 1e-4 of its energy, are left out; phases count from sample N / 2.
+
+    Args:
+        window: (N,) over fast time, symmetric.
+
+    Shapes: like (B, R, M) complex, noise power per IF sample (B,) -> noise (B, R, M) in R neighbouring bins, and the
+        energy (B,) that N samples would have of what was drawn. Differentiable by the power.
+    """
+
+    taps: list[float]
+
+    def __init__(self, window: Tensor) -> None:
+        super().__init__()
+        self.samples = window.shape[0]
+        lag = torch.arange(self.samples, dtype=torch.float64)
+        mid_chirp = torch.polar(torch.ones_like(lag), math.pi * lag * (self.samples - 1) / self.samples)
+        taps = (torch.fft.fft(window.double()) * mid_chirp).real * (1 - 2 * torch.remainder(lag, 2))
+        share = taps.square() / (window.double().square().sum() * self.samples)
+        reach = 0
+        while float(share[0] + 2 * share[1 : reach + 1].sum()) < 1 - 1e-4:
+            reach += 1
+        self.taps = (taps[: reach + 1] / math.sqrt(self.samples)).tolist()
+
+    def forward(self, like: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+        """See the class."""
+        reach = len(self.taps) - 1
+        bins = like.shape[1]
+        shape = [like.shape[0], bins + 2 * reach, like.shape[2]]
+        white = torch.randn(shape, dtype=like.dtype, device=like.device)
+        parts = torch.view_as_real(white)
+        noise = parts[:, reach : reach + bins] * self.taps[0]
+        for lag in range(1, reach + 1):
+            pair = parts[:, reach - lag : reach - lag + bins] + parts[:, reach + lag : reach + lag + bins]
+            noise = torch.add(noise, pair, alpha=self.taps[lag])
+        drawn = energy(white).to(power.dtype) * power * (self.samples / shape[1])
+        return torch.view_as_complex(noise * power.to(noise.dtype).sqrt()[:, None, None, None]), drawn
+
+
 class ReceiverNoise(nn.Module):
     """Adds complex white Gaussian noise to IF samples. PyTorch's global generator draws it:
     ``torch.manual_seed``.

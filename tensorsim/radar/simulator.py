@@ -1,7 +1,7 @@
 """The radar chain whole: scatterers in, range-time maps, Doppler-time map and ridges out."""
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from tensorsim.radar.doppler import DopplerTimeMap
 from tensorsim.radar.echo import EchoSynthesizer, check_scene
 from tensorsim.radar.engines import RangeBinEngine, TimeEngine
 from tensorsim.radar.mti import MovingTargetIndicator
-from tensorsim.radar.noise import ReceiverNoise, decibels, energy
+from tensorsim.radar.noise import ProfileNoise, ReceiverNoise, decibels
 from tensorsim.radar.range_profile import FollowingGate, RangeProfile, flatten_batch, unflatten_batch
 from tensorsim.radar.ridges import RidgeExtractor, Ridges
 from tensorsim.types import RadarMaps
@@ -40,7 +40,7 @@ class Piece(NamedTuple):
     """What a stretch of m pulses adds to the maps of B clips.
 
     Attributes:
-        profiles: (B, m, R) complex.
+        profiles: (B, m, R) complex, with noise.
         moving: (B, m', R) complex; fewer in the first piece.
         doppler_time: (B, F, k) frames that the pulses complete.
         pending: for the next piece.
@@ -57,19 +57,20 @@ class Piece(NamedTuple):
 class RadarSimulator(nn.Module):
     """Echo, receiver noise, range profiles, moving target indicator, Doppler-time map and ridges of a scene.
 
-    The IF is never held whole: it is made and turned into profiles ``pulse_chunk`` pulses at a time, twice
-    when noise is wanted, because the noise is set by the mean power of the clip. ``stream`` does the same for
-    clips of any length without holding their profiles either; ``doppler_time`` makes that map alone, for data
-    sets.
+    The IF is never held whole: it is made and turned into profiles ``pulse_chunk`` pulses at a time. The profiles
+    are, since the noise in them is set by the mean power of the clip; it is drawn where they are, with the
+    covariance that windowed white noise has there (:class:`~tensorsim.radar.noise.ProfileNoise`). ``stream`` takes
+    clips of any length without holding their profiles, and makes them twice for it; ``doppler_time`` makes that map
+    alone, for data sets: fastest with ``engine="range-bins"``, few ``near_bins`` and a ``range_gate_m``.
 
     Args:
         radar: the radar.
-        wall, multipath, leakage, wall_echo, wall_paths, direct: see
-            :class:`~tensorsim.radar.echo.EchoSynthesizer`.
-        echo: a ready one with further options; the six arguments above then have no effect.
+        wall: a wall in the scene.
+        scene: all other arguments of an :class:`~tensorsim.radar.echo.EchoSynthesizer`, by name: ``multipath``,
+            ``leakage``, ``wall_echo``, ``incidence``, ``floor``, ...
+        echo: a ready one, in place of the wall and the scene.
         engine: ``"time"`` makes the IF and transforms it; ``"range-bins"`` makes the bins in closed form, see
-            :class:`~tensorsim.radar.closed_form.RangeBinSynthesizer`, and gives the noise in them the covariance
-            that windowed white noise has. The maps are the same, with noise another realisation.
+            :class:`~tensorsim.radar.closed_form.RangeBinSynthesizer`. The maps are the same.
         near_bins: for ``"range-bins"``: only bins within this many of each path. Faster; its error is
             ``simulator.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann).
         range_gate_m: (nearest, farthest) metres: the maps have these bins only. One number is the width of a
@@ -85,8 +86,8 @@ class RadarSimulator(nn.Module):
         doppler: a ready one; the three arguments above then have no effect.
         ridge_count: see :class:`~tensorsim.radar.ridges.RidgeExtractor`.
         ridges: a ready one, in place of ``ridge_count``.
-        pulse_chunk: pulses worked on at a time, over all clips of a batch. Noise is drawn chunk by chunk, so
-            with one seed another chunk is another realisation.
+        pulse_chunk: pulses worked on at a time, over all clips of a batch. Noise is drawn for a few chunks at
+            once, so with one seed another chunk is another realisation.
         display_rate_hz: reduce the two range-time maps to about this many columns per second, each the root
             of the mean power of its pulses; None keeps every pulse.
 
@@ -107,11 +108,7 @@ class RadarSimulator(nn.Module):
         self,
         radar: RadarConfig,
         wall: WallConfig | None = None,
-        multipath: bool = False,
-        leakage: bool = False,
-        wall_echo: bool = False,
-        wall_paths: str = "series",
-        direct: bool = True,
+        *,
         snr_db: float | None = 50.0,
         noise_reference: str = "echo",
         noise_figure_db: float = 10.0,
@@ -130,6 +127,7 @@ class RadarSimulator(nn.Module):
         echo: EchoSynthesizer | None = None,
         doppler: DopplerTimeMap | None = None,
         ridges: RidgeExtractor | None = None,
+        **scene: Any,
     ) -> None:
         super().__init__()
         if radar.has_array:
@@ -141,9 +139,10 @@ class RadarSimulator(nn.Module):
             raise TensorsimError(f"engine: got {engine!r}, expected 'time' or 'range-bins'")
         if near_bins is not None and engine == "time":
             raise TensorsimError(f"near_bins: got {near_bins} with the engine 'time', expected 'range-bins'")
-        self.echo = echo or EchoSynthesizer(
-            radar, wall, multipath, leakage, wall_echo, wall_paths, direct, pulse_chunk
-        )
+        if echo is not None and (wall is not None or scene):
+            given = sorted(scene) + ["wall"] * (wall is not None)
+            raise TensorsimError(f"echo: got a ready one and {', '.join(given)}, expected one or the other")
+        self.echo = echo or EchoSynthesizer(radar, wall, pulse_chunk=pulse_chunk, **scene)
         self.noise = ReceiverNoise(
             snr_db,
             noise_reference,
@@ -154,10 +153,11 @@ class RadarSimulator(nn.Module):
         )
         fixed = None if isinstance(range_gate_m, float | int) else range_gate_m
         self.range_profile = RangeProfile(radar, range_window, fixed)
-        self.engine: nn.Module = TimeEngine(self.echo, self.noise, self.range_profile)
+        total = noise_reference == "total"
+        self.engine: nn.Module = TimeEngine(self.echo, self.range_profile, total)
         if engine == "range-bins":
-            bins = RangeBinSynthesizer(self.echo, self.range_profile, near_bins)
-            self.engine = RangeBinEngine(bins, self.noise)
+            self.engine = RangeBinEngine(RangeBinSynthesizer(self.echo, self.range_profile, near_bins), total)
+        self.profile_noise = ProfileNoise(self.range_profile.window)
         self.gate: nn.Module | None = None
         if isinstance(range_gate_m, float | int):
             self.gate = FollowingGate(radar, self.range_profile.range_m, range_gate_m)
@@ -179,7 +179,7 @@ class RadarSimulator(nn.Module):
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
         pulses = positions.shape[1]
-        signal = self._energy(positions, rcs) / (pulses * self.echo.samples)
+        echoes, signal = self._echoes(positions, rcs)
         noise = torch.zeros_like(signal)
         pending = self._nothing_pending(positions)
         range_time: list[Tensor] = []
@@ -188,7 +188,7 @@ class RadarSimulator(nn.Module):
         span = self._span(positions)
         for start in range(0, pulses, span):
             stop = start + span
-            piece = self._piece(positions[:, start:stop], rcs[:, start:stop], signal, pending)
+            piece = self._piece(echoes.pop(0), positions[:, start:stop], rcs[:, start:stop], signal, pending)
             range_time.append(piece.profiles.transpose(1, 2).abs())
             range_time_mti.append(piece.moving.transpose(1, 2).abs())
             doppler_times.append(piece.doppler_time)
@@ -211,13 +211,13 @@ class RadarSimulator(nn.Module):
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
         pulses = positions.shape[1]
-        signal = self._energy(positions, rcs) / (pulses * self.echo.samples)
+        echoes, signal = self._echoes(positions, rcs)
         pending = self._nothing_pending(positions)
         parts: list[Tensor] = []
         span = self._span(positions)
         for start in range(0, pulses, span):
             stop = start + span
-            piece = self._piece(positions[:, start:stop], rcs[:, start:stop], signal, pending)
+            piece = self._piece(echoes.pop(0), positions[:, start:stop], rcs[:, start:stop], signal, pending)
             parts.append(piece.doppler_time)
             pending = piece.pending
         return unflatten_batch(torch.cat(parts, -1), lead)
@@ -258,7 +258,7 @@ class RadarSimulator(nn.Module):
         for positions, rcs in self._pieces(source, pulses):
             speeds.add(positions, rcs)
             if not self.noise.noiseless:
-                signal = signal + self._energy(positions, rcs).to(signal) / (pulses * self.echo.samples)
+                signal = signal + self._profiles(positions, rcs)[1].to(signal) / (pulses * self.echo.samples)
         speeds.judge()
 
         seen = pulses - self.mti.lost_pulses
@@ -270,7 +270,8 @@ class RadarSimulator(nn.Module):
         noise = torch.zeros_like(signal)
         for positions, rcs in self._pieces(source, pulses):
             before = pending[0] if pending else self._nothing_pending(positions)
-            piece = self._piece(positions, rcs, signal.to(positions.device), before)
+            fresh = self._profiles(positions, rcs)[0]
+            piece = self._piece(fresh, positions, rcs, signal.to(positions.device), before)
             pending, noise = [piece.pending], noise + piece.noise_energy.to(noise)
             range_time.push(piece.profiles[0].T.abs())
             range_time_mti.push(piece.moving[0].T.abs())
@@ -315,9 +316,18 @@ class RadarSimulator(nn.Module):
         nothing = self.echo.static_echo().new_zeros([positions.shape[0], 0, bins])
         return Pending(nothing, nothing)
 
-    def _piece(self, positions: Tensor, rcs: Tensor, signal: Tensor, pending: Pending) -> Piece:
-        """Maps of the next pulses (B, m, S, 3), (B, m, S), after those of which ``pending`` is left."""
-        fresh, noise_energy = self._profiles(positions, rcs, signal)
+    def _piece(
+        self, fresh: Tensor, positions: Tensor, rcs: Tensor, signal: Tensor, pending: Pending
+    ) -> Piece:
+        """Maps of the next pulses, after those of which ``pending`` is left.
+
+        Their profiles (B, m, R) free of noise, positions (B, m, S, 3), RCS (B, m, S); ``signal`` (B,) is the mean
+        power that the noise refers to.
+        """
+        noise_energy = torch.zeros_like(signal)
+        if not self.noise.noiseless:
+            noise, noise_energy = self.profile_noise(fresh.transpose(1, 2), self.noise.noise_power(signal))
+            fresh = fresh + noise.transpose(1, 2)
         profiles = join_pulses(pending.profiles, fresh)
         moving = self.mti(profiles)
         if self.gate is not None:
@@ -338,34 +348,27 @@ class RadarSimulator(nn.Module):
             noise_energy,
         )
 
-    def _energy(self, positions: Tensor, rcs: Tensor) -> Tensor:
-        """Energy (B,) over pulses and samples of the noise reference: (B, M, S, 3), (B, M, S)."""
+    def _echoes(self, positions: Tensor, rcs: Tensor) -> tuple[list[Tensor], Tensor]:
+        """Profiles free of noise, piece by piece, and the mean power (B,) of the noise reference."""
+        pulses, span = positions.shape[1], self._span(positions)
+        pieces: list[Tensor] = []
         total = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
-        if self.noise.noiseless:
-            return total
-        static = self.echo.static_echo()
-        step = self._step(positions)
-        for start in range(0, positions.shape[1], step):
-            stop = start + step
-            signal = self.echo.target_echo(positions[:, start:stop], rcs[:, start:stop])
-            if self.noise.reference == "total":
-                signal = signal + static
-            total = total + energy(signal)
-        return total
+        for start in range(0, pulses, span):
+            profiles, energy = self._profiles(
+                positions[:, start : start + span], rcs[:, start : start + span]
+            )
+            pieces.append(profiles)
+            total = total + energy
+        return pieces, total / (pulses * self.echo.samples)
 
-    def _profiles(self, positions: Tensor, rcs: Tensor, signal: Tensor) -> tuple[Tensor, Tensor]:
-        """Profiles (B, M, R), stored with time running fastest, for noise set by the mean signal power (B,).
-
-        Also the energy (B,) of the noise that was drawn.
-        """
-        power = self.noise.noise_power(signal)
-        total = torch.zeros_like(signal)
+    def _profiles(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
+        """Profiles (B, M, R) free of noise, stored with time running fastest, and the energy (B,) of the reference."""
+        total = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
         chunks: list[Tensor] = []
         step = self._step(positions)
         for start in range(0, positions.shape[1], step):
-            stop = start + step
-            profiles, drawn = self.engine(positions[:, start:stop], rcs[:, start:stop], power)
-            total = total + drawn
+            profiles, energy = self.engine(positions[:, start : start + step], rcs[:, start : start + step])
+            total = total + energy
             chunks.append(profiles.transpose(1, 2))
         return torch.cat(chunks, -1).transpose(1, 2), total
 

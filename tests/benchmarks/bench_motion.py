@@ -1,11 +1,12 @@
-"""Motion stages against SciPy in the same run, one thread each.
+"""Motion stages against SciPy in the same run. Batches go to SciPy as one array, and clip by clip.
 
-``OMP_NUM_THREADS=1 python tests/benchmarks/bench_motion.py``
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_motion [--cpu]``
 """
 
-import statistics
+import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,24 +15,20 @@ from scipy.signal import savgol_filter
 
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
+from tests.benchmarks.timing import host, medians
 
 ROUNDS = 15
 
 
 def compare(name: str, ours: Callable[[], object], peer: Callable[[], object]) -> None:
     """Median of each, taken in turn, and how many times faster ours is."""
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(ROUNDS + 1):
-        for function, column in zip((ours, peer), times, strict=True):
-            start = time.perf_counter()
-            function()
-            column.append(time.perf_counter() - start)
-    own, other = (statistics.median(column[1:]) * 1e3 for column in times)  # the first round warms up
-    print(f"{name:<58} {own:9.3f} ms   SciPy {other:9.3f} ms   ratio {other / own:6.2f}")
+    clock = time.process_time if "--cpu" in sys.argv else time.perf_counter
+    own, other = medians([ours, peer], ROUNDS, clock)
+    print(f"{name:<58} {own * 1e3:9.3f} ms   SciPy {other * 1e3:9.3f} ms   ratio {other / own:6.2f}")
 
 
 def main() -> None:
-    torch.set_num_threads(1)
+    print(host())
     torch.set_grad_enabled(False)
     clip = torch.randn(120, 14, 3, dtype=torch.float64).cumsum(0)
     batch = torch.randn(64, 120, 14, 3, dtype=torch.float64).cumsum(1)
@@ -44,6 +41,9 @@ def main() -> None:
     ):
         stage, array = SavitzkyGolay(window, 3), x.numpy()
         compare(name, lambda: stage(x), lambda: savgol_filter(array, window, 3, axis=-3))  # noqa: B023
+        if x is batch:
+            one_by_one = partial(lambda clips: [savgol_filter(c, 11, 3, axis=-3) for c in clips], list(array))
+            compare("  against SciPy clip by clip", partial(stage, x), one_by_one)
 
     for prf_hz in (8192.0, 128.0):
         resampler = PoseResampler(prf_hz)

@@ -1,15 +1,14 @@
-"""Speed and memory of the radar chain: `python -m tests.benchmarks.bench_radar [--ten-minutes | --plot PNG]`.
+"""Speed and memory of the radar chain: `python -m tests.benchmarks.bench_radar [--cpu] [--ten-minutes | --plot PNG]`.
 
 Peers, in the same run: the echo evaluated directly in NumPy complex128, and the same sum written plainly in torch.
 Medians of ours; the peers, which take long, run once. The chain is positions to Doppler-time map, noise included.
+`--cpu` takes processor time instead of wall time, for a machine that is busy with other work.
 On a GPU, if there is one: clips per second for batches of 1 to 64.
 """
 
 import argparse
 import math
-import os
 import resource
-import statistics
 import time
 
 import numpy as np
@@ -17,6 +16,7 @@ import torch
 
 from tensorsim.config import JOINT_RCS_M2, RadarConfig, WallConfig
 from tensorsim.radar.simulator import RadarSimulator
+from tests.benchmarks.timing import host, medians, seconds
 from tests.radar import reference
 
 
@@ -26,16 +26,6 @@ def walker(start, stop, prf_hz, scatterers=14):
     limb = torch.linspace(0, 1, scatterers, dtype=torch.float64)
     y = 4 - 2 * torch.sin(0.6 * t) + 0.25 * torch.sin(2 * math.pi * (t + limb))
     return torch.stack((0.3 * torch.cos(7 * limb) + 0 * t, y, 0.1 + 1.6 * limb + 0 * t), -1).float()
-
-
-def seconds(function, repeats):
-    """Median wall time."""
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times)
 
 
 def plain_torch_echo(radar, positions, rcs):
@@ -55,36 +45,70 @@ def plain_torch_echo(radar, positions, rcs):
     return total
 
 
-def compare(name, radar, clip_s, wall=None, multipath=False):
+#: The chain in three settings: the defaults, closed-form bins, and those within a gate, as data sets are made.
+SETTINGS = {
+    "time engine, all bins": {},
+    "range-bins engine, 8 near": {"engine": "range-bins", "near_bins": 8},
+    "range-bins engine, 8 near, gate 1.5 to 5.5 m": {
+        "engine": "range-bins",
+        "near_bins": 8,
+        "range_gate_m": (1.5, 5.5),
+    },
+}
+
+
+def compare(name, radar, clip_s, clock, wall=None, multipath=False, rounds=5):
     """Print medians and ratios of echo and chain against both peers."""
     pulses = round(clip_s * radar.prf_hz)
     positions, rcs = walker(0, pulses, radar.prf_hz), torch.tensor(JOINT_RCS_M2)
     p, sigma = positions.double().numpy(), np.asarray(JOINT_RCS_M2)
     answers = []
-    peer = seconds(lambda: answers.append(reference.echo(radar, p, sigma, wall, multipath)), 1)
+    peer = seconds(lambda: answers.append(reference.echo(radar, p, sigma, wall, multipath)), clock)
     print(
         f"{name}: {pulses} pulses x 14 scatterers x {radar.samples_per_chirp} samples; NumPy echo {peer:.2f} s"
     )
-    if wall is None:
-        plain = seconds(lambda: plain_torch_echo(radar, positions, rcs), 1)
-        print(f"  plain torch echo {plain:.2f} s")
-    echo = RadarSimulator(radar, wall, multipath).echo
+    versus = ""
+    simulators = {
+        label: RadarSimulator(radar, wall, multipath=multipath, **options)
+        for label, options in SETTINGS.items()
+    }
+    echo = simulators["time engine, all bins"].echo
     error = reference.relative(echo(positions, rcs), answers.pop())
-    median = seconds(lambda: echo(positions, rcs), 5)
-    versus = f", plain torch {plain / median:.1f} times" if wall is None else ""
+    median = medians([lambda: echo(positions, rcs)], rounds, clock)[0]
+    if wall is None:
+        plain = seconds(lambda: plain_torch_echo(radar, positions, rcs), clock)
+        versus = f", plain torch {plain / median:.1f} times"
     print(f"  echo {median:.3f} s, error {error:.1e}: NumPy {peer / median:.1f} times{versus}")
-    for options in ({}, {"engine": "range-bins", "near_bins": 8, "range_gate_m": (1.0, 7.0)}):
-        simulator = RadarSimulator(radar, wall, multipath, **options)
-        simulator(positions, rcs)
-        maps = seconds(lambda s=simulator: s(positions, rcs), 5)
-        alone = seconds(lambda s=simulator: s.doppler_time(positions, rcs), 5)
+    for label, simulator in simulators.items():
+        maps, alone = medians(
+            [
+                lambda s=simulator: s(positions, rcs),
+                lambda s=simulator: s.doppler_time(positions, rcs),
+            ],
+            rounds,
+            clock,
+        )
         print(
-            f"  {options or 'time engine'}: all maps {maps:.3f} s, {peer / maps:.1f} times; "
+            f"  {label}: all maps {maps:.3f} s, {peer / maps:.1f} times; "
             f"Doppler-time map alone {alone:.3f} s, {peer / alone:.1f} times"
         )
 
 
-def plot(path):
+def compiled(radar, clock):
+    """Print what torch.compile makes of the sum over scatterers, where it finds a compiler."""
+    echo = RadarSimulator(radar).echo
+    pulses, rcs = walker(0, 1024, radar.prf_hz), torch.tensor(JOINT_RCS_M2).expand(1024, 14)
+    function = torch.compile(echo.target_echo)
+    try:
+        function(pulses, rcs)
+    except Exception as error:
+        print(f"torch.compile: none here ({type(error).__name__})")
+        return
+    eager, fast = medians([lambda: echo.target_echo(pulses, rcs), lambda: function(pulses, rcs)], 20, clock)
+    print(f"torch.compile of the echo, 1024 pulses: {fast * 1e3:.2f} ms, eager {eager * 1e3:.2f} ms")
+
+
+def plot(path, clock):
     """Time of the echo against the length of the clip and the number of scatterers, as a PNG."""
     import matplotlib
 
@@ -110,11 +134,13 @@ def plot(path):
                     part = walker(start, min(start + 1024, pulses), radar.prf_hz, scatterers)
                     echo.target_echo(part, rcs.expand(part.shape[:2]))
 
-            times.append(seconds(run, 1 if clip_s > 60 else 3))
+            times.append(seconds(run, clock) if clip_s > 60 else medians([run], 3, clock)[0])
         values = [case[label == "scatterers"] for case in cases]
-        print(f"{label}: " + ", ".join(f"{v}: {t:.3f} s" for v, t in zip(values, times, strict=True)))
+        slope = np.polyfit(np.log(values[1:]), np.log(times[1:]), 1)[0]
+        points = ", ".join(f"{v}: {t:.3f} s" for v, t in zip(values, times, strict=True))
+        print(f"{label}, exponent {slope:.2f} without the first: {points}")
         axis.loglog(values, times, "o-")
-        axis.set(xlabel=label, ylabel="echo, s")
+        axis.set(xlabel=label, ylabel="echo, s", title=f"exponent {slope:.2f}")
     figure.savefig(path)
 
 
@@ -128,9 +154,7 @@ def on_gpu():
     block = torch.empty(2**28, device="cuda")
 
     def timed(function):
-        function()
-        torch.cuda.synchronize()
-        return seconds(lambda: (function(), torch.cuda.synchronize()), 5)
+        return medians([lambda: (function(), torch.cuda.synchronize())], 5)[0]
 
     bandwidth = 2 * block.nbytes / timed(lambda: block.clone())
     simulator = RadarSimulator(radar, pulse_chunk=32768, range_gate_m=(1.0, 7.0)).cuda()
@@ -168,16 +192,20 @@ if __name__ == "__main__":
     parser.add_argument(
         "--ten-minutes", action="store_true", help="only stream a ten-minute clip, for its memory"
     )
+    parser.add_argument("--cpu", action="store_true", help="processor time instead of wall time")
     parser.add_argument("--plot", metavar="PNG", help="only plot the time against pulses and scatterers")
     arguments = parser.parse_args()
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f}")
+    clock = time.process_time if arguments.cpu else time.perf_counter
+    print(f"{host()}, {clock.__name__}")
     with torch.no_grad():
         if arguments.ten_minutes:
             ten_minutes(RadarConfig.free_space())
         elif arguments.plot:
-            plot(arguments.plot)
+            plot(arguments.plot, clock)
         else:
             on_gpu()
-            compare("free space, 4 s", RadarConfig.free_space(), 4.0)
-            compare("through wall, 4 s", RadarConfig.through_wall(), 4.0, WallConfig(), multipath=True)
-            compare("through wall, 60 s", RadarConfig.through_wall(), 60.0, WallConfig(), multipath=True)
+            compare("free space, 4 s", RadarConfig.free_space(), 4.0, clock)
+            through, wall = RadarConfig.through_wall(), WallConfig()
+            compare("through wall, 4 s", through, 4.0, clock, wall, multipath=True)
+            compare("through wall, 60 s", through, 60.0, clock, wall, multipath=True)
+            compiled(RadarConfig.free_space(), clock)

@@ -2,12 +2,11 @@
 
 Both take every range bin's STFT, sum its power over range and take the root. SciPy is given its data in the layout
 and the precision that it likes best, and its batches clip by clip: its own zero padding takes at most two dimensions.
-``OMP_NUM_THREADS=1 python tests/benchmarks/bench_stft.py``
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_stft [--cpu]``
 """
 
-import statistics
+import sys
 import time
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,20 +15,9 @@ from scipy.signal.windows import hann
 
 from tensorsim.config import RadarConfig
 from tensorsim.radar.doppler import DopplerTimeMap
+from tests.benchmarks.timing import host, medians
 
 ROUNDS = 7
-
-
-def medians(ours: Callable[[], object], peer: Callable[[], object]) -> tuple[float, float]:
-    """Milliseconds of each, taken in turn."""
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(ROUNDS + 1):
-        for function, column in zip((ours, peer), times, strict=True):
-            start = time.perf_counter()
-            function()
-            column.append(time.perf_counter() - start)
-    own, other = (statistics.median(column[1:]) * 1e3 for column in times)  # the first round warms up
-    return own, other
 
 
 def scipy_map(stft: ShortTimeFFT, clip: np.ndarray, first: int, last: int) -> np.ndarray:
@@ -40,7 +28,8 @@ def scipy_map(stft: ShortTimeFFT, clip: np.ndarray, first: int, last: int) -> np
 
 def main() -> None:
     torch.set_grad_enabled(False)
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} thread(s), complex64")
+    clock = time.process_time if "--cpu" in sys.argv else time.perf_counter
+    print(f"{host()}, {clock.__name__}, complex64")
     scenes = (("free space", RadarConfig.free_space()), ("through-wall", RadarConfig.through_wall()))
     for name, radar in scenes:
         stage = DopplerTimeMap(radar)
@@ -63,12 +52,16 @@ def main() -> None:
             last = first + frames
             x = profiles.transpose(1, 2)
             own, other = medians(
-                lambda: stage(x),  # noqa: B023
-                lambda: [scipy_map(stft, clip, first, last) for clip in series],  # noqa: B023
+                [
+                    lambda: stage(x),  # noqa: B023
+                    lambda: [scipy_map(stft, clip, first, last) for clip in series],  # noqa: B023
+                ],
+                ROUNDS,
+                clock,
             )
             print(
                 f"{name:<13} {batch:3d} clip(s) x {bins:3d} range bins, {frames:4d} frames of {stage.bins}:"
-                f" {own:9.2f} ms   SciPy {other:9.2f} ms   ratio {other / own:6.2f}"
+                f" {own * 1e3:9.2f} ms   SciPy {other * 1e3:9.2f} ms   ratio {other / own:6.2f}"
             )
 
 

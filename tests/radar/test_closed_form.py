@@ -146,23 +146,21 @@ def test_gate_is_a_cut_through_all_bins():
     assert_same(gated(p, rcs), whole(p, rcs)[:, chosen])
 
 
-@pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize("gate_m", [None, (2.0, 2.6)])
-def test_noise_has_the_covariance_of_windowed_white_noise(window, gate_m):
-    """Against the definition, and the factor itself: its square is the covariance up to the phase of a bin."""
-    bins = synthesizer(FREE, window, gate_m=gate_m)
-    k = np.arange(bins.profile.first_bin, bins.profile.last_bin + 1)
-    w = {"hamming": np.hamming, "hann": np.hanning, "blackman": np.blackman, None: np.ones}[window](400)
-    dft = np.exp(-2j * np.pi * np.outer(k, np.arange(400)) / 400)
-    expected = (dft * w**2) @ dft.conj().T
-    centre = np.exp(2j * np.pi * k * 399 / 800)
-    factor = bins.noise_factor.numpy()
-    actual = (factor @ factor.T) * np.outer(centre.conj(), centre)
-    np.testing.assert_allclose(actual, expected, atol=1e-9 * np.abs(expected).max())
-    noise = bins.color(torch.randn(40_000, len(k), dtype=torch.complex128)).numpy()
-    drawn = noise.T @ noise.conj() / 40_000 * np.outer(centre.conj(), centre)
-    assert np.abs(drawn - expected).max() < 6 / math.sqrt(40_000) * np.abs(expected).max()
-    assert np.abs(noise.T @ noise / 40_000).max() < 6 / math.sqrt(40_000) * np.abs(expected).max()
+@pytest.mark.parametrize("paths", [2, 14, 90])
+def test_energy_is_that_of_the_samples(paths):
+    """By pairs, and for many paths by samples; two of them at one place, with and without what stands still."""
+    p = swinging(20, paths, 8192.0)
+    p[:, 1] = p[:, 0]
+    p, rcs = tensors(p, np.linspace(0.1, 1, paths))
+    bins = synthesizer(FREE, leakage=True)
+    echo = bins.echo.double().target_echo(p, rcs.expand(20, paths))
+    expected = {
+        total: (echo + total * bins.echo.static_echo()).abs().square().sum(-1) for total in (False, True)
+    }
+    for module, error in ((bins.double(), 1e-9), (synthesizer(FREE, leakage=True), 1e-5)):
+        for total in (False, True):
+            energy = module.energy(*module.tones(p, rcs.expand(20, paths)), total)
+            assert reference.relative(energy, expected[total]) < error
 
 
 def test_refuses_bad_settings():

@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from tensorsim.errors import TensorsimError
-from tensorsim.radar.noise import ReceiverNoise
+from tensorsim.radar.noise import ProfileNoise, ReceiverNoise
 from tests.stage import StageTester, assert_same
 
 
@@ -165,3 +166,61 @@ def test_gradient_scales_the_noise_with_the_signal():
 def test_bad_arguments(arguments, message):
     with pytest.raises(TensorsimError, match=message):
         ReceiverNoise(**arguments)
+
+
+class TestProfileNoise(StageTester):
+    """Without power, since base tests repeat calls."""
+
+    batched_arguments = (0, 1)
+    gradient_arguments = ()  # tested below
+    batch_shapes = ((3,),)
+
+    def make(self):
+        return ProfileNoise(torch.hamming_window(24, periodic=False, dtype=torch.float64))
+
+    def inputs(self, batch, dtype):
+        x = signal(*batch, 6, 8)
+        return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64), torch.zeros(*batch)
+
+    def test_refuses_bad_input(self):
+        pytest.skip("an inner stage: the simulator has checked its arguments")
+
+
+@pytest.mark.parametrize(
+    ("window", "taps"), [(np.hamming, 2), (np.hanning, 2), (np.blackman, 3), (np.ones, 1)]
+)
+def test_noise_of_the_bins_has_the_covariance_of_windowed_white_noise(window, taps):
+    """Against the definition, ``F diag(w^2) F^H``, phases counted from sample N / 2."""
+    module = ProfileNoise(torch.tensor(window(400)))
+    assert len(module.taps) == taps
+    bins, draws = 40, 40_000
+    k = np.arange(30, 30 + bins)
+    dft = np.exp(-2j * np.pi * np.outer(k, np.arange(400) - 399 / 2) / 400) * np.exp(-1j * np.pi * k[:, None])
+    expected = 2.0 * (dft * window(400) ** 2) @ dft.conj().T
+    noise, energy = module(torch.zeros(1, bins, draws, dtype=torch.complex128), torch.tensor([2.0]).double())
+    noise = noise[0].numpy()
+    scale = np.abs(expected).max()
+    drawn = noise @ noise.conj().T / draws
+    assert np.abs(drawn - expected).max() < 6 / math.sqrt(draws) * scale
+    assert np.abs(noise @ noise.T / draws).max() < 6 / math.sqrt(draws) * scale
+    assert float(energy) / (draws * 400) == pytest.approx(2.0, rel=0.01)
+    # The taps themselves, without the scatter of draws.
+    filters = np.zeros((bins, bins + 2 * taps - 2))
+    for lag in range(1 - taps, taps):
+        filters[np.arange(bins), np.arange(bins) + taps - 1 + lag] = module.taps[abs(lag)]
+    assert np.abs(2.0 * filters @ filters.T - expected).max() < 3e-3 * scale
+
+
+def test_noise_of_the_bins_is_set_per_clip_and_scales_with_its_power():
+    module = ProfileNoise(torch.tensor(np.hamming(24)))
+    power = torch.tensor([1.0, 100.0], dtype=torch.float64)
+    noise, energy = module(torch.zeros(2, 5, 4000, dtype=torch.complex128), power)
+    level = noise.abs().square().mean((1, 2)) / (power * float((np.hamming(24) ** 2).sum()))
+    assert level.tolist() == pytest.approx([1.0, 1.0], rel=0.05)
+    assert (energy / (4000 * 24 * power)).tolist() == pytest.approx([1.0, 1.0], rel=0.05)
+
+    def function(power):
+        torch.manual_seed(0)
+        return module(torch.zeros(2, 5, 3, dtype=torch.complex128), power)
+
+    assert torch.autograd.gradcheck(function, power.requires_grad_(True))

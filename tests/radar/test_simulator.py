@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tensorsim.config import RadarConfig, WallConfig
+from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.ambiguity import check_unambiguous, radial_speed
 from tensorsim.radar.columns import block_rms
@@ -223,6 +223,15 @@ def test_ready_stages_take_the_place_of_their_settings():
     named = {"leakage": True, "overlap": 0.5, "integration": "paper", "ridge_count": 1}
     p, rcs = tensors(swinging(60, 3, 256.0), np.ones(3))
     assert_same(ready(p, rcs), RadarSimulator(SMALL, snr_db=None, **named)(p, rcs))
+
+
+def test_scene_is_that_of_the_echo_synthesizer():
+    p, rcs = tensors(swinging(60, 3, 256.0), np.ones(3))
+    scene = {"floor": FloorConfig(), "direct": False}
+    ready = RadarSimulator(SMALL, snr_db=None, echo=EchoSynthesizer(SMALL, **scene))
+    assert_same(RadarSimulator(SMALL, snr_db=None, **scene)(p, rcs), ready(p, rcs))
+    with pytest.raises(TensorsimError, match="echo: got a ready one and direct, wall, expected"):
+        RadarSimulator(SMALL, WallConfig(), echo=EchoSynthesizer(SMALL), direct=False)
 
 
 def test_fixed_gate_is_a_cut_through_the_maps():
