@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
+from tensorsim.enhance.perona_malik import PeronaMalik
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_not_empty
 
 
@@ -40,6 +41,7 @@ class DnCNN(nn.Module):
                 f"DnCNN: got depth {depth} and {channels} channels, expected at least 2 and at least 1"
             )
         self.depth = depth
+        self.reach = depth
         self.channels = channels
         self.batch_norm = batch_norm
         layers: list[nn.Module] = [_convolution(1, channels), nn.ReLU(inplace=True)]
@@ -137,20 +139,21 @@ class MapDenoiser(nn.Module):
     the whole map and memory does not grow with its length.
 
     Args:
-        network: noisy images in [0, 1] -> clean ones, see :class:`DnCNN`.
+        network: noisy images (..., H, W) in [0, 1] -> clean ones, :class:`DnCNN` or
+            :class:`~tensorsim.enhance.perona_malik.PeronaMalik`.
         tile: columns (time) cleaned at once.
 
     Raises:
         TensorsimError: a tile without columns.
     """
 
-    def __init__(self, network: DnCNN, tile: int = 1024) -> None:
+    def __init__(self, network: DnCNN | PeronaMalik, tile: int = 1024) -> None:
         super().__init__()
         if tile < 1:
             raise TensorsimError(f"MapDenoiser.tile: got {tile} columns, expected at least 1")
         self.network = network
         self.tile = tile
-        self.reach = network.depth
+        self.reach: int = network.reach
 
     def forward(self, maps: Tensor) -> Tensor:
         """Clean magnitude maps (..., H, W), each on its own scale.

@@ -1,0 +1,94 @@
+"""``tensorsim evaluate classifier``: accuracy on generated people, against noise, and on poses from films."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class EvaluateClassifier:
+    """Print accuracy against signal-to-noise ratio, and confusion matrices of the lowest and highest.
+
+    Attributes:
+        weights: SPNet's or SPGNet's (.safetensors).
+        maps: folder of maps; missing ones are made first.
+        scenes: what to evaluate on.
+        people: people per scene, each doing all 12 activities.
+        held_out: only every fifth of them: for a folder that the network was trained on.
+        maps_seed: of people, motion and noise; one that the network was not trained on makes a test set.
+        snr: signal-to-noise ratios in dB.
+        poses: folder with a pose.npz of ``tensorsim simulate`` per film, in folders whose names begin with S1 to S12.
+        out: folder for the confusion matrices as CSV and PNG.
+        quiet: no progress bar.
+    """
+
+    weights: Path
+    maps: Path | None = None
+    scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    people: int = 40
+    held_out: bool = False
+    maps_seed: int = 1
+    snr: tuple[float, ...] = (50.0, 40.0, 30.0, 20.0, 10.0)
+    poses: Path | None = None
+    out: Path | None = None
+    quiet: bool = False
+
+    def run(self) -> None:
+        """Do it."""
+        if self.maps is None and self.poses is None:
+            raise TensorsimError("evaluate classifier: got nothing to classify, expected --maps or --poses")
+        if len(self.snr) == 0:
+            raise TensorsimError("--snr: got no ratios, expected at least one")
+        if self.maps is not None:
+            self._on_maps()
+        if self.poses is not None:
+            self._on_poses()
+
+    def _on_maps(self) -> None:
+        from tensorsim import plot
+        from tensorsim.config import ACTIVITIES
+        from tensorsim.training.classifier import clips_of, confusion, load_classifier, logits_of
+        from tensorsim.training.maps import MapSettings, MapStore, build_maps
+
+        assert self.maps is not None
+        network, size = load_classifier(self.weights)
+        build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
+        store = MapStore(self.maps)
+        print(f"{'scene':14s}" + "".join(f"{ratio:8.0f} dB" for ratio in self.snr) + "   clips")
+        matrices = {}
+        for scene in self.scenes:
+            clips = clips_of(store, (scene,), self.people, validation=True if self.held_out else None)
+            row = []
+            for ratio in self.snr:
+                counts = confusion(logits_of(network, store, clips, (ratio, ratio), size), clips)
+                row.append(float(counts.diagonal().sum()) / len(clips))
+                matrices[scene, ratio] = counts.numpy()
+            print(f"{scene:14s}" + "".join(f"{100 * a:9.1f} %" for a in row) + f"{len(clips):8d}", flush=True)
+        names = [name.split(" ")[0] for name in ACTIVITIES]
+        for (scene, ratio), matrix in matrices.items():
+            if ratio in (min(self.snr), max(self.snr)):
+                print(f"\n{scene}, {ratio:.0f} dB: true class in rows, predicted in columns")
+                print("     " + "".join(f"{name:>5s}" for name in names))
+                for name, numbers in zip(names, matrix, strict=True):
+                    print(f"{name:5s}" + "".join(f"{n:5d}" for n in numbers))
+            if self.out is not None:
+                self.out.mkdir(parents=True, exist_ok=True)
+                stem = self.out / f"confusion_{scene}_{ratio:.0f}dB"
+                lines = [",".join(["", *names])]
+                lines += [
+                    ",".join([name, *map(str, numbers)]) for name, numbers in zip(names, matrix, strict=True)
+                ]
+                stem.with_suffix(".csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+                figure = plot.confusion_figure(matrix, names, f"{scene}, {ratio:.0f} dB")
+                plot.save_figure(figure, stem.with_suffix(".png"))
+
+    def _on_poses(self) -> None:
+        from tensorsim.training.film_maps import classify_poses, labelled_poses
+
+        assert self.poses is not None
+        poses = labelled_poses(self.poses)
+        for scene in self.scenes:
+            right = classify_poses(self.weights, poses, scene, max(self.snr), self.quiet)
+            print(f"{scene:14s} films: {100 * sum(right) / len(right):.1f} % of {len(right)}")

@@ -1,0 +1,59 @@
+"""``tensorsim evaluate denoiser``: what a denoiser gains on maps of people it has not seen, beside its rivals."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class EvaluateDenoiser:
+    """Print PSNR and the errors of ridges and envelope, before and after, for each kind of map and each rival.
+
+    Attributes:
+        weights: DnCNN's (.safetensors, .pth).
+        against: more weights of DnCNN to compare with, such as dncnn_gray_blind.pth.
+        clips: clips per scene, activity after activity from S2 on.
+        scenes: what to evaluate on.
+        snr: signal-to-noise ratios in dB.
+        seed: of people, motion and noise; one that was not trained on.
+        ksvd: include K-SVD, which takes about a minute a map.
+        out: file for the table as CSV.
+        quiet: no progress bar.
+    """
+
+    weights: Path
+    against: tuple[Path, ...] = ()
+    clips: int = 11
+    scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    snr: tuple[float, ...] = (10.0,)
+    seed: int = 1
+    ksvd: bool = True
+    out: Path | None = None
+    quiet: bool = False
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
+        from tensorsim.enhance.perona_malik import PeronaMalik
+        from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, KSVDMaps, compare
+
+        rivals: Denoisers = {"none": None}
+        rivals |= {
+            path.stem: MapDenoiser(DnCNN.from_pretrained(path)) for path in (self.weights, *self.against)
+        }
+        rivals["Perona-Malik"] = MapDenoiser(PeronaMalik())
+        if self.ksvd:
+            rivals["K-SVD"] = KSVDMaps()
+        rows = compare(rivals, self.scenes, self.snr, self.clips, self.seed, self.quiet)
+        print(
+            f"{'scene':13s} {'map':30s} {'SNR':>4s} {'denoiser':24s}" + "".join(f"{c:>18s}" for c in COLUMNS)
+        )
+        for (scene, view, ratio, name), figures in rows.items():
+            numbers = "".join(f"{x:18.3f}" for x in figures)
+            print(f"{scene:13s} {view:30s} {ratio:4.0f} {name:24s}{numbers}")
+        if self.out is not None:
+            lines = [",".join(["scene", "map", "snr_db", "denoiser", *COLUMNS])]
+            lines += [
+                ",".join([*map(str, key), *(f"{x:.4f}" for x in figures)]) for key, figures in rows.items()
+            ]
+            self.out.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,111 @@
+"""Denoising by sparse combinations of patches that are learned from the noisy image itself.
+
+Source: M. Elad, M. Aharon, "Image denoising via sparse and redundant representations over learned dictionaries", IEEE
+Transactions on Image Processing 15 (2006). The dictionary is learned by scikit-learn's online method (Mairal et al.,
+2009) in place of K-SVD: the same objective, one patch after another.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_rank
+
+
+def noise_deviation(image: Tensor) -> float:
+    """Standard deviation of white noise in an image (H, W).
+
+    From the median of the finest diagonal Haar coefficients (Donoho, Johnstone, 1994).
+    """
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    x = image[:height, :width]
+    diagonal = (x[::2, ::2] - x[::2, 1::2] - x[1::2, ::2] + x[1::2, 1::2]) / 2
+    return float(diagonal.abs().median()) / 0.6745
+
+
+def cosine_dictionary(side: int, atoms: int) -> Tensor:
+    """Overcomplete cosine patches (atoms, side^2) of norm 1, ``atoms`` a square number: where learning starts."""
+    count = math.isqrt(atoms)
+    place = torch.arange(side, dtype=torch.float64)
+    rows = torch.cos(torch.arange(count, dtype=torch.float64)[:, None] * (place + 0.5) * (math.pi / count))
+    rows[1:] -= rows[1:].mean(1, keepdim=True)
+    rows /= torch.linalg.vector_norm(rows, dim=1, keepdim=True)
+    return torch.kron(rows, rows)
+
+
+def ksvd_denoise(
+    image: Tensor,
+    sigma: float | None = None,
+    side: int = 8,
+    atoms: int = 256,
+    iterations: int = 10,
+    training_patches: int = 10_000,
+    seed: int = 0,
+) -> Tensor:
+    """Clean an image (H, W) in [0, 1].
+
+    Every patch without its mean is approximated by as few atoms as leave a squared error of ``side^2 (1.15 sigma)^2``
+    (orthogonal matching pursuit); patches are averaged where they overlap, together with the noisy image of weight
+    ``0.118 / sigma`` (the paper's 30 over sigma in grey levels). Runs on the CPU in float64 and is not differentiable.
+
+    Args:
+        image: (H, W), at least ``side`` in both.
+        sigma: deviation of the noise; None estimates it, see :func:`noise_deviation`.
+        side: of a patch.
+        atoms: of the dictionary, a square number.
+        iterations: passes over the training patches.
+        training_patches: at most so many, drawn at random.
+        seed: of that draw and of learning.
+
+    Raises:
+        TensorsimError: another rank, an image smaller than a patch, NaN, atoms that are no square number, or
+            scikit-learn missing.
+    """
+    try:
+        from sklearn.decomposition import MiniBatchDictionaryLearning, sparse_encode
+    except ImportError as error:
+        raise TensorsimError(
+            f"ksvd_denoise: scikit-learn does not import ({error}); install tensorsim[train]"
+        ) from error
+    from torch.nn.functional import fold, unfold
+
+    check_floating(image, "ksvd_denoise")
+    check_rank(image, 2, "ksvd_denoise", "(H, W)")
+    check_finite(image, "ksvd_denoise")
+    if min(image.shape) < side:
+        raise TensorsimError(f"ksvd_denoise: got shape {list(image.shape)}, expected at least {side}x{side}")
+    if math.isqrt(atoms) ** 2 != atoms or atoms < 4:
+        raise TensorsimError(f"ksvd_denoise: got {atoms} atoms, expected a square number from 4")
+    noisy = image.detach().cpu().double()
+    sigma = noise_deviation(noisy) if sigma is None else sigma
+    if sigma <= 0:
+        return image.clone()
+    patches = unfold(noisy[None, None], side)[0].T  # (patches, side^2)
+    means = patches.mean(1, keepdim=True)
+    centred = (patches - means).numpy()
+    tolerance = side**2 * (1.15 * sigma) ** 2
+    drawn = torch.randperm(len(centred), generator=torch.Generator().manual_seed(seed))[:training_patches]
+    learner = MiniBatchDictionaryLearning(
+        n_components=atoms,
+        max_iter=iterations,
+        batch_size=256,
+        fit_algorithm="lars",
+        transform_algorithm="omp",
+        dict_init=cosine_dictionary(side, atoms).numpy(),
+        alpha=1.15 * sigma * side,
+        random_state=seed,
+    )
+    dictionary = learner.fit(centred[drawn.numpy()]).components_
+    dictionary /= (dictionary**2).sum(1, keepdims=True) ** 0.5
+    # Patches below the tolerance are their mean: the pursuit would find no atom for them.
+    busy = (centred**2).sum(1) > tolerance
+    found = torch.zeros_like(patches)
+    if busy.any():
+        codes = sparse_encode(centred[busy], dictionary, algorithm="omp", alpha=tolerance)
+        found[torch.from_numpy(busy)] = torch.from_numpy(codes @ dictionary)
+    weight = 0.118 / sigma
+    size = (int(noisy.shape[0]), int(noisy.shape[1]))
+    total = fold((found + means).T[None], size, side)[0, 0]
+    count = fold(torch.ones_like(found).T[None], size, side)[0, 0]
+    return ((weight * noisy + total) / (weight + count)).to(image)

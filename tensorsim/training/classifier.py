@@ -1,0 +1,228 @@
+"""The recipe of the activity classifiers: cross-entropy on stored pictures, noise drawn anew for every look."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.errors import TensorsimError
+from tensorsim.recognition.map_image import scaled
+from tensorsim.recognition.spgnet import SPGNet
+from tensorsim.recognition.spnet import SPNet
+from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.maps import MapStore
+from tensorsim.weights import load_state_dict, load_strict, read_metadata
+
+#: Networks by name, each with the size of the pictures that its authors give it.
+NETWORKS: dict[str, tuple[type[nn.Module], int]] = {"spnet": (SPNet, 224), "spgnet": (SPGNet, 32)}
+RANGE_DB = 40.0
+
+
+class Clip(NamedTuple):
+    """One clip of a store."""
+
+    scene: str
+    person: int
+    activity: int
+
+
+def held_out(person: int) -> bool:
+    """Whether a person is kept for validation: every fifth."""
+    return person % 5 == 4
+
+
+def clips_of(
+    store: MapStore, scenes: Sequence[str], people: int | None, validation: bool | None
+) -> list[Clip]:
+    """Clips of the first ``people`` people of a store (None: all); of both parts if ``validation`` is None.
+
+    Raises:
+        TensorsimError: fewer people there than asked for, or none of this part.
+    """
+    clips = []
+    for scene in scenes:
+        there = store.people[scene]
+        if people is not None and len(there) < people:
+            raise TensorsimError(f"{store.folder}: got {len(there)} people in {scene}, expected {people}")
+        for person in there[:people]:
+            if validation is None or held_out(person) == validation:
+                clips += [Clip(scene, person, activity) for activity in range(len(ACTIVITIES))]
+    if not clips:
+        raise TensorsimError(f"{store.folder}: got no clips of {', '.join(scenes)}, expected some")
+    return clips
+
+
+def picture(store: MapStore, clip: Clip, snr_db: float, size: int) -> Tensor:
+    """A stored clip as a network sees it: (1, size, size) in [0, 1].
+
+    Raises:
+        TensorsimError: the store's pictures are not a multiple of ``size``.
+    """
+    power = store.power(*clip, snr_db=snr_db)
+    if power.shape[-1] % size:
+        raise TensorsimError(f"picture: got size {size}, expected a divisor of the store's {power.shape[-1]}")
+    pooled = F.avg_pool2d(power.unsqueeze(0), power.shape[-1] // size)
+    return scaled(pooled, "db", RANGE_DB)
+
+
+def drawn_snr(seed: int, index: int, snr_db: tuple[float, float]) -> float:
+    """The ``index``-th draw of a stream, uniform between the two."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
+    return snr_db[0] + (snr_db[1] - snr_db[0]) * float(torch.rand((), generator=generator))
+
+
+class ClassifierRecipe(Recipe):
+    """The paper's protocol: Adam 1.47e-3, coupled L2 1e-4 on weights, a tenth of the rate after half of the epochs.
+
+    Args:
+        network: a name of :data:`NETWORKS`.
+        store: pictures of at least ``people`` people in each scene.
+        scenes: what to train on.
+        people: how many, of whom every fifth is held out.
+        snr_db: (lowest, highest) ratio, drawn anew for each picture; (50, 50) is the paper's.
+        seed: of weights, order and noise.
+        init: weights to start from.
+        size: height and width of the pictures, a divisor of the store's; None takes that of :data:`NETWORKS`.
+
+    Raises:
+        TensorsimError: an unknown network, a range that does not ascend, or a store without the people.
+    """
+
+    def __init__(
+        self,
+        network: str,
+        store: MapStore,
+        scenes: Sequence[str],
+        people: int,
+        snr_db: tuple[float, float] = (10.0, 50.0),
+        seed: int = 0,
+        init: Path | None = None,
+        size: int | None = None,
+    ) -> None:
+        if network not in NETWORKS:
+            raise TensorsimError(f"network: got {network!r}, expected one of {', '.join(NETWORKS)}")
+        if not snr_db[0] <= snr_db[1]:
+            raise TensorsimError(f"snr_db: got {snr_db}, expected the lower one first")
+        self.store, self.snr_db, self.seed = store, snr_db, seed
+        self.training = clips_of(store, scenes, people, validation=False)
+        self.validation = clips_of(store, scenes, people, validation=True)
+        kind, usual = NETWORKS[network]
+        self.size = usual if size is None else size
+        torch.manual_seed(seed)
+        net = kind(len(ACTIVITIES))
+        settings: dict[str, Any] = {
+            "network": network,
+            "size": self.size,
+            "scenes": list(scenes),
+            "people": people,
+            "snr_db": list(snr_db),
+            "seed": seed,
+            "store_seed": store.settings.seed,
+            "init": None if init is None else str(init),
+        }
+        metadata = {
+            "network": kind.__name__,
+            "size": str(self.size),
+            "speed_m_s": str(store.settings.speed_m_s),
+            "range_db": str(RANGE_DB),
+        }
+        super().__init__(net, settings, metadata)
+        some = [self.sample(index)["picture"].mean() for index in range(200)]
+        net.get_buffer("mean").fill_(float(torch.stack(some).mean()))
+        if init is not None:
+            load_strict(net, load_state_dict(init), init)
+
+    @functools.lru_cache(maxsize=2)  # noqa: B019  # two epochs, of the one recipe of a run
+    def order(self, epoch: int) -> Tensor:
+        """The order of the training clips in an epoch."""
+        generator = torch.Generator().manual_seed(self.seed * 7919 + epoch)
+        return torch.randperm(len(self.training), generator=generator)
+
+    def sample(self, index: int) -> dict[str, Any]:
+        """Picture (1, H, W) and label."""
+        epoch, place = divmod(index, len(self.training))
+        clip = self.training[int(self.order(epoch)[place])]
+        snr_db = drawn_snr(self.seed, index, self.snr_db)
+        return {"picture": picture(self.store, clip, snr_db, self.size), "label": clip.activity}
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Cross-entropy and accuracy."""
+        logits = net(batch["picture"]).float()
+        accuracy = (logits.argmax(-1) == batch["label"]).float().mean()
+        return {"loss": F.cross_entropy(logits, batch["label"]), "accuracy": accuracy}
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        """Adam; no L2 on biases and normalisation."""
+        weights = [p for p in self.net.parameters() if p.dim() > 1]
+        rest = [p for p in self.net.parameters() if p.dim() <= 1]
+        return torch.optim.Adam(
+            [{"params": weights, "weight_decay": 1e-4}, {"params": rest, "weight_decay": 0.0}], lr=1.47e-3
+        )
+
+    def rate(self, step: int, steps: int) -> float:
+        """1, and 0.1 in the second half."""
+        return 1.0 if 2 * step < steps else 0.1
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Accuracy in each scene and the loss, at ratios drawn once and for all; the lowest loss is best."""
+        logits = logits_of(net, self.store, self.validation, self.snr_db, self.size)
+        labels = torch.tensor([clip.activity for clip in self.validation])
+        correct = (logits.argmax(-1) == labels).float()
+        loss = float(F.cross_entropy(logits, labels))
+        figures = {"score": -loss, "loss": loss}
+        for scene in self.settings["scenes"]:
+            of_scene = torch.tensor([clip.scene == scene for clip in self.validation])
+            figures[f"accuracy {scene}"] = float(correct[of_scene].mean())
+        return figures
+
+
+@torch.no_grad()
+def logits_of(
+    net: nn.Module,
+    store: MapStore,
+    clips: Sequence[Clip],
+    snr_db: tuple[float, float],
+    size: int,
+    batch: int = 64,
+) -> Tensor:
+    """Logits (N, classes) of N clips, on the CPU. Clip k has the k-th draw of the ratios, whatever the network."""
+    parameter = next(net.parameters())
+    found = []
+    for first in range(0, len(clips), batch):
+        pictures = [
+            picture(store, clip, drawn_snr(10_007, first + k, snr_db), size)
+            for k, clip in enumerate(clips[first : first + batch])
+        ]
+        x = torch.stack(pictures).to(parameter, memory_format=torch.channels_last)
+        with torch.autocast(parameter.device.type, torch.bfloat16):
+            found.append(net(x).float().cpu())
+    return torch.cat(found)
+
+
+def load_classifier(path: Path) -> tuple[nn.Module, int]:
+    """The network of a weight file, whichever of the two it is, and the size of its pictures.
+
+    Raises:
+        TensorsimError: no such file, or weights of neither.
+    """
+    kinds = {kind.__name__: kind for kind, _ in NETWORKS.values()}
+    stated = read_metadata(path)
+    if stated.get("network") not in kinds or "size" not in stated:
+        raise TensorsimError(
+            f"{path}: its header says {stated or 'nothing'}, expected size and network ({', '.join(kinds)})"
+        )
+    return kinds[stated["network"]].from_pretrained(path), int(stated["size"])  # type: ignore[attr-defined]
+
+
+def confusion(logits: Tensor, clips: Sequence[Clip]) -> Tensor:
+    """Counts (classes, classes): row the true activity, column the predicted one."""
+    labels = torch.tensor([clip.activity for clip in clips])
+    classes = logits.shape[-1]
+    return torch.bincount(labels * classes + logits.argmax(-1), minlength=classes**2).reshape(
+        classes, classes
+    )

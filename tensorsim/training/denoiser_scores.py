@@ -1,0 +1,80 @@
+"""What denoisers gain on whole maps of held-out motion."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.enhance.ksvd import ksvd_denoise
+from tensorsim.radar.doppler import DopplerFrames
+from tensorsim.radar.metrics import envelope_rmse, level_envelope, psnr
+from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.ridges import RidgeExtractor
+from tensorsim.training.denoiser import simulate_pair
+
+#: PSNR of magnitudes over their peak; of decibels cut off 40 dB below it; speed errors of Doppler-time maps.
+COLUMNS = ("PSNR dB", "PSNR of dB map", "envelope m/s", "ridges m/s")
+#: Range-time maps are cut to so many columns: the slow rivals take minutes for all 32 767 of free space.
+_COLUMNS_AT_MOST = 1024
+Key = tuple[str, str, float, str]
+#: By name; None does nothing.
+Denoisers = dict[str, Callable[[Tensor], Tensor] | None]
+
+
+class KSVDMaps:
+    """:func:`~tensorsim.enhance.ksvd.ksvd_denoise` of magnitude maps, each scaled to [0, 1] and back."""
+
+    def __call__(self, maps: Tensor) -> Tensor:
+        """(H, W) to (H, W)."""
+        low, high = maps.amin(), maps.amax()
+        return ksvd_denoise((maps - low) / (high - low)).clamp_min(0.0) * (high - low) + low
+
+
+def ridge_error(noisy: Tensor, clean: Tensor, speed_m_s: Tensor) -> float:
+    """Mean distance in m/s of the strongest local maximum of each frame to that of the clean map.
+
+    Only over frames in which the clean one is within 20 dB of the map's peak.
+    """
+    extract = RidgeExtractor(count=1)
+    found, wanted = extract.peaks(noisy), extract.peaks(clean)
+    strong = wanted.magnitudes > clean.max() / 10
+    error = (speed_m_s[found.indices] - speed_m_s[wanted.indices]).abs()
+    return float(error[strong].mean())
+
+
+def scores(found: Tensor, clean: Tensor, speed_m_s: Tensor | None) -> list[float]:
+    """The figures of :data:`COLUMNS` of one map; speeds only of Doppler-time maps, else NaN."""
+    figures = [float(psnr(found, clean, scale)) for scale in ("linear", "db")]
+    if speed_m_s is None:
+        return [*figures, float("nan"), float("nan")]
+    outlines = [level_envelope(x, speed_m_s, level_db=20.0) for x in (found, clean)]
+    return [*figures, float(envelope_rmse(*outlines)), ridge_error(found, clean, speed_m_s)]
+
+
+@torch.no_grad()
+def compare(
+    denoisers: Denoisers,
+    scenes: Sequence[str],
+    ratios: Sequence[float],
+    clips: int,
+    seed: int,
+    quiet: bool = False,
+) -> dict[Key, list[float]]:
+    """Mean figures by scene, map, ratio and denoiser, on clips with a person in them."""
+    found: dict[Key, list[list[float]]] = {}
+    jobs = [(scene, ratio, clip) for scene in scenes for ratio in ratios for clip in range(clips)]
+    for scene, ratio, clip in tqdm(jobs, desc="maps", unit="clip", disable=quiet):
+        activity = 1 + clip % (len(ACTIVITIES) - 1)
+        pair = simulate_pair(scene, activity, seed * 1_000_003 + clip, ratio)
+        radar = PRESETS[scene].radar
+        speed = DopplerFrames(radar).doppler_hz * radar.doppler_wavelength_m / 2
+        for view, axis in (("range_time_mti", None), ("doppler_time", speed)):
+            whole = [getattr(maps, view).float() for maps in pair]
+            first = max(0, (whole[0].shape[1] - _COLUMNS_AT_MOST) // 2)
+            noisy, clean = (x[:, first : first + _COLUMNS_AT_MOST] for x in whole)
+            for name, denoise in denoisers.items():
+                cleaned = noisy if denoise is None else denoise(noisy)
+                found.setdefault((scene, view, ratio, name), []).append(scores(cleaned, clean, axis))
+    return {key: torch.tensor(figures).nanmean(0).tolist() for key, figures in found.items()}

@@ -1,0 +1,297 @@
+"""A store of Doppler-time pictures of generated people, at every signal-to-noise ratio at once.
+
+The map of an echo with noise is ``sum over bins of |S + s N|^2 = A + 2 s B + s^2 C``, S and N the spectra of echo and
+noise, s the noise amplitude, and
+
+    A = sum |S|^2,    B = sum Re(S N*),    C = sum |N|^2.
+
+Pixels average power, so the same holds for pictures: a clip is stored as the pictures of A, ``B / sqrt(A C)`` (which
+lies in [-1, 1]) and C, a byte per pixel each, and gives the exact picture at any ratio.
+
+A person does all twelve activities, each with another heading, distance and speed. One file holds what one person
+did in one scene, so that people can be held out whole and an interrupted run goes on.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.motion.people import People, PeopleConfig, draw_people
+from tensorsim.motion.resample import PoseResampler
+from tensorsim.motion.scatterers import JointScatterers
+from tensorsim.radar.closed_form import RangeBinSynthesizer
+from tensorsim.radar.doppler import DopplerFrames
+from tensorsim.radar.echo import EchoSynthesizer
+from tensorsim.radar.mti import MovingTargetIndicator
+from tensorsim.radar.noise import mean_power
+from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.range_profile import RangeProfile
+from tensorsim.recognition.map_image import MapToImage
+
+SCENES = ("free-space", "through-wall")
+
+#: Rate of the generator's own knots; its spline does the rest.
+_MOTION_HZ = 240.0
+#: Bytes hold decibels below the peak in these steps: 102 dB in all.
+_STEP_DB = 0.4
+#: Range bins beside the body that are worked out, and what bounces inside the wall add to the range.
+_MARGIN_BINS, _WALL_M = 5, 2.0
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """What a store holds.
+
+    Attributes:
+        seed: of people, motion and noise; person k of a seed is always the same.
+        size: height and width of the pictures.
+        speed_m_s: radial speeds that they show, either way.
+        duration_s: length of a clip.
+        motion_hz: joints are sampled at this rate before the spline to the pulses: 240 is the true motion, 30 what
+            a camera leaves of it.
+
+    Raises:
+        TensorsimError: a size below 1, or a span or rate that is not positive.
+    """
+
+    seed: int = 0
+    size: int = 224
+    speed_m_s: float = 3.8
+    duration_s: float = 4.0
+    motion_hz: float = _MOTION_HZ
+
+    def __post_init__(self) -> None:
+        if self.size < 1 or not (self.speed_m_s > 0 and self.duration_s > 0 and self.motion_hz > 0):
+            raise TensorsimError(f"MapSettings: got {self}, expected positive numbers")
+
+
+def one_person_many_ways(
+    count: int, generator: torch.Generator, config: PeopleConfig | None = None
+) -> People:
+    """One drawn body ``count`` times, each with its own heading, start, speed and variation of movements."""
+    drawn = draw_people(count, PeopleConfig() if config is None else config, generator)
+    body = drawn.take(torch.zeros(count, dtype=torch.int64))
+    return drawn._replace(
+        height_m=body.height_m,
+        mass_kg=body.mass_kg,
+        female=body.female,
+        left_handed=body.left_handed,
+        proportions=body.proportions,
+    )
+
+
+def to_bytes(power: Tensor) -> Tensor:
+    """Power relative to a peak of 1 as uint8 in decibels; 0 is no power."""
+    level = 255 + 10 * power.clamp_min(1e-30).log10() / _STEP_DB
+    return level.round().clamp(0, 255).to(torch.uint8)
+
+
+def from_bytes(level: Tensor) -> Tensor:
+    """The inverse of :func:`to_bytes`, float32."""
+    power = 10 ** ((level.float() - 255) * (_STEP_DB / 10))
+    return torch.where(level > 0, power, 0.0)
+
+
+class MapMaker:
+    """Makes the pictures of one scene.
+
+    Args:
+        scene: a name in ``tensorsim.radar.presets.PRESETS``; a wall comes with its multipath.
+        settings: of the store.
+    """
+
+    def __init__(self, scene: str, settings: MapSettings) -> None:
+        if scene not in SCENES:
+            raise TensorsimError(f"scene: got {scene!r}, expected one of {SCENES}")
+        preset = PRESETS[scene]
+        self.radar, self.settings = preset.radar, settings
+        self.echo = EchoSynthesizer(preset.radar, preset.wall, multipath=preset.wall is not None)
+        self.behind_wall_m = 0.0 if preset.wall is None else _WALL_M
+        self.profile = RangeProfile(self.radar)
+        self.mti = MovingTargetIndicator()
+        self.scatterers = JointScatterers()
+        self.resampler = PoseResampler(self.radar.prf_hz)
+        pulses = round(settings.duration_s * self.radar.prf_hz)
+        # A frame per column is enough: what lies between is averaged in a pixel anyway.
+        usual = DopplerFrames(self.radar)
+        hop = max(usual.hop, (pulses - 1 - usual.length) // max(1, settings.size - 1))
+        self.frames = DopplerFrames(self.radar, overlap=1 - (hop - 0.5) / usual.length)
+        self.image = MapToImage.doppler(self.radar, usual.bins, settings.speed_m_s, settings.size)
+        shown = torch.nonzero(self.image.rows.sum(0)).flatten()
+        self.first, self.last = int(shown[0]), int(shown[-1]) + 1
+
+    def spectra(self, profiles: Tensor) -> Iterator[Tensor]:
+        """Profiles (M, R) to Doppler spectra (r, K, F), a few range bins at a time, only the rows that are shown."""
+        window = self.frames.shifting_window.float()
+        for series in self.frames.series(self.mti(profiles))[0].split(8):
+            cut = series.unfold(-1, self.frames.length, self.frames.hop) * window
+            yield torch.fft.ifft(cut, self.frames.bins, norm="forward")[..., self.first : self.last]
+
+    def picture(self, power: Tensor) -> Tensor:
+        """Power (K, F shown) to pixels (size, size)."""
+        beside = [self.first, self.image.rows.shape[1] - self.last]
+        return self.image.average(torch.nn.functional.pad(power, beside).double().transpose(0, 1))
+
+    def noise(self, pulses: int, generator: torch.Generator) -> Tensor:
+        """Spectra (R, K, F) of receiver noise of power 1 per IF sample."""
+        profiles = []
+        for first in range(0, pulses, 2048):
+            shape = (min(2048, pulses - first), self.profile.samples)
+            profiles.append(self.profile(torch.randn(shape, dtype=torch.complex64, generator=generator)))
+        return torch.cat(list(self.spectra(torch.cat(profiles))))
+
+    def gate(self, points: Tensor) -> RangeProfile:
+        """Profiles of the range bins that scatterers at (M, S, 3) reach."""
+        tx, rx = (torch.tensor(antenna, dtype=points.dtype) for antenna in (self.radar.tx_m, self.radar.rx_m))
+        reach = (
+            torch.linalg.vector_norm(points - tx, dim=-1) + torch.linalg.vector_norm(points - rx, dim=-1)
+        ) / 2
+        margin = _MARGIN_BINS * self.radar.range_resolution_m
+        near, far = float(reach.min()) - margin, float(reach.max()) + margin + self.behind_wall_m
+        last = float(self.profile.range_m[-1])
+        return RangeProfile(self.radar, gate_m=(max(0.0, near), min(far, last)))
+
+    @torch.no_grad()
+    def person(self, index: int) -> dict[str, Tensor]:
+        """What person ``index`` does, as stored: bytes ``signal`` and ``cross`` (12, H, W) and ``noise`` (H, W).
+
+        ``gain_db`` (12,) is the noise's peak against the signal's at a ratio of 0 dB.
+        """
+        generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + index)
+        count = len(ACTIVITIES)
+        people = one_person_many_ways(count, generator)
+        motion = ActivityGenerator().generate(
+            torch.arange(count),
+            people=people,
+            duration_s=self.settings.duration_s,
+            rate_hz=self.settings.motion_hz,
+        )
+        pulses = self.resampler.pulses(motion.joints.shape[1], self.settings.motion_hz)
+        noise = self.noise(pulses, generator)
+        noise_picture = self.picture(torch.view_as_real(noise).square().sum(0).sum(-1))
+        noise_peak = noise_picture.max()
+        size = self.settings.size
+        signal = torch.zeros(count, size, size, dtype=torch.uint8)
+        cross = torch.zeros(count, size, size, dtype=torch.int8)
+        gain_db = torch.zeros(count)
+        for k in range(count):
+            if not bool(motion.valid[k].any()):
+                continue
+            positions = self.resampler(motion.joints[k : k + 1], self.settings.motion_hz)
+            points, rcs = self.scatterers(positions.unsqueeze(0), torch.ones(1, 1, pulses))
+            points, rcs = points[0], rcs[0]
+            every = max(1, pulses // 512)
+            power = mean_power(self.echo.target_echo(points[::every], rcs[::every]))
+            gate = self.gate(points)
+            bins = RangeBinSynthesizer(self.echo, gate, near_bins=_MARGIN_BINS - 1)
+            power_sum, cross_sum, first = torch.zeros(()), torch.zeros(()), gate.first_bin
+            for spectra in self.spectra(bins(points, rcs) / power.sqrt()):
+                echo, beside = (
+                    torch.view_as_real(spectra),
+                    torch.view_as_real(noise[first : first + len(spectra)]),
+                )
+                power_sum = power_sum + echo.square().sum(0).sum(-1)
+                cross_sum = cross_sum + (echo * beside).sum(0).sum(-1)
+                first += len(spectra)
+            a, b = self.picture(power_sum), self.picture(cross_sum)
+            signal[k] = to_bytes(a / a.max())
+            cross[k] = (127 * b / (a * noise_picture).sqrt().clamp_min(1e-30)).round().clamp(-127, 127)
+            gain_db[k] = 10 * (noise_peak / a.max()).log10()
+        return {
+            "signal": signal,
+            "cross": cross,
+            "noise": to_bytes(noise_picture / noise_peak),
+            "gain_db": gain_db,
+        }
+
+
+def build_maps(
+    folder: Path,
+    people: int,
+    scenes: tuple[str, ...] = SCENES,
+    settings: MapSettings | None = None,
+    first: int = 0,
+    quiet: bool = False,
+) -> None:
+    """Fill a store: people ``first`` to ``first + people`` in each scene; what is there already stays.
+
+    Raises:
+        TensorsimError: the folder holds a store of other settings.
+    """
+    from safetensors.torch import save_file
+
+    settings = MapSettings() if settings is None else settings
+    folder.mkdir(parents=True, exist_ok=True)
+    described = folder / "settings.json"
+    if described.is_file():
+        there = json.loads(described.read_text(encoding="utf-8"))
+        if there != asdict(settings):
+            raise TensorsimError(f"{folder}: it holds maps of {there}, expected {asdict(settings)}")
+    else:
+        _write(described, json.dumps(asdict(settings), indent=2).encode())
+    for scene in scenes:
+        maker = MapMaker(scene, settings)
+        for index in tqdm(range(first, first + people), desc=scene, unit="person", disable=quiet):
+            path = folder / f"{scene}-{index:05d}.safetensors"
+            if not path.is_file():
+                scratch = path.with_suffix(f".{os.getpid()}.tmp")
+                save_file(maker.person(index), scratch)
+                os.replace(scratch, path)
+
+
+def _write(path: Path, data: bytes) -> None:
+    scratch = path.with_suffix(f".{os.getpid()}.tmp")
+    scratch.write_bytes(data)
+    os.replace(scratch, path)
+
+
+class MapStore:
+    """Reads a store.
+
+    Args:
+        folder: made by :func:`build_maps`.
+
+    Attributes:
+        settings: what it holds.
+        people: scene -> sorted indices of the people whose file is there.
+
+    Raises:
+        TensorsimError: no store there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        described = folder / "settings.json"
+        if not described.is_file():
+            raise TensorsimError(f"{folder}: no settings.json, expected a store of maps")
+        self.folder = folder
+        self.settings = MapSettings(**json.loads(described.read_text(encoding="utf-8")))
+        self.people = {
+            scene: sorted(int(p.stem[-5:]) for p in folder.glob(f"{scene}-?????.safetensors"))
+            for scene in SCENES
+        }
+
+    def power(self, scene: str, person: int, activity: int, snr_db: float | None) -> Tensor:
+        """Power picture (H, W) of one clip at this signal-to-noise ratio; None is free of noise.
+
+        The empty scene has noise alone, whatever the ratio.
+        """
+        from safetensors import safe_open
+
+        with safe_open(self.folder / f"{scene}-{person:05d}.safetensors", "pt") as file:
+            signal = from_bytes(file.get_slice("signal")[activity])
+            if snr_db is None:
+                return signal
+            cross = file.get_slice("cross")[activity].float() / 127
+            noise = from_bytes(file.get_tensor("noise"))
+            gain_db = float(file.get_tensor("gain_db")[activity])
+        noise = noise * 10 ** ((gain_db - snr_db) / 10)
+        return (signal + 2 * cross * (signal * noise).sqrt() + noise).clamp_min(0.0)

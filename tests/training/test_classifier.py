@@ -1,0 +1,180 @@
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.training.classifier import (
+    NETWORKS,
+    ClassifierRecipe,
+    Clip,
+    clips_of,
+    confusion,
+    drawn_snr,
+    held_out,
+    load_classifier,
+    logits_of,
+    picture,
+)
+from tensorsim.training.loop import LoopConfig, fit
+from tensorsim.training.maps import MapSettings, MapStore, to_bytes
+from tensorsim.weights import save_weights
+
+pytest.importorskip("tensorboard")
+SIZE = 32
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> MapStore:
+    """Ten people whose activity k lights row 2 k + 3, a little elsewhere along time for each."""
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    (folder / "settings.json").write_text(json.dumps(asdict(MapSettings(size=SIZE))))
+    for person in range(10):
+        generator = torch.Generator().manual_seed(person)
+        power = torch.zeros(12, SIZE, SIZE)
+        for activity in range(1, 12):
+            first = int(torch.randint(0, 16, (), generator=generator))
+            power[activity, 2 * activity + 3, first : first + 16] = 1.0
+        noise = torch.rand(SIZE, SIZE, generator=generator) + 0.1
+        save_file(
+            {
+                "signal": to_bytes(power),
+                "cross": torch.zeros(12, SIZE, SIZE, dtype=torch.int8),
+                "noise": to_bytes(noise / noise.max()),
+                "gain_db": torch.full((12,), -10.0),
+            },
+            folder / f"through-wall-{person:05d}.safetensors",
+        )
+    return MapStore(folder)
+
+
+def recipe(store: MapStore, **options: object) -> ClassifierRecipe:
+    return ClassifierRecipe("spgnet", store, ("through-wall",), 10, **options)  # type: ignore[arg-type]
+
+
+class Tiny(nn.Module):
+    """Reads off which row is lit."""
+
+    def __init__(self, num_classes: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(1))
+        self.linear = nn.Linear(SIZE, num_classes)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        return self.linear(pictures.mean(-1).squeeze(-2) - self.mean)
+
+
+def test_learns_patterns_of_people_it_has_not_seen(
+    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(NETWORKS, "tiny", (Tiny, SIZE))
+    mine = ClassifierRecipe("tiny", store, ("through-wall",), 10, snr_db=(20.0, 50.0))
+    monkeypatch.setattr(mine, "optimiser", lambda: torch.optim.Adam(mine.net.parameters(), 0.05))
+    before = mine.validate(mine.net)
+    config = LoopConfig(tmp_path, 60, 24, workers=0, validate_every=60, ema_decay=0.0, quiet=True)
+    figures = fit(mine, config)
+    assert before["accuracy through-wall"] < 0.5
+    assert figures["accuracy through-wall"] > 0.9
+    clips = clips_of(store, ("through-wall",), 10, validation=True)
+    counts = confusion(logits_of(mine.net, store, clips, (50.0, 50.0), SIZE), clips)
+    assert counts.sum(1).tolist() == [2] * 12
+    assert int(counts.diagonal().sum()) >= 22
+
+
+def test_confusion_has_the_truth_in_rows() -> None:
+    clips = [Clip("through-wall", 0, activity) for activity in (0, 2, 2)]
+    logits = torch.eye(3)[[1, 2, 0]]
+    assert confusion(logits, clips).tolist() == [[0, 1, 0], [0, 0, 0], [1, 0, 1]]
+
+
+@pytest.mark.parametrize(("network", "size"), [("spgnet", 32), ("spnet", 112)])
+def test_a_weight_file_says_which_network_it_is(network: str, size: int, tmp_path: Path) -> None:
+    kind = NETWORKS[network][0]
+    path = tmp_path / "w.safetensors"
+    save_weights(kind(12), path, {"network": kind.__name__, "size": str(size)})
+    loaded, found = load_classifier(path)
+    assert isinstance(loaded, kind)
+    assert found == size
+    save_weights(kind(12), path, {"size": str(size)})
+    with pytest.raises(TensorsimError, match=r"its header says .* expected size and network"):
+        load_classifier(path)
+
+
+def test_no_body_is_in_both_parts(store: MapStore) -> None:
+    mine = recipe(store)
+    trained, kept = ({clip.person for clip in part} for part in (mine.training, mine.validation))
+    assert not trained & kept
+    assert kept == {4, 9} == {p for p in range(10) if held_out(p)}
+    assert len(mine.training) == 8 * 12
+
+
+def test_an_epoch_shows_every_clip_once_in_another_order(store: MapStore) -> None:
+    mine = recipe(store)
+    count = len(mine.training)
+    orders = [mine.order(epoch).tolist() for epoch in range(2)]
+    assert orders[0] != orders[1]
+    assert sorted(orders[0]) == sorted(orders[1]) == list(range(count))
+    labels = [mine.sample(index)["label"] for index in range(count)]
+    assert all(labels.count(k) == 8 for k in range(12))
+
+
+def test_a_sample_depends_on_its_number_only(store: MapStore) -> None:
+    first = recipe(store).sample(1234)["picture"]
+    mine = recipe(store)
+    mine.sample(7)
+    assert torch.equal(mine.sample(1234)["picture"], first)
+    assert first.shape == (1, SIZE, SIZE)
+    assert 0 <= float(first.min()) <= float(first.max()) <= 1
+
+
+def test_a_picture_is_pooled_in_power(store: MapStore) -> None:
+    clip = Clip("through-wall", 0, 5)
+    power = store.power("through-wall", 0, 5, 50.0)
+    pooled = power.reshape(8, 4, 8, 4).mean((1, 3))
+    expected = (1 + 10 * (pooled / pooled.max()).clamp_min(1e-4).log10() / 40)[None]
+    torch.testing.assert_close(picture(store, clip, 50.0, 8), expected, rtol=0, atol=1e-6)
+    with pytest.raises(TensorsimError, match="got size 7, expected a divisor"):
+        picture(store, clip, 50.0, 7)
+
+
+def test_draws_of_ratios_cover_the_range() -> None:
+    drawn = torch.tensor([drawn_snr(0, index, (10.0, 50.0)) for index in range(400)])
+    assert float(drawn.min()) < 11
+    assert float(drawn.max()) > 49
+    assert abs(float(drawn.mean()) - 30) < 2
+    assert drawn_snr(3, 5, (50.0, 50.0)) == 50.0
+
+
+def test_mean_of_pictures_is_subtracted(store: MapStore) -> None:
+    mine = recipe(store)
+    pictures = torch.stack([mine.sample(index)["picture"] for index in range(200)])
+    torch.testing.assert_close(mine.net.get_buffer("mean"), pictures.mean().reshape(1), rtol=1e-5, atol=0)
+
+
+def test_rate_falls_to_a_tenth_after_half() -> None:
+    rates = [ClassifierRecipe.rate(None, step, 20) for step in range(20)]  # type: ignore[arg-type]
+    assert rates == [1.0] * 10 + [0.1] * 10
+
+
+def test_biases_are_not_decayed(store: MapStore) -> None:
+    decayed, rest = recipe(store).optimiser().param_groups
+    assert decayed["weight_decay"] == 1e-4
+    assert rest["weight_decay"] == 0
+    assert all(p.dim() > 1 for p in decayed["params"])
+    assert all(p.dim() == 1 for p in rest["params"])
+
+
+def test_refuses_bad_settings(store: MapStore) -> None:
+    with pytest.raises(TensorsimError, match="got 'resnet', expected one of"):
+        ClassifierRecipe("resnet", store, ("through-wall",), 10)
+    with pytest.raises(TensorsimError, match="got 10 people in through-wall, expected 11"):
+        ClassifierRecipe("spgnet", store, ("through-wall",), 11)
+    with pytest.raises(TensorsimError, match="the lower one first"):
+        recipe(store, snr_db=(50.0, 10.0))
+    with pytest.raises(TensorsimError, match="got 0 people in free-space"):
+        clips_of(store, ("free-space",), 2, None)

@@ -1,0 +1,161 @@
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
+from tensorsim.errors import TensorsimError
+from tensorsim.training.denoiser import (
+    STORED,
+    TRAINED,
+    DenoiserRecipe,
+    build_pairs,
+    cut_patches,
+    on_scale,
+    simulate_pair,
+    views,
+)
+from tensorsim.training.denoiser_scores import COLUMNS, compare, ridge_error, scores
+from tensorsim.training.loop import LoopConfig, fit
+
+pytest.importorskip("tensorboard")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pairs")
+    build_pairs(folder, 10, per_map=6, scenes=("through-wall",), quiet=True)
+    return folder
+
+
+def test_a_pair_differs_by_its_noise() -> None:
+    noisy, clean = simulate_pair("through-wall", 7, 3, 10.0)
+    assert float(noisy.snr_db) == pytest.approx(10.0, abs=0.5)
+    assert float(clean.snr_db) == pytest.approx(50.0, abs=0.5)
+    again = simulate_pair("through-wall", 7, 3, 20.0)
+    # One draw of the noise: at another ratio the same pattern, weaker.
+    torch.testing.assert_close(again[1].doppler_time, clean.doppler_time)
+    patterns = [pair.range_time - clean.range_time for pair in (noisy, again[0])]
+    correlation = torch.corrcoef(torch.stack([x.flatten() for x in patterns]))[0, 1]
+    assert float(correlation) > 0.8
+
+
+def test_the_scale_is_that_of_the_map_denoiser() -> None:
+    """A network that returned the stored clean image would make MapDenoiser return the clean map."""
+    noisy, clean = simulate_pair("through-wall", 7, 3, 10.0)
+    target = on_scale(noisy.doppler_time, clean.doppler_time)[1]
+
+    class Oracle(nn.Module):
+        reach = 1
+
+        def forward(self, images: Tensor) -> Tensor:
+            return target
+
+    whole = MapDenoiser(Oracle(), tile=10_000)(noisy.doppler_time)  # type: ignore[arg-type]
+    expected = clean.doppler_time.clamp_min(float(noisy.doppler_time.min()))
+    torch.testing.assert_close(whole, expected, rtol=1e-4, atol=1e-6 * float(expected.max()))
+
+
+def test_views_of_maps() -> None:
+    noisy, _ = simulate_pair("through-wall", 7, 3, 10.0)
+    assert set(views(noisy, 128.0)) == {"doppler_time", "range_time_mti"}
+    display = views(noisy, 8192.0)["range_time_mti, display rate"]
+    first = noisy.range_time_mti[:, :32].square().mean(1).sqrt()
+    torch.testing.assert_close(display[:, 0], first)
+
+
+@pytest.mark.parametrize("shape", [(100, 300), (40, 500), (200, 50)])
+def test_patches_lie_at_one_place_in_both_maps(shape: tuple[int, int]) -> None:
+    """Half of them where the echo is: of a single bright point every such patch shows it."""
+    clean = torch.zeros(shape)
+    clean[shape[0] // 2, shape[1] // 2] = 1.0
+    noisy, wanted = cut_patches(2 * clean + 1, clean, 10, torch.Generator().manual_seed(0))
+    assert noisy.shape == wanted.shape == (10, STORED, STORED)
+    torch.testing.assert_close(noisy, 2 * wanted + 1)
+    assert bool((wanted[:5].amax((1, 2)) == 1).all())
+
+
+def test_learns_to_predict_the_noise(folder: Path, tmp_path: Path) -> None:
+    recipe = DenoiserRecipe(folder, depth=3)
+    assert (len(recipe.training["noisy"]), len(recipe.held_out["noisy"])) == (9 * 12, 12)
+    noisy, clean = (recipe.training[name].float() for name in ("noisy", "clean"))
+    noisiest = (noisy - clean).square().mean((1, 2)).topk(12).indices
+    noisy, clean = noisy[noisiest].unsqueeze(1), clean[noisiest].unsqueeze(1)
+    config = LoopConfig(
+        tmp_path, 60, 8, workers=0, validate_every=60, ema_decay=0.0, quiet=True, log_every=10
+    )
+    fit(recipe, config)
+    network = DnCNN.from_pretrained(tmp_path / "best.safetensors")
+    assert (network.depth, network.training) == (3, False)
+    with torch.no_grad():
+        error = (network(noisy) - clean).square().mean()
+    assert float(error) < 0.5 * float((noisy - clean).square().mean())
+
+
+def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
+    one, other = DenoiserRecipe(folder, depth=2), DenoiserRecipe(folder, depth=2)
+    other.sample(3)
+    for name, patch in one.sample(99).items():
+        assert patch.shape == (1, TRAINED, TRAINED)
+        assert torch.equal(patch, other.sample(99)[name])
+
+
+def test_loss_is_half_the_error_of_the_residual(folder: Path) -> None:
+    recipe = DenoiserRecipe(folder, depth=2)
+    sample = {name: patch[None] for name, patch in recipe.sample(0).items()}
+    residual = recipe.net.noise(sample["noisy"]) - (sample["noisy"] - sample["clean"])  # type: ignore[operator]
+    expected = residual.square().mean() / 2
+    torch.testing.assert_close(recipe.loss(recipe.net, sample)["loss"], expected)
+
+
+def test_goes_on_and_refuses(folder: Path, tmp_path: Path) -> None:
+    path = folder / "through-wall-00003.safetensors"
+    before, content = path.stat().st_mtime_ns, path.read_bytes()
+    build_pairs(folder, 10, per_map=6, scenes=("through-wall",), quiet=True)
+    assert path.stat().st_mtime_ns == before
+    path.unlink()
+    build_pairs(folder, 10, per_map=6, scenes=("through-wall",), quiet=True)
+    assert path.read_bytes() == content
+    with pytest.raises(TensorsimError, match="got 0 files of patches, expected at least 10"):
+        DenoiserRecipe(tmp_path)
+
+
+# ---- scores ----------------------------------------------------------------------------------------------
+
+
+def test_ridge_error_is_a_speed() -> None:
+    clean = torch.full((32, 6), 0.001)
+    clean[10] = 1.0
+    clean[10, 5] = 0.01  # too weak to count
+    moved = clean.roll(3, 0)
+    speed = torch.arange(32) * 0.25
+    assert ridge_error(moved, clean, speed) == pytest.approx(0.75)
+    assert ridge_error(clean, clean, speed) == 0
+
+
+def test_scores_of_a_perfect_map() -> None:
+    clean = torch.rand(16, 9) + 0.01
+    perfect = scores(clean, clean, torch.arange(16.0))
+    assert perfect == [float("inf"), float("inf"), 0.0, 0.0]
+    assert torch.tensor(scores(clean, clean, None)).isnan().tolist() == [False, False, True, True]
+
+
+def test_comparison_tells_a_good_denoiser_from_a_bad_one() -> None:
+    kept: list[Tensor] = []
+
+    def spoil(maps: Tensor) -> Tensor:
+        kept.append(maps)
+        return torch.ones_like(maps)
+
+    rows = compare({"none": None, "spoil": spoil}, ("through-wall",), (10.0,), clips=1, seed=1, quiet=True)
+    assert set(rows) == {
+        ("through-wall", view, 10.0, name)
+        for view in ("range_time_mti", "doppler_time")
+        for name in ("none", "spoil")
+    }
+    assert all(len(figures) == len(COLUMNS) for figures in rows.values())
+    for view in ("range_time_mti", "doppler_time"):
+        good, bad = (rows["through-wall", view, 10.0, name][0] for name in ("none", "spoil"))
+        assert good > bad + 10
+    assert len(kept) == 2

@@ -1,0 +1,131 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import tensorsim as ts
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.radar.echo import EchoSynthesizer
+from tensorsim.radar.presets import PRESETS
+from tensorsim.recognition.map_image import MapToImage, scaled
+from tensorsim.training.maps import (
+    MapMaker,
+    MapSettings,
+    MapStore,
+    build_maps,
+    from_bytes,
+    one_person_many_ways,
+    to_bytes,
+)
+
+SMALL = MapSettings(size=28, duration_s=1.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("maps")
+    build_maps(folder, 1, ("through-wall",), SMALL, quiet=True)
+    return folder
+
+
+def test_bytes_keep_a_fifth_of_a_decibel() -> None:
+    power = 10 ** torch.linspace(-10, 0, 401)
+    error_db = 10 * (from_bytes(to_bytes(power)) / power).log10()
+    assert float(error_db.abs().max()) <= 0.2 + 1e-4
+    assert from_bytes(to_bytes(torch.zeros(3))).tolist() == [0, 0, 0]
+
+
+def difference_db(folder: Path, scene: str, activity: int, snr_db: float) -> Tensor:
+    """The stored picture against the radar chain itself with another draw of the noise, down to 40 dB."""
+    radar, wall = PRESETS[scene].radar, PRESETS[scene].wall
+    people = one_person_many_ways(12, torch.Generator().manual_seed(0))
+    motion = ActivityGenerator().generate(torch.arange(12), people=people, duration_s=1.0, rate_hz=240.0)
+    positions = ts.motion.PoseResampler(radar.prf_hz)(motion.joints[activity : activity + 1], 240.0)
+    echo = EchoSynthesizer(radar, wall, multipath=wall is not None)
+    simulator = ts.radar.RadarSimulator(radar, echo=echo, snr_db=snr_db)
+    torch.manual_seed(1)
+    maps = simulator(positions, torch.tensor(ts.JOINT_RCS_M2, dtype=torch.float64))
+    store = MapStore(folder)
+    expected = MapToImage.doppler(radar, size=store.settings.size).average(maps.doppler_time.square())[0]
+    found = store.power(scene, 0, activity, snr_db)
+    ratio_db = 10 * (found / found.mean() / (expected / expected.mean())).log10()
+    return ratio_db[expected > 1e-4 * expected.max()]
+
+
+@pytest.mark.filterwarnings("ignore:positions. some scatterer has a radial speed")
+@pytest.mark.parametrize("snr_db", [50.0, 10.0, -5.0])
+def test_pictures_are_those_of_the_simulator(folder: Path, snr_db: float) -> None:
+    for activity in (5, 7, 9):
+        difference = difference_db(folder, "through-wall", activity, snr_db)
+        assert abs(float(difference.mean())) < 0.3
+        assert float(difference.abs().median()) < 1.0
+
+
+def test_any_ratio_from_three_pictures() -> None:
+    """``sum |S + s N|^2 = A + 2 s B + s^2 C`` holds for pictures, and C's root bounds B."""
+    maker = MapMaker("through-wall", SMALL)
+    generator = torch.Generator().manual_seed(0)
+    echo, noise = torch.randn(2, 128, 200, dtype=torch.complex64, generator=generator)
+    s = 0.3
+
+    def picture(profiles: torch.Tensor) -> torch.Tensor:
+        return maker.picture(torch.cat(list(maker.spectra(profiles))).abs().square().sum(0))
+
+    spectra = [torch.cat(list(maker.spectra(x))) for x in (echo, noise)]
+    cross = maker.picture((spectra[0] * spectra[1].conj()).real.sum(0))
+    a, c = picture(echo), picture(noise)
+    torch.testing.assert_close(picture(echo + s * noise), a + 2 * s * cross + s**2 * c, rtol=1e-4, atol=0)
+    assert bool((cross.square() <= a * c * (1 + 1e-6)).all())
+
+
+def test_empty_scene_is_noise(folder: Path) -> None:
+    store = MapStore(folder)
+    assert float(store.power("through-wall", 0, 0, None).max()) == 0
+    loud, quiet = (scaled(store.power("through-wall", 0, 0, snr), "db", 40.0) for snr in (10.0, 50.0))
+    torch.testing.assert_close(loud, quiet, rtol=0, atol=1e-5)
+    assert float(loud.mean()) > 0.7
+
+
+def test_one_body_many_ways() -> None:
+    people = one_person_many_ways(5, torch.Generator().manual_seed(3))
+    for field in ("height_m", "mass_kg", "female", "left_handed"):
+        assert len(getattr(people, field).unique()) == 1, field
+    assert all(len(torch.as_tensor(p).unique()) == 1 for p in people.proportions)
+    for field in ("speed_m_s", "heading_rad", "gait_phase"):
+        assert len(getattr(people, field).unique()) == 5, field
+
+
+def test_goes_on_where_it_stopped(folder: Path) -> None:
+    path = folder / "through-wall-00000.safetensors"
+    before, content = path.stat().st_mtime_ns, path.read_bytes()
+    build_maps(folder, 1, ("through-wall",), SMALL, quiet=True)
+    assert path.stat().st_mtime_ns == before
+    path.unlink()
+    build_maps(folder, 1, ("through-wall",), SMALL, quiet=True)
+    assert path.read_bytes() == content, "a person of a seed is always the same"
+    assert MapStore(folder).people == {"free-space": [], "through-wall": [0]}
+    assert not list(folder.glob("*.tmp"))
+
+
+def test_refuses_what_does_not_belong(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="it holds maps of"):
+        build_maps(folder, 1, ("through-wall",), MapSettings(size=14), quiet=True)
+    assert json.loads((folder / "settings.json").read_text())["size"] == 28
+    with pytest.raises(TensorsimError, match=r"no settings\.json"):
+        MapStore(tmp_path)
+    with pytest.raises(TensorsimError, match="got 'garden', expected one of"):
+        MapMaker("garden", SMALL)
+    with pytest.raises(TensorsimError, match="expected positive numbers"):
+        MapSettings(size=0)
+
+
+@pytest.mark.slow
+def test_free_space_pictures_are_those_of_the_simulator(tmp_path: Path) -> None:
+    """As for the other scene; here only the range bins near the body are worked out, in closed form."""
+    build_maps(tmp_path, 1, ("free-space",), MapSettings(size=84, duration_s=1.0), quiet=True)
+    difference = difference_db(tmp_path, "free-space", 7, 20.0)
+    assert abs(float(difference.mean())) < 0.3
+    assert float(difference.abs().median()) < 1.0
