@@ -52,6 +52,8 @@ class VideoToPose(nn.Module):
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages.
+        bone_fit: a :class:`~tensorsim.vision.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
+            keypoints that are exact; None leaves it out.
 
     Raises:
         TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1.
@@ -73,6 +75,7 @@ class VideoToPose(nn.Module):
         lifter: nn.Module | None = None,
         metric_pose: nn.Module | None = None,
         smoother: nn.Module | None = None,
+        bone_fit: nn.Module | None = None,
     ) -> None:
         super().__init__()
         for name, value in (
@@ -90,6 +93,7 @@ class VideoToPose(nn.Module):
             if metric_pose is not None
             else MetricPose(camera, person_height_m, initial_distance_m, keypoint_threshold)
         )
+        self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = smoother if smoother is not None else KalmanSmoother()
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
@@ -210,12 +214,20 @@ class VideoToPose(nn.Module):
         told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
+        joints = self.bone_fit(joints, told, fps)
         # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
         # the pose that was found stands in for it, as long as the person is in the scene.
         in_scene = told.unsqueeze(-1).expand_as(seen)
         coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         joints = self.smoother(joints, in_scene & ~coasting, fps)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid)
+
+
+class _AsPlaced(nn.Module):
+    """No :class:`~tensorsim.vision.bone_fit.BoneFit`."""
+
+    def forward(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+        return joints
 
 
 class PoseToDoppler(nn.Module):

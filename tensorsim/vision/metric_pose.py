@@ -110,6 +110,7 @@ class MetricPose(nn.Module):
         mode: ``"camera"`` or ``"paper"``.
         range_smoothing_s: standard deviation of the smoothing kernel of the range.
         floor_window_s: window in which the floor is looked for; longer than people stay in the air.
+        calibrated: height and tilt of the camera are known well: people stay at the height at which it sees them.
 
     Shape:
         joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
@@ -139,6 +140,7 @@ class MetricPose(nn.Module):
         mode: str = "camera",
         range_smoothing_s: float = 0.3,
         floor_window_s: float = 1.5,
+        calibrated: bool = False,
     ) -> None:
         super().__init__()
         if mode not in ("camera", "paper"):
@@ -147,6 +149,7 @@ class MetricPose(nn.Module):
         self.keypoint_threshold = keypoint_threshold
         self.range_smoothing_s = range_smoothing_s
         self.floor_window_s = floor_window_s
+        self.calibrated = calibrated
         self.whole_body_joints = 10  # seen joints that make a body whole enough to tell its size
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
@@ -238,7 +241,8 @@ class MetricPose(nn.Module):
             root_range = height * robust_smooth(focal / scale - beyond, whole, self.range_smoothing_s * fps)
             reach = root_range[..., None] + height[..., None] * lifted.depth
             joints = back_project(image, reach, focal, torch.tensor(center).to(image), pose)
-            joints = lowered(joints, self._floor(joints, valid, fps))
+            if not self.calibrated:
+                joints = lowered(joints, self._floor(joints, valid, fps))
         joints = joints.gather(-3, nearest_valid(valid)[..., None, None].expand_as(joints))
         return joints * valid.any(dim=-1)[..., None, None, None], seen
 

@@ -1,0 +1,75 @@
+"""``tensorsim evaluate truth``: how right the maps are."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tensorsim.commands.networks import default_networks
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class EvaluateTruth:
+    """Compare the maps of the pipeline with those of motion that is exactly known.
+
+    Prints a table and writes truth.md, truth.csv and a picture per scene. Goes on where it was interrupted.
+    """
+
+    out: Path
+    """Folder of the results; cells/ in it keeps the figures of every clip."""
+    clips: int = 10
+    """Clips per row of the table."""
+    activities: tuple[str, ...] = ()
+    """Rows; default all twelve activities, or none with --motion ("all" for all with --motion)."""
+    motion: tuple[Path, ...] = ()
+    """Motion capture (.npz, .bvh), each file a row."""
+    motion_fps: float | None = None
+    """Frames per second of motion capture that does not say."""
+    scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    """Radars."""
+    settings: tuple[Literal["a", "b", "c"], ...] = ("a", "b")
+    """From true 3D joints at video rate (a), true 2D keypoints (b), or the rendered film by networks (c)."""
+    stages: bool = True
+    """Also replace each stage by the truth in turn."""
+    detector: str | None = None
+    """For setting c: path or name. Default: $TENSORSIM_DETECTOR, else the shipped one."""
+    pose: str | None = None
+    """For setting c: path or name. Default: $TENSORSIM_POSE, else the shipped one."""
+    seed: int = 0
+    """Of the first clip of each activity; the next have the next."""
+    jobs: int = 1
+    """Processes, each with one thread."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> None:
+        """Do it."""
+        if self.out.exists() and not self.out.is_dir():
+            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        detector = pose = None
+        if "c" in self.settings:
+            detector, pose = default_networks(self.detector, self.pose)
+
+        from tensorsim.evaluation.report import markdown, save_pictures, write_csv
+        from tensorsim.evaluation.settings import Pipelines
+        from tensorsim.evaluation.truth import TruthLoop, example_maps
+        from tensorsim.radar.presets import PRESETS
+        from tensorsim.run import collected_warnings
+
+        loop = TruthLoop(
+            self.out, self.clips, self.activities, self.motion, self.motion_fps, self.scenes, self.settings,
+            self.stages, detector, pose, self.seed, self.jobs,
+        )  # fmt: skip
+        with collected_warnings() as messages:
+            cells = loop.run(self.quiet)
+        for message in messages:
+            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        text = markdown(cells)
+        self.out.mkdir(parents=True, exist_ok=True)
+        (self.out / "truth.md").write_text(text, encoding="utf-8")
+        write_csv(self.out / "truth.csv", cells)
+        for scene in self.scenes:
+            speed = Pipelines({scene: PRESETS[scene]}).speed_m_s(scene)
+            save_pictures(self.out / f"doppler_time_{scene}.png", example_maps(loop, scene), speed)
+        print(text)

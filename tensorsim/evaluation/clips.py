@@ -1,0 +1,147 @@
+"""Clips whose motion is known at every moment: of the generator, or of motion capture."""
+
+import zipfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.data.motion_files import Motion, load_motion, place
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator, activity_index
+from tensorsim.motion.resample import PoseResampler
+from tensorsim.vision.pose_library import body_height
+
+#: Length of the paper's clips.
+CLIP_S = 4.0
+#: Where captured motion is put: y of the hips at the start.
+CAPTURE_RANGE_M = 4.0
+
+
+@dataclass(frozen=True)
+class ActivityClip:
+    """Somebody who does one of the twelve activities.
+
+    Attributes:
+        row: name of the class, the row of the table that the clip counts for.
+        name: of the clip within the row.
+        seed: of the generator, and of what a film of it draws.
+    """
+
+    row: str
+    name: str
+    seed: int
+    duration_s: float = CLIP_S
+
+    @cached_property
+    def height_m(self) -> float:
+        """Standing height of the body."""
+        people = ActivityGenerator().generate(self.row, seed=self.seed, duration_s=0.1).people
+        return float(people.height_m[0])
+
+    @property
+    def present(self) -> bool:
+        """Whether there is anybody."""
+        return activity_index(self.row) != 0
+
+    def joints(self, rate_hz: float) -> Tensor:
+        """The true joints (T, 14, 3) float64 in m at ``k / rate_hz``, evaluated and not resampled."""
+        motion = ActivityGenerator().generate(
+            self.row, seed=self.seed, duration_s=self.duration_s, rate_hz=rate_hz
+        )
+        return motion.joints[0]
+
+
+@dataclass(frozen=True)
+class CapturedClip:
+    """Captured motion; between its frames the natural spline through them is the truth.
+
+    Attributes:
+        row, name: see :class:`ActivityClip`.
+        motion: one person on the floor, cut to the clip.
+        seed: of what a film of it draws.
+    """
+
+    row: str
+    name: str
+    motion: Motion
+    seed: int = 0
+
+    @cached_property
+    def height_m(self) -> float:
+        """Standing height of the body, from its legs and trunk."""
+        return float(body_height(self.motion.joints).median())
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the clip."""
+        return self.motion.joints.shape[1] / self.motion.fps
+
+    @property
+    def present(self) -> bool:
+        """Whether there is anybody."""
+        return True
+
+    def joints(self, rate_hz: float) -> Tensor:
+        """The true joints (T, 14, 3) float64 in m at ``k / rate_hz``."""
+        return PoseResampler(rate_hz)(self.motion.joints[0].double(), self.motion.fps)
+
+
+Clip = ActivityClip | CapturedClip
+
+
+def activity_clips(activities: tuple[str, ...], count: int, seed: int) -> dict[str, list[Clip]]:
+    """``count`` clips of each activity (default all), numbered from ``seed`` on, by row; all of different people."""
+    indices = [activity_index(name) for name in activities] or list(range(len(ACTIVITIES)))
+    return {
+        ACTIVITIES[i]: [
+            ActivityClip(ACTIVITIES[i], str(k), k * len(ACTIVITIES) + i) for k in range(seed, seed + count)
+        ]
+        for i in indices
+    }
+
+
+def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Clip]:
+    """The first ``count`` motions of a file, at most 4 s of each, 4 m away.
+
+    The first frame of a capture is left out: it is often a calibration pose.
+
+    Args:
+        path: ``.bvh``, or an ``.npz`` in which every array with three dimensions is a motion.
+        count: at most so many.
+        fps: frames per second where the file says nothing.
+
+    Raises:
+        TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; nothing long enough.
+    """
+    keys: list[str | None] = [None]
+    if path.suffix.lower() == ".npz" and path.is_file():
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                keys = [name for name in arrays.files if arrays[name].ndim == 3]
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            raise TensorsimError(f"{path}: got a file that cannot be read as npz ({error})") from error
+    clips: list[Clip] = []
+    for key in keys:
+        motion = load_motion(path, key, fps)
+        stop = 1 + int(CLIP_S * motion.fps)
+        motion = Motion(motion.joints[:1, 1:stop], motion.valid[:1, 1:stop], motion.fps)
+        if motion.joints.shape[1] < 0.5 * motion.fps or not bool(motion.valid.all()):
+            continue
+        motion = place(motion, CAPTURE_RANGE_M)
+        clips.append(CapturedClip(path.stem, key or path.stem, _kept_away(motion)))
+    if not clips:
+        raise TensorsimError(f"{path}: got no motion of at least half a second, expected one")
+    return clips[:count]
+
+
+def _kept_away(motion: Motion, nearest_m: float = 1.5, farthest_m: float = 7.0) -> Motion:
+    """Motion moved along y, as far as it takes to stay within the generator's ranges, nearest first."""
+    y = motion.joints[..., (8, 11), 1]
+    shift = (farthest_m - y.max()).clamp(max=0.0)
+    shift = torch.maximum(shift, nearest_m - y.min())
+    return motion._replace(joints=motion.joints + torch.stack([0 * shift, shift, 0 * shift]))

@@ -1,0 +1,134 @@
+"""What a camera gives of a clip: the true keypoints in its picture, or what networks find in the rendered film."""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import CameraConfig
+from tensorsim.data.render import PersonRenderer
+from tensorsim.data.render_cast import View
+from tensorsim.evaluation.clips import Clip
+from tensorsim.motion.body import body_to_coco
+from tensorsim.pipeline import VideoToPose
+from tensorsim.types import Tracks
+
+#: Frame rate of the films.
+FPS = 30.0
+HEIGHT, WIDTH = 360, 640
+#: Stands behind the radar, far enough for whole bodies from 1.5 m on.
+CAMERA = CameraConfig(position_m=(0.0, -2.0, 1.0))
+
+
+class Observed(NamedTuple):
+    """People of a film in its picture.
+
+    Attributes:
+        boxes: (P, T, 4) ``xyxy`` pixels.
+        valid: (P, T) bool, whether the person is followed in that frame.
+        keypoints: (P, T, 17, 2) pixels.
+        scores: (P, T, 17).
+    """
+
+    boxes: Tensor
+    valid: Tensor
+    keypoints: Tensor
+    scores: Tensor
+
+    def tracks(self) -> Tracks:
+        """As a tracker gives them, a batch of one clip."""
+        return Tracks(self.boxes[None], self.valid[None], self.valid[None])
+
+
+def project(joints: Tensor) -> tuple[Tensor, Tensor, View]:
+    """COCO keypoints of joints (T, 14, 3): pixels (T, 17, 2), whether in the picture (T, 17), the camera's view."""
+    view = View.of_camera(CAMERA, HEIGHT, WIDTH, joints)
+    pixels, depth = view.project(body_to_coco(joints))
+    limit = pixels.new_tensor([WIDTH - 0.5, HEIGHT - 0.5])
+    inside = ((pixels >= -0.5) & (pixels < limit)).all(dim=-1) & (depth > 0)
+    return pixels, inside, view
+
+
+def true_keypoints(clip: Clip) -> Observed:
+    """The true keypoints of a clip, those inside of the picture with score 1, the others with 0.
+
+    Hidden ones count, as they do in the labels of COCO; boxes are those of the keypoints and a margin.
+    """
+    joints = clip.joints(FPS)
+    if not clip.present:
+        frames = len(joints)
+        return Observed(
+            torch.zeros(0, frames, 4), torch.zeros(0, frames, dtype=torch.bool),
+            torch.zeros(0, frames, 17, 2), torch.zeros(0, frames, 17),
+        )  # fmt: skip
+    pixels, inside, _ = project(joints)
+    shown = torch.where(inside[..., None], pixels, torch.nan)
+    low = torch.where(inside[..., None], pixels, torch.inf).amin(dim=-2)
+    high = torch.where(inside[..., None], pixels, -torch.inf).amax(dim=-2)
+    margin = 0.06 * (high - low).amax(dim=-1, keepdim=True)
+    boxes = torch.cat([low - margin, high + margin], dim=-1)
+    valid = inside.any(dim=-1)
+    boxes = torch.where(valid[:, None], boxes, 0.0)
+    return Observed(
+        boxes.float()[None],
+        valid[None],
+        torch.where(shown.isnan(), pixels, shown).float()[None],
+        inside.float()[None],
+    )
+
+
+class Filmed(NamedTuple):
+    """What networks make of a rendered film.
+
+    Attributes:
+        found: people detected and tracked.
+        boxed: the pose network on the true boxes.
+    """
+
+    found: Observed
+    boxed: Observed
+
+
+def render_and_watch(clip: Clip, detector: nn.Module, pose: nn.Module) -> Filmed:
+    """Render a clip and run detector, tracker and pose network on it; frames are not kept."""
+    joints = clip.joints(FPS).float()
+    there = torch.full((1, len(joints)), clip.present)
+    film = PersonRenderer(CAMERA, HEIGHT, WIDTH)(joints, seed=clip.seed, valid=there)
+    stage = VideoToPose(detector, pose, camera=CAMERA).eval()
+    with torch.inference_mode():
+        seen = stage(film.frames[None], FPS)
+        found = Observed(seen.boxes[0], seen.valid[0], seen.keypoints[0], seen.keypoint_scores[0])
+        valid = film.valid
+        keypoints, scores = stage.estimate(
+            film.frames, film.boxes.transpose(0, 1).float(), valid.transpose(0, 1)
+        )
+    boxed = Observed(film.boxes.float(), valid, keypoints.transpose(0, 1), scores.transpose(0, 1))
+    if not clip.present:
+        boxed = true_keypoints(clip)
+    return Filmed(found, boxed)
+
+
+def filmed(path: Path, clip: Clip, detector: nn.Module, pose: nn.Module) -> Filmed:
+    """:func:`render_and_watch`, or what it gave before if ``path`` (npz) is there; else writes it."""
+    if path.is_file():
+        with np.load(path, allow_pickle=False) as arrays:
+            parts = [
+                Observed(*(torch.from_numpy(arrays[f"{part}_{name}"]) for name in Observed._fields))
+                for part in Filmed._fields
+            ]
+        return Filmed(*parts)
+    result = render_and_watch(clip, detector, pose)
+    arrays = {
+        f"{part}_{name}": tensor.numpy()
+        for part, people in zip(Filmed._fields, result, strict=True)
+        for name, tensor in zip(Observed._fields, people, strict=True)
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as scratch:
+        np.savez(scratch, **arrays)
+    os.replace(scratch.name, path)
+    return result

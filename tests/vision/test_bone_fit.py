@@ -1,0 +1,190 @@
+"""Depths from bones that keep their length: against SciPy's least squares, and against bodies that are known."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.vision.bone_fit import (
+    BONES,
+    LENGTH_OF_BONE,
+    LENGTH_SHARES,
+    BoneFit,
+    jitter,
+    solve_block_tridiagonal,
+)
+from tests.stage import StageTester
+
+CAMERA = (0.1, -2.0, 1.1)
+FREE = [0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13]
+FPS = 30.0
+
+
+def moving(frames: int, seed: int = 5) -> tuple[Tensor, float]:
+    """Somebody who walks, (frames, 14, 3), and their height."""
+    motion = ActivityGenerator().generate("walking", seed=seed, duration_s=frames / FPS, rate_hz=FPS)
+    return motion.joints[0], float(motion.people.height_m[0])
+
+
+def misplaced(joints: Tensor, deviation_m: float = 0.08, seed: int = 0) -> Tensor:
+    """Joints moved along their lines of sight, each by an error that stays."""
+    generator = torch.Generator().manual_seed(seed)
+    sight = joints - joints.new_tensor(CAMERA)
+    off = deviation_m * torch.randn(1, 14, 1, generator=generator, dtype=joints.dtype)
+    return joints + off * sight / sight.norm(dim=-1, keepdim=True)
+
+
+class Fit(nn.Module):
+    def __init__(self, calibrated: bool) -> None:
+        super().__init__()
+        self.stage = BoneFit(CAMERA, (1.8, 1.7), calibrated, bone_m=0.02, steps=(2, 1, 1))
+
+    def forward(self, joints: Tensor, valid: Tensor) -> Tensor:
+        return self.stage(joints, valid, 30.0)
+
+
+class TestBoneFit(StageTester):
+    batched_arguments = (0, 1)
+    batch_atol = 1e-6
+    calibrated = False
+
+    def make(self) -> nn.Module:
+        return Fit(self.calibrated)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        generator = torch.Generator().manual_seed(1)
+        body = misplaced(moving(7)[0])
+        noise = torch.randn(*batch, 2, 7, 14, 3, generator=generator, dtype=torch.float64)
+        valid = torch.rand(*batch, 2, 7, generator=generator) > 0.2
+        return (body + 0.02 * noise).to(dtype), valid
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        joints, valid = self.inputs((), torch.float32)
+        return [
+            ((joints[..., :13, :], valid), r"expected \(\.\.\., P, T, 14, 3\)"),
+            ((joints[..., :2], valid), r"expected \(\.\.\., P, T, 14, 3\)"),
+            ((joints * float("nan"), valid), "joints: got NaN"),
+            ((joints, valid[..., :3]), r"valid: got torch.bool of \[2, 3\], expected bool of \[2, 7\]"),
+            ((joints, valid.float()), "valid: got torch.float32"),
+        ]
+
+
+class TestCalibrated(TestBoneFit):
+    calibrated = True
+
+
+def test_block_tridiagonal_systems_as_dense_ones() -> None:
+    generator = torch.Generator().manual_seed(0)
+    half = torch.randn(2, 12, 12, generator=generator, dtype=torch.float64)
+    matrix = half @ half.mT + 12 * torch.eye(12)
+    block = torch.arange(12) // 3
+    matrix = matrix * ((block[:, None] - block).abs() <= 1)
+    matrix = matrix + 40 * torch.eye(12)
+    right = torch.randn(2, 12, 2, generator=generator, dtype=torch.float64)
+    diagonal = torch.stack([matrix[:, 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(4)], 1)
+    below = torch.stack([matrix[:, 3 * k + 3 : 3 * k + 6, 3 * k : 3 * k + 3] for k in range(3)], 1)
+    solved = solve_block_tridiagonal(diagonal, below, right.reshape(2, 4, 3, 2)).reshape(2, 12, 2)
+    np.testing.assert_allclose(solved, np.linalg.solve(matrix.numpy(), right.numpy()), rtol=1e-9)
+
+
+@pytest.mark.parametrize("frames", [6, 7])
+def test_minimum_is_that_of_scipy(frames: int) -> None:
+    joints, height = moving(frames)
+    given = misplaced(joints).numpy()
+    stage = BoneFit(CAMERA, (height,), bone_m=0.02, steps=(10, 20, 60))
+    fitted = stage(torch.from_numpy(given)[None], torch.ones(1, frames, dtype=torch.bool), FPS)[0]
+
+    sight = given - np.array(CAMERA)
+    distance = np.linalg.norm(sight, axis=-1)
+    lines = sight / distance[..., None]
+    d = np.diff(lines[:, FREE], 4, axis=0)
+    shake = (1.4826 / 70**0.5 * np.quantile(np.abs(d), 0.5, axis=0, method="lower")).mean()
+    bone_m = np.hypot(0.02, 2 * shake * distance[:, FREE].mean())
+
+    def points(r: np.ndarray) -> np.ndarray:
+        x = np.zeros((frames, 15, 3))
+        x[:, FREE] = np.array(CAMERA) + r[..., None] * lines[:, FREE]
+        x[:, 1], x[:, 14] = (x[:, 2] + x[:, 5]) / 2, (x[:, 8] + x[:, 11]) / 2
+        return x
+
+    def errors(unknown: np.ndarray) -> np.ndarray:
+        r, stretch = unknown[:-8].reshape(frames, 13), unknown[-8:]
+        x, off = points(r), r - distance[:, FREE]
+        length = height * np.array(LENGTH_SHARES) * np.exp(stretch)
+        bones = [
+            np.linalg.norm(x[:, a] - x[:, b], axis=-1) - length[i]
+            for (a, b), i in zip(BONES, LENGTH_OF_BONE, strict=True)
+        ]
+        hips = (off[:, FREE.index(8)] + off[:, FREE.index(11)]) / 2
+        parts = [
+            np.array(bones) / bone_m, stretch / 0.04, np.diff(r, 2, axis=0) * FPS**2 / 40,
+            (off - hips[:, None]) / 0.1, hips / 0.3,
+        ]  # fmt: skip
+        return np.concatenate([p.ravel() for p in parts])
+
+    best = least_squares(errors, np.r_[distance[:, FREE].ravel(), np.zeros(8)], xtol=1e-12, ftol=1e-12)
+    np.testing.assert_allclose(fitted.numpy(), points(best.x[:-8].reshape(frames, 13))[:, :14], atol=2e-4)
+
+
+def test_depths_of_exact_keypoints_come_out_right() -> None:
+    joints, height = moving(90)
+    given = torch.cat([misplaced(frame[None], seed=t) for t, frame in enumerate(joints)])
+    fitted = BoneFit(CAMERA, (height,), calibrated=True)(
+        given[None], torch.ones(1, 90, dtype=torch.bool), FPS
+    )[0]
+
+    def error(x: Tensor) -> float:
+        return float((x - joints).norm(dim=-1).square().mean().sqrt())
+
+    assert error(given) > 0.07
+    assert error(fitted) < 0.4 * error(given)
+    lengths = torch.stack([(fitted[:, a] - fitted[:, b]).norm(dim=-1) for a, b in BONES[:11]])
+    assert float((lengths.amax(-1) - lengths.amin(-1)).max()) < 0.01
+
+
+def test_joints_stay_on_their_lines_of_sight_but_for_the_neck() -> None:
+    joints, height = moving(30)
+    given = misplaced(joints)
+    fitted = BoneFit(CAMERA, (height,))(given[None], torch.ones(1, 30, dtype=torch.bool), FPS)[0]
+    before, after = (x[:, FREE] - x.new_tensor(CAMERA) for x in (given, fitted))
+    torch.testing.assert_close(
+        after / after.norm(dim=-1, keepdim=True), before / before.norm(dim=-1, keepdim=True)
+    )
+    torch.testing.assert_close(fitted[:, 1], (fitted[:, 2] + fitted[:, 5]) / 2)
+
+
+def test_invalid_frames_and_very_short_clips_stay() -> None:
+    joints, height = moving(30)
+    given = misplaced(joints)[None]
+    valid = torch.ones(1, 30, dtype=torch.bool)
+    valid[0, 10:13] = False
+    fitted = BoneFit(CAMERA, (height,))(given, valid, FPS)
+    assert torch.equal(fitted[:, 10:13], given[:, 10:13])
+    assert not torch.equal(fitted[:, 9], given[:, 9])
+    assert torch.equal(BoneFit(CAMERA)(given[:, :3], valid[:, :3], FPS), given[:, :3])
+
+
+def test_jitter_is_the_deviation_of_noise_and_not_of_movement() -> None:
+    generator = torch.Generator().manual_seed(0)
+    time = torch.arange(400, dtype=torch.float64) / FPS
+    path = torch.stack([torch.sin(2 * torch.pi * time), 0.5 * time], dim=-1)
+    valid = torch.ones(400, dtype=torch.bool)
+    assert float(jitter(path, valid).max()) < 0.003
+    noisy = path + 0.05 * torch.randn(path.shape, generator=generator, dtype=torch.float64)
+    assert jitter(noisy, valid).tolist() == pytest.approx([0.05, 0.05], rel=0.2)
+    assert jitter(noisy[:4], valid[:4]).tolist() == [0, 0]
+
+
+def test_settings_are_checked() -> None:
+    for options, message in (
+        ({"bone_m": 0.0}, "BoneFit.bone_m: got 0.0"),
+        ({"person_height_m": ()}, "BoneFit.person_height_m: got no values"),
+        ({"person_height_m": (1.8, -1.0)}, r"BoneFit.person_height_m\[1\]: got -1.0"),
+    ):
+        with pytest.raises(TensorsimError, match=message):
+            BoneFit(**options)
