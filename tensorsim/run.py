@@ -18,9 +18,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim import plot
+from tensorsim.config import ACTIVITIES
 from tensorsim.data.video import VideoReader, write_video
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
+from tensorsim.recognition import ActivityRecognizer
 from tensorsim.types import Detections, Pose, RadarMaps
 
 if TYPE_CHECKING:
@@ -332,6 +334,15 @@ def summary_of(
         "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
         **{name: None if part is None else asdict(part) for name, part in scene._asdict().items()},
     }
+
+
+def label_of(recognizer: ActivityRecognizer | None, maps: RadarMaps) -> dict[str, Any]:
+    """The activity that the maps (without a batch dimension) show, and the probability of each; None unasked."""
+    if recognizer is None:
+        return {"label": None, "probabilities": None}
+    probabilities = recognizer(maps).softmax(-1).tolist()
+    by_name = {name: round(p, 4) for name, p in zip(ACTIVITIES, probabilities, strict=True)}
+    return {"label": max(by_name, key=by_name.__getitem__), "probabilities": by_name}
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

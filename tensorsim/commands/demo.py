@@ -55,6 +55,7 @@ class Demo(RadarOptions):
             raise TensorsimError(f"--duration: got {self.duration}, expected seconds from 0.5 to 60")
         detector, pose_network = default_networks(self.detector, self.pose)
         scene = self.radar_scene()
+        recognizer = self.recognizer(scene)
 
         import numpy as np
         import torch
@@ -124,14 +125,19 @@ class Demo(RadarOptions):
                     fps=FILM_FPS,
                 )
                 likeness = run.similarity(maps, true_maps)
-                summary = run.summary_of(source, scene, pose, maps, self.seed) | {
-                    "activity": ACTIVITIES[activity],
-                    "person_height_m": round(height_m, 4),
-                    **drawn_by(camera, (HEIGHT, WIDTH)),
-                    "film_against_truth": likeness | joint_errors(pose, film),
-                    "config": self.described() | {"detector": str(detector), "pose": str(pose_network)},
-                    "warnings": messages,
-                }
+                label = run.label_of(recognizer, maps)
+                summary = (
+                    label
+                    | run.summary_of(source, scene, pose, maps, self.seed)
+                    | {
+                        "activity": ACTIVITIES[activity],
+                        "person_height_m": round(height_m, 4),
+                        **drawn_by(camera, (HEIGHT, WIDTH)),
+                        "film_against_truth": likeness | joint_errors(pose, film),
+                        "config": self.described() | {"detector": str(detector), "pose": str(pose_network)},
+                        "warnings": messages,
+                    }
+                )
                 run.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.radar.presets import RadarScene
+    from tensorsim.recognition import ActivityRecognizer
 
 #: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
 FULL_RATE_PULSES = 1 << 17
@@ -49,6 +50,9 @@ class RadarOptions:
     """Signal-to-noise ratio in dB of the people's echo, per IF sample."""
     denoiser: Path | None = None
     """DnCNN weights (.pth or .safetensors) to clean the shown maps."""
+    classifier: str | None = None
+    """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
+    for no label. Default: the shipped one."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
@@ -124,6 +128,17 @@ class RadarOptions:
             scatterers=self._scatterers(scene),
             denoiser=None if self.denoiser is None else MapDenoiser(DnCNN.from_pretrained(self.denoiser)),
         )
+
+    def recognizer(self, scene: "RadarScene") -> "ActivityRecognizer | None":
+        """What tells the activity from the maps of this radar; None if it is not wanted."""
+        from tensorsim.recognition import ActivityRecognizer
+
+        if self.classifier == "none":
+            return None
+        try:
+            return ActivityRecognizer.from_pretrained(scene.radar, self.classifier)
+        except TensorsimError as error:
+            raise TensorsimError(f"--classifier: {error}") from None
 
     def _scatterers(self, scene: "RadarScene") -> "nn.Module":
         from tensorsim.motion import Body13Scatterers, JointScatterers, LimbScatterers

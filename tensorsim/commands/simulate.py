@@ -25,6 +25,7 @@ _MEANT_FOR = {
     "person_height": ("video", "keypoints"),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
+    "library": ("video", "keypoints"),
     "image_size": ("keypoints",),
     "clip": ("motion",),
     "heading": ("motion",),
@@ -59,6 +60,8 @@ class Simulate(RadarOptions):
     """Horizontal field of view of the camera in degrees, when no initial distance is given."""
     position: Literal["camera", "paper"] = "camera"
     """Camera model, or the paper's pixel displacement (no motion along the optical axis)."""
+    library: Path | None = None
+    """Pool of poses for the lifting to 3D, as `tensorsim library build` writes it. Default: the shipped one."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -92,6 +95,7 @@ class Simulate(RadarOptions):
                 name = field.name.replace("_", "-")
                 raise TensorsimError(f"--{name}: got it for {KINDS[kind]}, expected it for {meant} only")
         scene = self.radar_scene()
+        recognizer = self.recognizer(scene)
         device = usable_device(self.device)
         with run.collected_warnings() as messages, torch.inference_mode():
             source, networks = self._source(kind, device)
@@ -100,14 +104,20 @@ class Simulate(RadarOptions):
             with run.complete_or_nothing(self.out) as folder:
                 pose, maps = run.simulate(source, stage, folder, self.seed, device, self.quiet)
                 run.write_maps(folder, maps, run.axes_of(stage, maps))
-                summary = run.summary_of(source, scene, pose, maps, self.seed) | {
-                    "config": self.described() | networks,
-                    "warnings": messages,
-                }
+                label = run.label_of(recognizer, maps)
+                summary = (
+                    label
+                    | run.summary_of(source, scene, pose, maps, self.seed)
+                    | {
+                        "config": self.described() | networks,
+                        "warnings": messages,
+                    }
+                )
                 run.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
-        print(f"{self.out}: {pose.valid.shape[1]} people in {pose.valid.shape[2]} frames")
+        shown = f", {label['label']}" if label["label"] else ""
+        print(f"{self.out}: {pose.valid.shape[1]} people in {pose.valid.shape[2]} frames{shown}")
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
@@ -167,11 +177,14 @@ class Simulate(RadarOptions):
         from tensorsim.config import CameraConfig
         from tensorsim.pipeline import VideoToPose
         from tensorsim.vision.kalman import KalmanSmoother
+        from tensorsim.vision.lifter import NearestPoseLifter
         from tensorsim.vision.metric_pose import MetricPose
+        from tensorsim.vision.pose_library import load_pose_library
 
         return VideoToPose(
             nn.Identity() if detector is None else detector,
             nn.Identity() if pose is None else pose,
+            lifter=None if self.library is None else NearestPoseLifter(load_pose_library(self.library)),
             metric_pose=MetricPose(
                 CameraConfig(horizontal_fov_rad=math.radians(self.camera_fov)),
                 person_height_m=self.person_height,

@@ -368,7 +368,8 @@ class RadarSimulator(nn.Module):
         step = self._step(positions)
         for start in range(0, positions.shape[1], step):
             profiles, energy = self.engine(positions[:, start : start + step], rcs[:, start : start + step])
-            total = total + energy
+            # Without noise the ratio is infinite, and no gradient goes through it.
+            total = total + (energy.detach() if self.noise.noiseless else energy)
             chunks.append(profiles.transpose(1, 2))
         return torch.cat(chunks, -1).transpose(1, 2), total
 

@@ -28,13 +28,14 @@ class RTMDet(nn.Module):
     A fresh module is in training mode; call ``eval()`` before use (``from_pretrained`` does).
 
     Args:
-        variant: "nano-person", "tiny", "s", "m", "l", "x" (80 classes of COCO, 0 = person) or "m-person".
+        variant: "nano-person", "small-person", "tiny", "s", "m", "l", "x" (80 classes of COCO, 0 = person) or
+            "m-person".
         score_threshold: detections score more than this. None, here and below, is the setting of the
             published figures: 0.05 for one class, 0.001 for 80. To follow people, 0.3 is usual.
         nms_iou: boxes of a class that overlap more are one object. None: 0.6 for one class, 0.65 for 80.
         max_detections: K, the padded count. None: 100 for one class, 300 for 80.
         nms_pre: candidates kept per level. None: 1000 for one class, 30000 for 80.
-        input_size: side of the square input in pixels, a multiple of 32. None: 320 for nano, else 640.
+        input_size: side of the square input in pixels, a multiple of 32. None: 320 for nano and small, else 640.
 
     Raises:
         TensorsimError: an unknown variant or a setting out of range.
@@ -67,7 +68,7 @@ class RTMDet(nn.Module):
         self.nms_iou = (0.6 if one_class else 0.65) if nms_iou is None else nms_iou
         self.max_detections = (100 if one_class else 300) if max_detections is None else max_detections
         self.nms_pre = (1000 if one_class else 30000) if nms_pre is None else nms_pre
-        self.input_size = (320 if size.depthwise else 640) if input_size is None else input_size
+        self.input_size = size.input_size if input_size is None else input_size
         for name in ("score_threshold", "nms_iou"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TensorsimError(
@@ -218,7 +219,7 @@ class RTMDet(nn.Module):
 
 
 def variant_of(state_dict: dict[str, Tensor], source: str | os.PathLike[str]) -> str:
-    """The variant whose stem width and number of classes a state dict has.
+    """The variant whose stem width, number of classes and kind of convolution a state dict has.
 
     Raises:
         TensorsimError: no variant has them.
@@ -228,8 +229,14 @@ def variant_of(state_dict: dict[str, Tensor], source: str | os.PathLike[str]) ->
         raise TensorsimError(
             f"{source}: got no backbone.stem.0 and bbox_head.rtm_cls.0, expected weights of RTMDet"
         )
+    # Every variant has depthwise 5x5 convolutions, 3x3 ones only those of separable convolutions throughout.
+    depthwise = any(tensor.shape[1:] == (1, 3, 3) for tensor in state_dict.values())
     for variant, size in RTMDET_SIZES.items():
-        if stem.shape[0] == int(64 * size.widen // 2) and head.shape[0] == size.num_classes:
+        if (stem.shape[0], head.shape[0], depthwise) == (
+            int(64 * size.widen // 2),
+            size.num_classes,
+            size.depthwise,
+        ):
             return variant
     raise TensorsimError(
         f"{source}: got {stem.shape[0]} channels in the stem and {head.shape[0]} classes, "

@@ -1,0 +1,71 @@
+"""``tensorsim evaluate detector``: how well a person detector finds people it has not seen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class EvaluateDetector:
+    """Print average precision and recall on held-out pictures, and how long films are followed beside another detector.
+
+    Attributes:
+        weights: RTMDet's (.safetensors, .pth, .onnx); the shipped ones if not given.
+        against: another detector's, measured alike; needed for films.
+        data: folder of coco_small-*.tar, whose held-out pictures are looked at.
+        coco: folder with one COCO annotation file (*.json) and its pictures in images/.
+        films: videos to follow people in.
+    """
+
+    weights: Path | None = None
+    against: Path | None = None
+    data: Path | None = None
+    coco: Path | None = None
+    films: tuple[Path, ...] = ()
+
+    def run(self) -> None:
+        """Do it."""
+        import torch
+
+        from tensorsim.training.detector import HELD_OUT_PERCENT
+        from tensorsim.training.detector_metrics import compare_tracks, measure, tracks_of_film
+        from tensorsim.training.pose_data import split
+        from tensorsim.training.shards import Sample, Shards, find_shards, read_coco
+        from tensorsim.vision.rtmdet import RTMDet
+
+        groups: dict[str, list[Sample]] = {}
+        if self.data is not None:
+            held_out = split(Shards(find_shards(self.data, "coco_small")), HELD_OUT_PERCENT)[1]
+            groups["coco_small, held out"] = held_out
+        if self.coco is not None:
+            files = sorted(self.coco.glob("*.json"))
+            if len(files) != 1:
+                raise TensorsimError(f"--coco: got {len(files)} json files in {self.coco}, expected one")
+            groups[str(self.coco)] = read_coco(files[0], self.coco / "images")
+        if not groups and not self.films:
+            raise TensorsimError(
+                "evaluate detector: got nothing to look at, expected --data, --coco or --films"
+            )
+        if self.films and self.against is None:
+            raise TensorsimError("--films: got no --against, the detector to compare with")
+
+        detectors = {
+            "shipped" if self.weights is None else str(self.weights): RTMDet.from_pretrained(self.weights)
+        }
+        if self.against is not None:
+            detectors[str(self.against)] = RTMDet.from_pretrained(self.against)
+        with torch.inference_mode():
+            for name, samples in groups.items():
+                for source, detector in detectors.items():
+                    figures = measure(detector, samples)
+                    told = ", ".join(f"{key} {value:.3g}" for key, value in figures.items())
+                    print(f"{name}, {source}: {told}")
+            for film in self.films:
+                tracks = [tracks_of_film(detector, film) for detector in detectors.values()]
+                followed = compare_tracks(*tracks)
+                share = followed.shared / max(followed.reference_frames, 1)
+                print(
+                    f"{film}: {tracks[0].valid.shape[1]} people in {followed.frames} person-frames, "
+                    f"{tracks[1].valid.shape[1]} in {followed.reference_frames}, shared {share:.3f}"
+                )

@@ -1,0 +1,174 @@
+"""People cut out of rendered pictures, with exact outlines, to be pasted on pictures of places.
+
+A shard is a tar of ``KEY.png`` (RGBA, straight alpha, cropped to the person) and ``KEY.json`` with
+``{"keypoints": [[x, y, v] * 17]}`` in pixels of it (centres at integers; v as in COCO).
+"""
+
+import io
+import json
+import math
+import os
+import tarfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from tensorsim.config import CameraConfig
+from tensorsim.data.render import PersonRenderer
+from tensorsim.data.render_cast import camera_axes
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.body import rest_on_floor, rotation
+from tensorsim.motion.pose_sampler import sample_poses
+
+#: Rendered this many times larger than kept, so that outlines have soft edges.
+OVERSAMPLING = 2
+PER_SHARD = 250
+
+
+class Cutout(NamedTuple):
+    """One person.
+
+    Attributes:
+        rgba: (h, w, 4) uint8, straight alpha.
+        keypoints: (17, 3) float32: x, y and v (0 outside, 1 hidden, 2 seen), pixels of ``rgba``.
+    """
+
+    rgba: npt.NDArray[np.uint8]
+    keypoints: npt.NDArray[np.float32]
+
+
+class Cutouts(Sequence[Cutout]):
+    """The cut-outs of shards, in the order of the files and of their names inside them, decoded when asked for.
+
+    Raises:
+        TensorsimError: a path that is not such a shard.
+    """
+
+    def __init__(self, paths: Iterable[str | os.PathLike[str]]) -> None:
+        self.entries: list[tuple[bytes, npt.NDArray[np.float32]]] = []
+        for path in paths:
+            try:
+                with tarfile.open(path) as tar:
+                    files = {m.name: tar.extractfile(m).read() for m in tar if m.isfile()}  # type: ignore[union-attr]
+                for name in sorted(files):
+                    if name.endswith(".png"):
+                        label = json.loads(files[name.removesuffix("png") + "json"])
+                        points = np.array(label["keypoints"], np.float32).reshape(17, 3)
+                        self.entries.append((files[name], points))
+            except (OSError, tarfile.TarError, ValueError, KeyError) as error:
+                raise TensorsimError(f"{path}: not a shard of cut-outs ({error})") from error
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, index: Any) -> Any:
+        import cv2
+
+        data, keypoints = self.entries[index]
+        bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if bgra is None:
+            raise TensorsimError(f"cut-out {index}: not a picture that can be read")
+        return Cutout(np.ascontiguousarray(bgra[..., [2, 1, 0, 3]]), keypoints.copy())
+
+
+def render_cutout(pose: Tensor, seed: int, side: int = 288) -> Cutout:
+    """One person in this pose, seen from somewhere, in some clothes and light.
+
+    Args:
+        pose: (14, 3) body heights, as :func:`tensorsim.motion.pose_sampler.sample_poses` draws them.
+        seed: of looks, light, the way that the person faces and the camera.
+        side: longest side of the result in pixels, about.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def number(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    height = number(1.5, 1.95)
+    turn = rotation(2, torch.tensor(number(-math.pi, math.pi), dtype=pose.dtype))
+    joints = rest_on_floor((turn @ pose[..., None])[..., 0] * height, height)
+    distance, camera_height = number(2.2, 8.0), number(0.5, 2.8)
+    # The camera looks at the body, now and then a little past it, and is never quite level.
+    centre = (joints.amin(dim=0) + joints.amax(dim=0)) / 2
+    position = (float(centre[0]), float(centre[1]) - distance, camera_height)
+    pitch = math.atan2(float(centre[2]) - camera_height, distance)
+    camera = CameraConfig(position_m=position, pitch_rad=pitch)
+    pixels = side * OVERSAMPLING
+    # The focal length and the principal point that make joints, with flesh around them, fill the picture.
+    x, y, z = ((joints - joints.new_tensor(position)) @ camera_axes(camera, joints).T).unbind(-1)
+    low, high = torch.stack([x / z, y / z], dim=-1).aminmax(dim=0)
+    flesh = 0.17 * height / 1.75 / distance
+    focal = pixels / float((high - low).max() + 2 * flesh)
+    middle = (low + high) / 2 * focal
+    principal = ((pixels - 1) / 2 - float(middle[0]), (pixels - 1) / 2 - float(middle[1]))
+    camera = CameraConfig(focal, center_px=principal, position_m=position, pitch_rad=pitch)
+    renderer = PersonRenderer(camera, pixels, pixels, blur_px=0, noise=0, jpeg_quality=None)
+    film = renderer(joints[None], seed, background=torch.full((3, 1, 1), 0.5))
+
+    mask = film.masks[0, 0].float()
+    coverage = _shrink(mask[None])
+    colour = _shrink(film.frames[0].float() * mask) / coverage.clamp(min=1e-6)
+    rgba = torch.cat([colour, coverage * 255]).round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
+    rows, columns = (np.flatnonzero((rgba[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
+    top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+    rgba = np.ascontiguousarray(rgba[top : rows[-1] + 2, left : columns[-1] + 2])
+    # A pixel of the small picture is the mean of a square of the large one.
+    points = (film.keypoints[0, 0] + 0.5) / OVERSAMPLING - 0.5 - torch.tensor([left, top])
+    flags = film.visibility[0, 0, :, None]
+    return Cutout(rgba, torch.cat([points, flags], dim=-1).numpy().astype(np.float32))
+
+
+def _shrink(picture: Tensor) -> Tensor:
+    return torch.nn.functional.avg_pool2d(picture[None], OVERSAMPLING)[0]
+
+
+def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bool = False) -> list[Path]:
+    """Render people in sampled poses into shards ``cutouts-NNN.tar``; shards that are there are kept.
+
+    Args:
+        count: number of people, at least 13.
+        seed: the same seed gives the same people.
+        out: folder, made if it is not there.
+        quiet: no progress bar.
+
+    Returns:
+        The shards.
+    """
+    from tqdm import tqdm
+
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    poses = sample_poses(count, seed)
+    poses = poses[torch.randperm(count, generator=torch.Generator().manual_seed(seed))]
+    shards = []
+    with tqdm(total=count, desc="people", disable=quiet) as progress:
+        for first in range(0, count, PER_SHARD):
+            shard = folder / f"cutouts-{first // PER_SHARD:03d}.tar"
+            shards.append(shard)
+            last = min(first + PER_SHARD, count)
+            if not shard.exists():
+                partial = shard.with_suffix(".partial")
+                with tarfile.open(partial, "w") as tar:
+                    for index in range(first, last):
+                        _add(tar, f"{index:06d}", render_cutout(poses[index], seed * 1_000_003 + index))
+                        progress.update()
+                partial.replace(shard)
+            else:
+                progress.update(last - first)
+    return shards
+
+
+def _add(tar: tarfile.TarFile, key: str, cutout: Cutout) -> None:
+    import cv2
+
+    png = cv2.imencode(".png", np.ascontiguousarray(cutout.rgba[..., [2, 1, 0, 3]]))[1].tobytes()
+    label = json.dumps({"keypoints": cutout.keypoints.round(2).tolist()}).encode()
+    for suffix, data in ((".png", png), (".json", label)):
+        info = tarfile.TarInfo(key + suffix)
+        info.size = len(data)
+        tar.addfile(info, io.BytesIO(data))

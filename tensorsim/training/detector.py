@@ -1,0 +1,153 @@
+"""The recipe of the person detector: RTMDet from a random start, on few real pictures and many made ones."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from tensorsim.training.assign import detection_losses
+from tensorsim.training.cutouts import Cutouts
+from tensorsim.training.detector_data import PictureMaker, Sources
+from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.pose_data import lean_deg, split
+from tensorsim.training.shards import Sample, Shards, find_shards
+from tensorsim.vision.detection import distances_to_boxes
+from tensorsim.vision.rtmdet import RTMDet
+
+#: Of the COCO pictures, never trained on.
+HELD_OUT_PERCENT = 20
+#: Heads stand out of the boxes of the street pictures by about this share of their height.
+PEDESTRIAN_HEAD = 0.18
+#: Sides of the pictures of a step, drawn anew for each.
+SIDES = (160, 192, 224, 256, 320)
+
+
+class TrainedRTMDet(RTMDet):
+    """RTMDet whose ``forward`` is its network alone, as training needs it."""
+
+    def forward(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:  # type: ignore[override]
+        """As :meth:`RTMDet.dense`."""
+        return self.dense(x)
+
+
+def read_sources(data: Path, cutouts: Cutouts) -> tuple[Sources, list[Sample]]:
+    """What to train on, and the held-out pictures, of a folder of shards."""
+    coco, held_out = split(Shards(find_shards(data, "coco_small")), HELD_OUT_PERCENT)
+    lspet = list(Shards(find_shards(data, "lspet")))
+    street = list(Shards(find_shards(data, "pedestrian")))
+    for sample in street:
+        sample.boxes[:, 1] -= PEDESTRIAN_HEAD * (sample.boxes[:, 3] - sample.boxes[:, 1])
+        np.maximum(sample.boxes, 0, out=sample.boxes)
+    standing = [sample for sample in lspet if abs(lean_deg(sample.keypoints[0])) < 35]
+    empty = [sample for sample in coco if len(sample.boxes) == 0 and sample.all_labelled]
+    return Sources(
+        complete=[sample for sample in coco if len(sample.boxes) and sample.all_labelled],
+        empty=empty + list(Shards(find_shards(data, "backgrounds"))),
+        partial=[lspet, standing, street],
+        cutouts=cutouts,
+    ), held_out
+
+
+class DetectorRecipe(Recipe):
+    """Train RTMDet for people.
+
+    Args:
+        net: the network.
+        sources: what to train on.
+        held_out: what to measure on.
+        seed: of the pictures.
+        learning_rate: highest learning rate.
+        warm_up: steps until it is reached.
+    """
+
+    def __init__(
+        self,
+        net: TrainedRTMDet,
+        sources: Sources,
+        held_out: list[Sample],
+        seed: int = 0,
+        learning_rate: float = 1.5e-3,
+        warm_up: int = 50,
+    ) -> None:
+        settings = {
+            "recipe": "detector",
+            "variant": net.variant,
+            "seed": seed,
+            "learning_rate": learning_rate,
+        }
+        super().__init__(net, settings, {"model": "RTMDet", "variant": net.variant})
+        self.detector = net
+        self.held_out, self.seed, self.learning_rate, self.warm_up = held_out, seed, learning_rate, warm_up
+        self.maker = PictureMaker(sources, net.input_size)
+
+    def sample(self, index: int) -> dict[str, Any]:
+        """A picture: image (3, s, s) uint8 RGB, boxes (n, 4), known (m, m)."""
+        import cv2
+
+        cv2.setNumThreads(0)  # the processes of the loader are the parallel ones
+        picture = self.maker(np.random.default_rng([self.seed, index]))
+        return {
+            "index": index,
+            "image": torch.from_numpy(picture.image).permute(2, 0, 1),
+            "boxes": torch.from_numpy(picture.boxes),
+            "known": torch.from_numpy(picture.known),
+        }
+
+    def collate(self, samples: list[dict[str, Any]]) -> Batch:
+        """Pictures of one side: image (B, 3, s, s) in [0, 255], boxes (B, G, 4), valid (B, G), known (B, m, m)."""
+        most = max(len(sample["boxes"]) for sample in samples)
+        boxes = torch.zeros(len(samples), most, 4)
+        valid = torch.zeros(len(samples), most, dtype=torch.bool)
+        for i, sample in enumerate(samples):
+            boxes[i, : len(sample["boxes"])] = sample["boxes"]
+            valid[i, : len(sample["boxes"])] = True
+        image = torch.stack([sample["image"] for sample in samples]).float()
+        sides = [side for side in SIDES if side < image.shape[-1]] + [image.shape[-1]]
+        side = sides[int(np.random.default_rng([self.seed, samples[0]["index"], 1]).integers(len(sides)))]
+        if side < image.shape[-1]:
+            boxes = boxes * (side / image.shape[-1])
+            image = F.interpolate(image, (side, side), mode="bilinear", antialias=True)
+        return {
+            "image": image,
+            "boxes": boxes,
+            "valid": valid,
+            "known": torch.stack([sample["known"] for sample in samples]),
+        }
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Quality focal loss and twice the GIoU loss."""
+        x = ((batch["image"] - self.detector.mean) / self.detector.std).flip(1)
+        logits, distances = net(x.contiguous(memory_format=torch.channels_last))
+        strides = self.detector.strides
+        with torch.autocast(x.device.type, enabled=False):
+            boxes = [distances_to_boxes(d.float(), s) for d, s in zip(distances, strides, strict=True)]
+            return detection_losses(
+                logits, torch.cat(boxes, dim=1), strides, batch["boxes"], batch["valid"], batch["known"]
+            )
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        """AdamW; norms and biases do not decay."""
+        heavy = [p for p in self.net.parameters() if p.ndim > 1]
+        light = [p for p in self.net.parameters() if p.ndim <= 1]
+        groups = [{"params": heavy, "weight_decay": 0.05}, {"params": light, "weight_decay": 0.0}]
+        return torch.optim.AdamW(groups, lr=self.learning_rate)
+
+    def rate(self, step: int, steps: int) -> float:
+        """Linear warm-up, flat to the half, then a cosine to one in twenty."""
+        warm = min(1.0, (step + 1) / self.warm_up)
+        late = max(0.0, 2 * step / steps - 1)
+        return warm * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * late)))
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Average precision and recall on the held-out pictures."""
+        from tensorsim.training.detector_metrics import measure
+
+        detector = RTMDet(self.detector.variant).eval()
+        detector.load_state_dict(net.state_dict())
+        device = next(net.parameters()).device
+        figures = measure(detector.to(device), self.held_out)
+        return figures | {"score": figures["ap50"]}

@@ -1,0 +1,192 @@
+"""How good a person detector is: precision and recall on labelled pictures, how long it follows people on film."""
+
+import contextlib
+import io
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.data.video import VideoReader
+from tensorsim.errors import TensorsimError
+from tensorsim.training.shards import Sample
+from tensorsim.types import Detections, Tracks
+from tensorsim.vision.detection import box_iou
+from tensorsim.vision.rtmdet import RTMDet
+from tensorsim.vision.tracker import GNNTracker
+
+
+def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> dict[str, float]:
+    """Figures of a detector on pictures in which everybody is labelled.
+
+    Returns:
+        ``ap`` and ``ap50`` as COCO defines them (averaged over overlaps from 0.5 to 0.95, and at 0.5), and with
+        detections of more than ``score``: ``recall`` and ``recall_large`` (share of the people, and of those
+        taller than a fifth of their picture, that one detection overlaps by at least 0.5) and
+        ``false_per_picture`` (detections that overlap nobody by 0.5).
+
+    Raises:
+        TensorsimError: no people, or the libraries for average precision are missing.
+    """
+    found = large = found_large = people = wrong = 0
+    truths: list[Tensor] = []
+    found_boxes: list[Tensor] = []
+    for sample in samples:
+        boxes, scores = people_in(detector, sample)
+        truth = torch.from_numpy(sample.boxes)
+        truths.append(truth)
+        found_boxes.append(torch.cat([boxes, scores[:, None]], dim=1))
+        hit = _matches(boxes[scores > score], truth)
+        tall = (truth[:, 3] - truth[:, 1]) > 0.2 * sample.image().shape[0]
+        people += len(truth)
+        found += int(hit.any(dim=0).sum())
+        large += int(tall.sum())
+        found_large += int((hit.any(dim=0) & tall).sum())
+        wrong += int((~hit.any(dim=1)).sum())
+    if people == 0:
+        raise TensorsimError(f"detector: got {len(samples)} pictures without people, expected some with")
+    ap, ap50 = average_precision(truths, found_boxes)
+    return {
+        "ap": ap,
+        "ap50": ap50,
+        "recall": found / people,
+        "recall_large": found_large / max(large, 1),
+        "false_per_picture": wrong / len(samples),
+        "people": float(people),
+    }
+
+
+def average_precision(truths: Sequence[Tensor], found: Sequence[Tensor]) -> tuple[float, float]:
+    """COCO's average precision over overlaps from 0.5 to 0.95, and at 0.5, by its own evaluator.
+
+    Args:
+        truths: per picture (n, 4) ``xyxy``.
+        found: per picture (m, 5) ``xyxy`` and score.
+    """
+    try:
+        from pycocotools.coco import COCO
+        from pycocotools.cocoeval import COCOeval
+    except ImportError as error:
+        raise TensorsimError(f"average precision: {error}; install tensorsim[train]") from error
+
+    def rows(tables: Sequence[Tensor]) -> list[dict[str, Any]]:
+        result: list[dict[str, Any]] = []
+        for picture, table in enumerate(tables, start=1):
+            for left, top, right, bottom, *score in table.tolist():
+                size = (right - left, bottom - top)
+                row: dict[str, Any] = {
+                    "id": len(result) + 1,
+                    "image_id": picture,
+                    "category_id": 1,
+                    "iscrowd": 0,
+                }
+                row |= {
+                    "bbox": [left, top, *size],
+                    "area": size[0] * size[1],
+                    "score": score[0] if score else 1.0,
+                }
+                result.append(row)
+        return result
+
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints its progress
+        labels = COCO()
+        images = [{"id": picture} for picture in range(1, len(truths) + 1)]
+        labels.dataset = {
+            "images": images, "categories": [{"id": 1, "name": "person"}], "annotations": rows(truths)
+        }  # fmt: skip
+        labels.createIndex()
+        answers = COCO()
+        answers.dataset = labels.dataset | {"annotations": rows(found)}
+        answers.createIndex()
+        evaluation = COCOeval(labels, answers, "bbox")
+        evaluation.evaluate()
+        evaluation.accumulate()
+        evaluation.summarize()
+    return float(evaluation.stats[0]), float(evaluation.stats[1])
+
+
+def people_in(detector: RTMDet, sample: Sample) -> tuple[Tensor, Tensor]:
+    """Boxes (n, 4) and scores (n,) of the people that a detector finds in a picture, on the CPU."""
+    image = torch.from_numpy(sample.image()).permute(2, 0, 1)[None]
+    with torch.no_grad():
+        seen: Detections = detector(image.to(detector.mean.device))
+    persons = seen.valid[0] & (seen.labels[0] == 0)
+    return seen.boxes[0][persons].cpu(), seen.scores[0][persons].cpu()
+
+
+def calibrate(detector: RTMDet, samples: Sequence[Sample], false_per_picture: float = 0.1) -> float:
+    """Shift the scores of a one-class detector so that one of 0.5 means the same as in others.
+
+    A network that is not trained to the end doubts what it rightly finds. A constant is added to its logits, in
+    place, with which it makes this many false detections per picture above a score of 0.5. The order of
+    detections, and with it average precision, stays.
+
+    Returns:
+        The constant.
+    """
+    wrong: list[Tensor] = []
+    for sample in samples:
+        boxes, scores = people_in(detector, sample)
+        wrong.append(scores[~_matches(boxes, torch.from_numpy(sample.boxes)).any(dim=1)])
+    highest = torch.cat(wrong).sort(descending=True).values
+    allowed = int(false_per_picture * len(samples))
+    if allowed >= len(highest):
+        return 0.0
+    shift = -float(torch.logit(highest[allowed].double()))
+    with torch.no_grad():
+        for name, parameter in detector.bbox_head.rtm_cls.named_parameters():
+            if name.endswith("bias"):
+                parameter.add_(shift)
+    return shift
+
+
+def _matches(boxes: Tensor, truth: Tensor) -> Tensor:
+    """(n, m) bool, which detections overlap whom by at least one half."""
+    return box_iou(boxes[:, None], truth[None]) >= 0.5
+
+
+class Followed(NamedTuple):
+    """How long two detectors follow the people of a film.
+
+    Attributes:
+        frames: person-frames of the detector's tracks.
+        reference_frames: those of the reference's.
+        shared: the reference's person-frames that a track of the detector overlaps by at least one half.
+    """
+
+    frames: int
+    reference_frames: int
+    shared: int
+
+
+def tracks_of_film(detector: RTMDet, path: str | os.PathLike[str], interval: int = 2) -> Tracks:
+    """People of a film (one clip) by the default tracker, detected in every ``interval``-th frame and in the last."""
+    reader = VideoReader(path)
+    found: list[Detections] = []
+    observed: list[bool] = []
+    last, device = torch.empty(0), detector.mean.device
+    with torch.no_grad():
+        for frames in reader.chunks(interval):
+            found.append(detector(frames[:1].to(device)))
+            observed += [True] + [False] * (len(frames) - 1)
+            last = frames[-1:].clone()
+        if not observed[-1]:
+            found.append(detector(last.to(device)))
+            observed[-1] = True
+    whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+    mask = torch.tensor(observed, device=device)
+    place = (
+        mask.cumsum(0) - 1
+    )  # the detections of the last observed frame fill those between: they do not count
+    spread = Detections(*(part[place].unsqueeze(0) for part in whole))
+    return GNNTracker()(spread, mask)
+
+
+def compare_tracks(tracks: Tracks, reference: Tracks) -> Followed:
+    """Two detectors' people of one film: ``tracks`` against ``reference``, clips of one film each (B = 1)."""
+    overlap = box_iou(reference.boxes[0][:, None], tracks.boxes[0][None])  # (Q, P, T)
+    both = reference.valid[0][:, None] & tracks.valid[0][None] & (overlap >= 0.5)
+    shared = int(both.any(dim=1).sum()) if both.shape[1] else 0
+    return Followed(int(tracks.valid.sum()), int(reference.valid.sum()), shared)

@@ -1,0 +1,280 @@
+"""Crops of people to train a pose network on: labelled pictures and rendered people, turned, scaled and mirrored.
+
+Crops follow :mod:`tensorsim.vision.crops`: pixel centres at integers, and without augmentation a crop is the one
+that :class:`~tensorsim.vision.crops.BoxCrop` gives for the person's box.
+"""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tensorsim.config import COCO_KEYPOINTS
+from tensorsim.errors import TensorsimError
+from tensorsim.training.cutouts import Cutouts
+from tensorsim.training.shards import Floats, Sample
+from tensorsim.vision.topdown import MIRRORED
+
+Picture = npt.NDArray[np.uint8]
+Doubles = npt.NDArray[np.float64]
+
+PADDING = 1.25  # of the boxes, as TopDownPose has it
+_SHOULDERS, _HIPS = (5, 6), (11, 12)
+_UPPER, _LOWER = tuple(range(13)), tuple(range(11, 17))
+
+
+class Person(NamedTuple):
+    """A labelled person in a picture.
+
+    Attributes:
+        sample: the picture.
+        box: (4,) ``xyxy`` pixels.
+        keypoints: (17 or 19, 3): x, y and v; a neck and the top of the head, where given, help to find the box of
+            a person who is turned.
+        area: pixels that show the person.
+    """
+
+    sample: Sample
+    box: Floats
+    keypoints: Floats
+    area: float
+
+
+class Crop(NamedTuple):
+    """What the network is shown and what it should say.
+
+    Attributes:
+        image: (h, w, 3) uint8 RGB.
+        points: (17, 2) float32, crop pixels.
+        known: (17,) bool, labelled and inside of the crop.
+    """
+
+    image: Picture
+    points: Floats
+    known: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How far crops may be from upright, well centred ones.
+
+    Attributes:
+        scale: standard deviation of the log of the box's factor; held within a factor of 1.5.
+        turn_deg: standard deviation of the rotation; held within twice as much.
+        shift: of the centre, standard deviation in sizes of the box.
+        upright: probability that a person who lies or leans is stood upright before that turn.
+        half: probability that only the upper or the lower body is cropped.
+    """
+
+    scale: float = 0.15
+    turn_deg: float = 18.0
+    shift: float = 0.04
+    upright: float = 0.6
+    half: float = 0.3
+
+
+def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
+    """The people of pictures with at least so many labelled COCO keypoints and such a longest side."""
+    return [
+        Person(sample, box, keypoints, float(area))
+        for sample in samples
+        for box, keypoints, area in zip(sample.boxes, sample.keypoints, sample.areas, strict=True)
+        if (keypoints[:17, 2] > 0).sum() >= least and (box[2:] - box[:2]).max() >= least_px
+    ]
+
+
+def split(samples: Sequence[Sample], percent: int) -> tuple[list[Sample], list[Sample]]:
+    """Samples to train on, and the percent that are held out, told by a hash of their keys."""
+    parts: tuple[list[Sample], list[Sample]] = ([], [])
+    for sample in samples:
+        parts[int(hashlib.sha256(sample.key.encode()).hexdigest(), 16) % 100 < percent].append(sample)
+    return parts
+
+
+def upright(persons: Sequence[Person], most_deg: float = 30.0) -> list[Person]:
+    """Those of the people whose trunk leans no further than that."""
+    return [person for person in persons if abs(lean_deg(person.keypoints)) < most_deg]
+
+
+def lean_deg(keypoints: Floats) -> float:
+    """How far the trunk is from upright: the turn, positive clockwise as seen, from upright to what it is.
+
+    NaN where shoulders or hips are not labelled.
+    """
+    shoulders, hips = keypoints[_SHOULDERS, :], keypoints[_HIPS, :]
+    if not ((shoulders[:, 2] > 0).any() and (hips[:, 2] > 0).any()):
+        return math.nan
+    up = shoulders[shoulders[:, 2] > 0, :2].mean(0) - hips[hips[:, 2] > 0, :2].mean(0)
+    return math.degrees(math.atan2(up[0], -up[1]))
+
+
+def rotation(angle_deg: float) -> Doubles:
+    """(2, 2) turn of image points, clockwise as seen (v points down)."""
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[c, -s], [s, c]])
+
+
+def box_matrix(box: Doubles, size: tuple[int, int], mirrored: bool = False) -> Doubles:
+    """(2, 3) matrix from image points to points of the crop (H, W) of a box, or of its mirror image."""
+    height, width = size
+    scale = PADDING * max((box[2] - box[0]) / width, (box[3] - box[1]) / height)
+    middle = (box[:2] + box[2:]) / 2
+    matrix = np.array([[1 / scale, 0, 0], [0, 1 / scale, 0]])
+    matrix[:, 2] = np.array([width, height]) / 2 - middle / scale
+    if mirrored:
+        matrix[0] *= -1
+        matrix[0, 2] += width - 1
+    return matrix
+
+
+def turned_box(box: Floats, keypoints: Floats, turn: Doubles) -> Doubles:
+    """Box of a person in a turned picture: around the turned keypoints, as far from them as the box was."""
+    known = keypoints[keypoints[:, 2] > 0, :2].astype(np.float64)
+    low, high = known.min(0), known.max(0)
+    # Flesh around the points, turned as an offset of the middle and half an extra size.
+    offset = turn @ ((box[:2] + box[2:]) / 2 - (low + high) / 2)
+    flesh = np.abs(turn) @ ((box[2:] - box[:2]) - (high - low)) / 2
+    low, high = (known @ turn.T).min(0), (known @ turn.T).max(0)
+    half = np.maximum((high - low) / 2 + flesh, 1.0)
+    middle = (low + high) / 2 + offset
+    return np.concatenate([middle - half, middle + half])
+
+
+def crop_person(
+    image: Picture,
+    box: Floats,
+    keypoints: Floats,
+    size: tuple[int, int],
+    augmentation: Augmentation | None = None,
+    generator: np.random.Generator | None = None,
+) -> Crop:
+    """Crop a person from a picture.
+
+    Args:
+        image: (H, W, C) uint8; C is 3, or 4 with an alpha that the colours were multiplied with.
+        box: (4,) ``xyxy`` pixels.
+        keypoints: (17 or 19, 3): x, y and v.
+        size: (h, w) of the crop.
+        augmentation: how it may be changed; None crops the box as it is.
+        generator: decides; needed with an augmentation.
+
+    Returns:
+        The crop, with the C channels of the image.
+
+    Raises:
+        TensorsimError: a person without a labelled point, an augmentation without a generator.
+    """
+    import cv2
+
+    if not (keypoints[:, 2] > 0).any():
+        raise TensorsimError("crop_person: got a person without labelled keypoints")
+    mirrored, border = False, cv2.BORDER_CONSTANT
+    turn = np.eye(2)
+    frame = box.astype(np.float64)
+    if augmentation is not None:
+        if generator is None:
+            raise TensorsimError("crop_person: got an augmentation, expected a generator with it")
+        mirrored = bool(generator.random() < 0.5)
+        if generator.random() < 0.5:
+            border = cv2.BORDER_REPLICATE
+        turn, frame = _vary(box, keypoints, augmentation, generator)
+    matrix = box_matrix(frame, size, mirrored)
+    matrix[:, :2] = matrix[:, :2] @ turn
+    warped = cv2.warpAffine(image, matrix, (size[1], size[0]), flags=cv2.INTER_LINEAR, borderMode=border)
+
+    body = keypoints[: len(COCO_KEYPOINTS)]
+    if mirrored:
+        body = body[list(MIRRORED)]
+    points = body[:, :2] @ matrix[:, :2].T + matrix[:, 2]
+    inside = ((points >= -0.5) & (points <= np.array([size[1], size[0]]) - 0.5)).all(1)
+    return Crop(warped.astype(np.uint8, copy=False), points.astype(np.float32), inside & (body[:, 2] > 0))
+
+
+def _vary(
+    box: Floats, keypoints: Floats, augmentation: Augmentation, generator: np.random.Generator
+) -> tuple[Doubles, Doubles]:
+    """A random turn (2, 2) of the picture, and the box to crop from the turned picture."""
+
+    def bounded_normal(deviation: float) -> float:
+        return deviation * float(np.clip(generator.standard_normal(), -2, 2))
+
+    angle = bounded_normal(augmentation.turn_deg)
+    lean = lean_deg(keypoints)
+    if generator.random() < augmentation.upright and abs(lean) > 30:
+        angle -= lean
+    turn = rotation(angle)
+    frame = turned_box(box, keypoints, turn)
+    part = np.array(_UPPER if generator.random() < 0.6 else _LOWER)
+    part = part[keypoints[part, 2] > 0]
+    if generator.random() < augmentation.half and len(part) >= 4:
+        some = keypoints[part, :2].astype(np.float64) @ turn.T
+        margin = generator.uniform(0.05, 0.2) * (some.max(0) - some.min(0)).max() + 1
+        frame = np.concatenate([some.min(0) - margin, some.max(0) + margin])
+    size = (frame[2:] - frame[:2]).max()
+    middle = (frame[:2] + frame[2:]) / 2 + size * np.array([bounded_normal(augmentation.shift) for _ in "uv"])
+    half = (
+        (frame[2:] - frame[:2]) / 2 * math.exp(float(np.clip(bounded_normal(augmentation.scale), -0.4, 0.4)))
+    )
+    return turn, np.concatenate([middle - half, middle + half])
+
+
+class RenderedPeople:
+    """Cut-out people on pictures of places.
+
+    Args:
+        cutouts: the people.
+        places: pictures without people.
+    """
+
+    def __init__(self, cutouts: Cutouts, places: Sequence[Sample]) -> None:
+        if not len(cutouts) or not len(places):
+            raise TensorsimError(
+                f"RenderedPeople: got {len(cutouts)} cut-outs and {len(places)} places, expected some of each"
+            )
+        self.cutouts, self.places = cutouts, places
+
+    def __len__(self) -> int:
+        return len(self.cutouts)
+
+    def crop(
+        self, index: int, size: tuple[int, int], augmentation: Augmentation, generator: np.random.Generator
+    ) -> Crop:
+        """A crop (3 channels) of the person ``index``, on a place that ``generator`` draws."""
+        cutout = self.cutouts[index]
+        height, width = cutout.rgba.shape[:2]
+        box = np.array([0, 0, width - 1, height - 1], np.float32)
+        rgba, keypoints = np.pad(cutout.rgba, ((2, 2), (2, 2), (0, 0))), cutout.keypoints.copy()
+        keypoints[:, :2] += 2
+        # Multiplied with alpha, colours can be interpolated.
+        crop = crop_person(_premultiplied(rgba), box + 2, keypoints, size, augmentation, generator)
+        place = random_view(self.places[int(generator.integers(len(self.places)))].image(), size, generator)
+        return crop._replace(image=_over(place, crop.image))
+
+
+def _premultiplied(rgba: Picture) -> Picture:
+    alpha = rgba[..., 3:].astype(np.uint16)
+    return np.concatenate([(rgba[..., :3] * alpha + 127) // 255, alpha], -1).astype(np.uint8)
+
+
+def _over(image: Picture, premultiplied: Picture) -> Picture:
+    rest = 255 - premultiplied[..., 3:].astype(np.uint16)
+    return np.minimum(premultiplied[..., :3] + (image * rest + 127) // 255, 255).astype(np.uint8)
+
+
+def random_view(image: Picture, size: tuple[int, int], generator: np.random.Generator) -> Picture:
+    """Part of a picture, of the aspect of (h, w), a third to all of what fits, maybe mirrored."""
+    import cv2
+
+    height, width = size
+    scale = min(image.shape[0] / height, image.shape[1] / width) * generator.uniform(0.33, 1.0)
+    h, w = max(int(scale * height), 1), max(int(scale * width), 1)
+    top = int(generator.integers(image.shape[0] - h + 1))
+    left = int(generator.integers(image.shape[1] - w + 1))
+    part = image[top : top + h, left : left + w]
+    part = part[:, ::-1] if generator.random() < 0.5 else part
+    view: Any = cv2.resize(np.ascontiguousarray(part), (width, height), interpolation=cv2.INTER_LINEAR)
+    return view.astype(np.uint8, copy=False)

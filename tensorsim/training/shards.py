@@ -1,0 +1,183 @@
+"""Labelled pictures of people: tar shards of jpg and json, and COCO annotation files, read in any order.
+
+A shard holds ``KEY.jpg`` and ``KEY.json`` with ``{"all_persons_labelled": bool, "persons": [{"bbox": [x, y, w,
+h], "keypoints": [[x, y, v] * 19] or null}]}``; a picture without a json shows no people. The 19 points are
+COCO-17, then neck and the top of the head; v is 0 where not labelled, 1 hidden, 2 visible. Pixel centres are at
+integers.
+"""
+
+import json
+import os
+import tarfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tensorsim.config import COCO_KEYPOINTS
+from tensorsim.errors import TensorsimError
+
+Floats = npt.NDArray[np.float32]
+
+#: The points of a labelled person.
+POINTS = (*COCO_KEYPOINTS, "neck", "head_top")
+#: Usual share of a box that its person covers.
+AREA_OF_BOX = 0.53
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A picture and the people labelled in it.
+
+    Attributes:
+        key: its name within its source.
+        boxes: (n, 4) float32 ``xyxy`` pixels.
+        keypoints: (n, 19, 3) float32: x, y and v of :data:`POINTS`; all zero for a person without points.
+        areas: (n,) float32, pixels that show each person, as annotated or else :data:`AREA_OF_BOX` of the box.
+        all_labelled: no further person is in the picture.
+        path: the file that holds the picture: itself a jpg, or a tar.
+        offset: where the picture begins in it.
+        size: its length in bytes; None is all the rest.
+    """
+
+    key: str
+    boxes: Floats
+    keypoints: Floats
+    areas: Floats
+    all_labelled: bool
+    path: Path
+    offset: int = 0
+    size: int | None = None
+
+    def image(self) -> npt.NDArray[np.uint8]:
+        """Decode the picture: (H, W, 3) uint8 RGB.
+
+        Raises:
+            TensorsimError: it cannot be decoded.
+        """
+        import cv2
+
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            data = file.read() if self.size is None else file.read(self.size)
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
+        if picture is None:
+            raise TensorsimError(f"{self.path}: {self.key} is not a picture that can be read")
+        return picture.astype(np.uint8, copy=False)
+
+
+class Shards(Sequence[Sample]):
+    """The samples of tar shards, in the order of the files and of their names inside them.
+
+    Each tar is read through once for its labels; pictures are read from it when asked for, so shards larger than
+    memory do, and a copy in another process opens files of its own.
+
+    Args:
+        paths: tar files.
+
+    Raises:
+        TensorsimError: a path that is not a tar of such samples.
+    """
+
+    def __init__(self, paths: Iterable[str | os.PathLike[str]]) -> None:
+        self.samples: list[Sample] = [sample for path in paths for sample in _read_tar(Path(path))]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.samples[index]
+
+
+def find_shards(folder: str | os.PathLike[str], name: str) -> list[Path]:
+    """The shards ``NAME-NN.tar`` of a folder, in order.
+
+    Raises:
+        TensorsimError: there is none.
+    """
+    paths = sorted(Path(folder).glob(f"{name}-*.tar"))
+    if not paths:
+        raise TensorsimError(f"{folder}: got no {name}-*.tar, expected shards of labelled pictures")
+    return paths
+
+
+def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str]) -> list[Sample]:
+    """The pictures of a COCO annotation file with their people, in the order of the file.
+
+    Args:
+        annotations: ``person_keypoints_*.json`` or ``instances_*.json``.
+        images: folder of the pictures.
+
+    Returns:
+        Samples; ``all_labelled`` is false where a crowd is marked, which is not among the boxes.
+
+    Raises:
+        TensorsimError: no such file or another content.
+    """
+    path, folder = Path(annotations), Path(images)
+    try:
+        content = json.loads(path.read_text())
+        people = {c["id"] for c in content["categories"] if c["name"] == "person"}
+        persons: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in content["images"]}
+        crowded = set()
+        for annotation in content["annotations"]:
+            if annotation["category_id"] not in people:
+                continue
+            if annotation.get("iscrowd", 0):
+                crowded.add(annotation["image_id"])
+                continue
+            points = annotation.get("keypoints")
+            rows = None if points is None else np.reshape(points, (len(COCO_KEYPOINTS), 3)).tolist()
+            persons[annotation["image_id"]].append(annotation | {"keypoints": rows})
+        return [
+            Sample(
+                Path(image["file_name"]).stem,
+                *_labels(persons[image["id"]]),
+                image["id"] not in crowded,
+                folder / image["file_name"],
+            )
+            for image in content["images"]
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TensorsimError(f"{path}: not a COCO annotation file ({error})") from error
+
+
+def _read_tar(path: Path) -> list[Sample]:
+    pictures: dict[str, tarfile.TarInfo] = {}
+    labels: dict[str, Any] = {}
+    try:
+        with tarfile.open(path) as tar:
+            for member in tar:
+                name = Path(member.name)
+                if name.suffix == ".jpg":
+                    pictures[name.stem] = member
+                elif name.suffix == ".json":
+                    content = tar.extractfile(member)
+                    labels[name.stem] = json.load(content) if content is not None else None
+        samples = []
+        for key, member in sorted(pictures.items()):
+            label = labels.get(key, {"persons": [], "all_persons_labelled": True})
+            everyone = bool(label["all_persons_labelled"])
+            labelled = _labels(label["persons"])
+            samples.append(Sample(key, *labelled, everyone, path, member.offset_data, member.size))
+    except (OSError, tarfile.TarError, ValueError, KeyError, TypeError) as error:
+        raise TensorsimError(f"{path}: not a shard of jpg and json ({error})") from error
+    if not samples:
+        raise TensorsimError(f"{path}: got no pictures, expected a shard of KEY.jpg and KEY.json")
+    return samples
+
+
+def _labels(persons: list[dict[str, Any]]) -> tuple[Floats, Floats, Floats]:
+    """Boxes (n, 4) ``xyxy``, points (n, 19, 3) and areas (n,) of people as they are written down."""
+    boxes = np.array([person["bbox"] for person in persons], np.float32).reshape(-1, 4)
+    usual = AREA_OF_BOX * boxes[:, 2:].prod(1)
+    boxes[:, 2:] += boxes[:, :2]
+    keypoints = np.zeros((len(persons), len(POINTS), 3), np.float32)
+    for person, rows in zip(persons, keypoints, strict=True):
+        if person["keypoints"] is not None:
+            rows[: len(person["keypoints"])] = person["keypoints"]
+    annotated = [person.get("area", area) for person, area in zip(persons, usual, strict=True)]
+    return boxes, keypoints, np.array(annotated, np.float32)

@@ -1,0 +1,46 @@
+"""People cut out of rendered pictures: outlines, points, repeatable."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.training import cutouts as module
+from tensorsim.training.cutouts import Cutouts, render_cutout, render_cutouts
+
+
+@pytest.mark.parametrize("index", [0, 20, 45, 60])
+def test_points_lie_on_the_person(index: int) -> None:
+    rgba, keypoints = render_cutout(sample_poses(65, 0)[index], seed=index, side=96)
+    alpha = rgba[..., 3]
+    assert 60 <= max(alpha.shape) <= 100
+    # Cropped to the person, with one pixel around.
+    solid = alpha > 127
+    rows, columns = np.flatnonzero(solid.any(1)), np.flatnonzero(solid.any(0))
+    assert max(rows[0], columns[0]) <= 1
+    assert rows[-1] >= alpha.shape[0] - 2
+    assert ((alpha > 0) & (alpha < 255)).sum() > 20  # soft edges
+    seen = keypoints[keypoints[:, 2] == 2, :2].round().astype(int)
+    assert len(seen) >= 5
+    near = [solid[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].any() for x, y in seen]
+    assert all(near)
+    # Both ends of the body: the picture is not a part of it.
+    assert (keypoints[:, 2] > 0).all()
+
+
+def test_shards_are_repeatable_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PER_SHARD", 8)
+    small = render_cutout
+    monkeypatch.setattr(module, "render_cutout", lambda pose, seed: small(pose, seed, side=40))
+    paths = render_cutouts(13, 3, tmp_path, quiet=True)
+    assert [p.name for p in paths] == ["cutouts-000.tar", "cutouts-001.tar"]
+    people = Cutouts(paths)
+    assert len(people) == 13
+    data = [p.read_bytes() for p in paths]
+    paths[1].unlink()
+    render_cutouts(13, 3, tmp_path, quiet=True)
+    assert [p.read_bytes() for p in paths] == data
+    assert not list(tmp_path.glob("*.partial"))
+    other = render_cutouts(13, 4, tmp_path / "other", quiet=True)
+    assert other[0].read_bytes() != data[0]

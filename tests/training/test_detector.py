@@ -1,0 +1,286 @@
+"""The recipe of the detector: it learns, goes on where it stopped, and is measured as COCO measures."""
+
+import copy
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.commands.evaluate_detector import EvaluateDetector
+from tensorsim.errors import TensorsimError
+from tensorsim.training.detector import DetectorRecipe, TrainedRTMDet, read_sources
+from tensorsim.training.detector_data import Sources
+from tensorsim.training.detector_metrics import (
+    average_precision,
+    calibrate,
+    compare_tracks,
+    measure,
+    people_in,
+)
+from tensorsim.training.loop import LoopConfig, fit
+from tensorsim.types import Detections, Tracks
+from tensorsim.vision.rtmdet import RTMDet
+from tensorsim.vision.rtmdet_layers import RTMDET_SIZES, RTMDetSize
+from tensorsim.weights import save_weights
+
+from .test_detector_data import cutouts, encoded, shard, write_tar
+
+
+@pytest.fixture
+def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DetectorRecipe:
+    """Pictures of 64 pixels, a tiny network."""
+    tiny = RTMDetSize(0.167, 0.125, 1, exp_on_reg=True, depthwise=False, share_conv=True, input_size=64)
+    monkeypatch.setitem(RTMDET_SIZES, "test", tiny)
+    complete, empty = shard(tmp_path / "p.tar", True), shard(tmp_path / "e.tar", False)
+    sources = Sources(complete, empty, [shard(tmp_path / "s.tar", True, False)], cutouts(tmp_path / "c.tar"))
+    torch.manual_seed(0)
+    return DetectorRecipe(TrainedRTMDet("test"), sources, complete, warm_up=5)
+
+
+def test_four_pictures_are_learnt(recipe: DetectorRecipe) -> None:
+    samples = [recipe.sample(i) for i in range(4)]
+    batch = recipe.collate(samples)
+    assert int(batch["valid"].sum()) >= 4
+    net, optimiser = recipe.net, recipe.optimiser()
+    losses = []
+    for _ in range(60):
+        loss = recipe.loss(net, batch)["loss"]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_the_detector_sees_what_the_recipe_trains_on(recipe: DetectorRecipe) -> None:
+    """Normalisation and order of the channels in training are those of use."""
+    image = recipe.sample(0)["image"][None]
+    seen: list[Tensor] = []
+
+    class Listener(nn.Module):
+        def forward(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+            seen.append(x)
+            return recipe.detector.dense(x)
+
+    batch = {
+        "image": image.float(),
+        "boxes": torch.zeros(1, 0, 4),
+        "valid": torch.zeros(1, 0, dtype=torch.bool),
+        "known": torch.ones(1, 40, 40, dtype=torch.bool),
+    }
+    recipe.loss(Listener(), batch)
+    torch.testing.assert_close(seen[0], recipe.detector.preprocess(image))
+
+
+def test_a_batch_of_another_size_keeps_boxes_on_people(recipe: DetectorRecipe, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr("tensorsim.training.detector.SIDES", (32,))
+    sizes = set()
+    for first in range(8):
+        samples = [recipe.sample(2 * first), recipe.sample(2 * first + 1)]
+        batch = recipe.collate(samples)
+        side = batch["image"].shape[-1]
+        sizes.add(side)
+        for i, sample in enumerate(samples):
+            own = batch["boxes"][i][batch["valid"][i]]
+            torch.testing.assert_close(own, sample["boxes"] * side / 64)
+    assert sizes == {32, 64}
+
+
+def test_an_interrupted_run_goes_on_to_the_same_weights(recipe: DetectorRecipe, tmp_path: Path) -> None:
+    def config(name: str, steps: int) -> LoopConfig:
+        return LoopConfig(
+            tmp_path / name, steps, batch=4, workers=0, quiet=True, checkpoint_every=3, validate_every=6
+        )
+
+    fresh = copy.deepcopy(recipe.net.state_dict())
+    monotone = recipe.rate
+    recipe.rate = lambda step, steps: monotone(step, 6)  # type: ignore[method-assign]
+    fit(recipe, config("whole", 6))
+    recipe.net.load_state_dict(fresh)
+    fit(recipe, config("parts", 3))
+    recipe.net.load_state_dict(fresh)  # must come from the checkpoint
+    fit(recipe, config("parts", 6))
+    states = [torch.load(tmp_path / n / "last.pt", weights_only=True)["averaged"] for n in ("whole", "parts")]
+    for key, value in states[0].items():
+        torch.testing.assert_close(states[1][key], value, rtol=0, atol=0, msg=key)
+
+
+def test_weights_of_the_small_network_load_by_path(tmp_path: Path) -> None:
+    net = TrainedRTMDet("small-person").eval()
+    path = tmp_path / "small.safetensors"
+    save_weights(net, path, {"model": "RTMDet"})
+    assert path.stat().st_size <= 5e6
+    loaded = RTMDet.from_pretrained(path)
+    assert loaded.variant == "small-person"
+    assert loaded.input_size == 320
+    x = torch.randn(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        torch.testing.assert_close(loaded.dense(x)[0], net.dense(x)[0], rtol=0.02, atol=0.02)
+
+
+def test_learning_rate_rises_stays_and_falls(recipe: DetectorRecipe) -> None:
+    rates = [recipe.rate(step, 100) for step in range(100)]
+    assert rates[0] == pytest.approx(0.2)
+    assert rates[4] == rates[50] == 1
+    assert all(a >= b for a, b in itertools.pairwise(rates[4:]))
+    assert rates[-1] == pytest.approx(0.05, abs=0.01)
+
+
+def test_norms_and_biases_do_not_decay(recipe: DetectorRecipe) -> None:
+    decaying, light = (group["params"] for group in recipe.optimiser().param_groups)
+    assert len(decaying) + len(light) == len(list(recipe.net.parameters()))
+    norms = [p for m in recipe.net.modules() if isinstance(m, nn.BatchNorm2d) for p in m.parameters()]
+    assert {id(p) for p in norms} <= {id(p) for p in light}
+
+
+# ---- measures --------------------------------------------------------------------------------------------
+
+
+def test_average_precision_by_hand() -> None:
+    truth = [torch.tensor([[0.0, 0, 100, 100], [200, 200, 300, 300]])]
+    right, wrong = [0.0, 0, 100, 100], [400.0, 0, 500, 100]
+    ap, ap50 = average_precision(
+        truth, [torch.tensor([[*right, 0.9], [*wrong, 0.8], [200, 200, 300, 300, 0.7]])]
+    )
+    # Recall up to a half at precision 1, above at 2/3, on 101 points.
+    assert ap50 == pytest.approx((51 + 50 * 2 / 3) / 101, abs=1e-6)
+    assert ap == pytest.approx(ap50)
+    ap, ap50 = average_precision(truth, [torch.tensor([[0.0, 0, 100, 72, 0.9]])])  # overlaps by 0.72
+    assert ap50 == pytest.approx(51 / 101)
+    assert ap == pytest.approx(5 / 10 * 51 / 101)
+
+
+def test_figures_of_a_detector_that_is_told_the_answer(tmp_path: Path) -> None:
+    samples = shard(tmp_path / "p.tar", True) + shard(tmp_path / "e.tar", False)
+
+    class Told(nn.Module):
+        mean = torch.zeros(1)
+
+        def forward(self, images: Tensor) -> Detections:
+            boxes = torch.tensor([[[40.0, 20, 70, 80], [0, 0, 10, 10], [100, 0, 120, 30]]])
+            scores = torch.tensor([[0.9, 0.6, 0.4]])
+            return Detections(boxes, scores, torch.zeros(1, 3, dtype=torch.int64), scores > 0)
+
+    figures = measure(Told(), samples)  # type: ignore[arg-type]
+    assert figures["recall"] == figures["recall_large"] == 1
+    assert figures["false_per_picture"] == 1.5  # one, and two where nobody is; 0.4 does not count
+    assert figures["people"] == 1
+    with pytest.raises(TensorsimError, match="without people"):
+        measure(Told(), samples[1:])  # type: ignore[arg-type]
+
+
+def test_calibrated_scores_mean_the_same_number_of_mistakes(tmp_path: Path, recipe: DetectorRecipe) -> None:
+    torch.manual_seed(1)
+    detector = RTMDet("test", score_threshold=0.0).eval()
+    samples = shard(tmp_path / "n.tar", False) * 5
+    samples += shard(tmp_path / "o.tar", True) * 5
+    before = [people_in(detector, sample) for sample in samples]
+    assert max(float(scores.max()) for _, scores in before) < 0.5
+    shift = calibrate(detector, samples, false_per_picture=0.5)
+    assert shift > 0
+    after = [people_in(detector, sample) for sample in samples]
+    for (boxes, scores), (shifted_boxes, shifted_scores) in zip(before, after, strict=True):
+        torch.testing.assert_close(shifted_boxes, boxes)
+        torch.testing.assert_close(shifted_scores.logit(), scores.logit() + shift, rtol=0, atol=1e-3)
+    assert measure(detector, samples)["false_per_picture"] <= 0.5
+    # The next one would be one too many.
+    highest = torch.cat([scores for _, scores in after]).sort(descending=True).values
+    assert float(highest[5]) == pytest.approx(0.5, abs=1e-4)
+
+
+def test_shared_person_frames() -> None:
+    def tracks(boxes: list[list[list[float]]]) -> Tracks:
+        table = torch.tensor(boxes)[None]
+        valid = table.flatten(3).any(dim=-1)
+        return Tracks(table, valid, valid)
+
+    a, b, none = [0.0, 0, 10, 10], [50.0, 50, 60, 60], [0.0] * 4
+    reference = tracks([[a, a, a, a], [b, b, b, none]])
+    found = tracks(
+        [[a, a, none, none], [none, [51.0, 50, 61, 60], b, b], [none, [200.0, 0, 210, 10], none, none]]
+    )
+    followed = compare_tracks(found, reference)
+    assert followed == (6, 7, 4)
+    empty = Tracks(torch.zeros(1, 0, 4, 4), *(torch.zeros(1, 0, 4, dtype=torch.bool),) * 2)
+    assert compare_tracks(empty, reference) == (0, 7, 0)
+    assert compare_tracks(found, empty) == (6, 0, 0)
+
+
+def test_pictures_are_deterministic(recipe: DetectorRecipe) -> None:
+    first, again = recipe.sample(7), recipe.sample(7)
+    np.testing.assert_array_equal(first["image"], again["image"])
+    assert not torch.equal(recipe.sample(8)["image"], first["image"])
+
+
+# ---- sources and commands --------------------------------------------------------------------------------
+
+
+def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
+    picture = np.full((100, 100, 3), 90, np.uint8)
+
+    def person(points: dict[int, tuple[float, float]]) -> dict[str, object]:
+        rows = [[*points.get(i, (0, 0)), 2 if i in points else 0] for i in range(19)]
+        return {"bbox": [20, 30, 40, 50], "keypoints": rows}
+
+    def write(name: str, keys: list[str], persons: list[dict[str, object]], everyone: bool) -> None:
+        files = {}
+        for key in keys:
+            files[f"{key}.jpg"] = encoded(picture, ".jpg")
+            label = {"all_persons_labelled": everyone, "persons": persons}
+            files[f"{key}.json"] = json.dumps(label).encode()
+        write_tar(tmp_path / f"{name}-00.tar", files)
+
+    shoulders, hips = {5: (50.0, 30.0), 6: (40.0, 30.0)}, {11: (50.0, 60.0), 12: (40.0, 60.0)}
+    lying = {5: (20.0, 30.0), 6: (20.0, 40.0), 11: (60.0, 30.0), 12: (60.0, 40.0)}
+    write("coco_small", [f"c{i}" for i in range(40)], [person({})], True)
+    write("lspet", ["standing"], [person(shoulders | hips)], False)
+    write_tar(tmp_path / "lspet-01.tar", {
+        "lying.jpg": encoded(picture, ".jpg"),
+        "lying.json": json.dumps({"all_persons_labelled": False, "persons": [person(lying)]}).encode(),
+    })  # fmt: skip
+    write("pedestrian", ["street"], [person({})], False)
+    write_tar(tmp_path / "backgrounds-00.tar", {"room.jpg": encoded(picture, ".jpg")})
+
+    sources, held_out = read_sources(tmp_path, cutouts(tmp_path / "people.tar"))
+    keys = {sample.key for sample in sources.complete}
+    assert keys | {sample.key for sample in held_out} == {f"c{i}" for i in range(40)}
+    assert not keys & {sample.key for sample in held_out}
+    assert 0 < len(held_out) < 20
+    everybody, standing, street = sources.partial
+    assert {s.key for s in everybody} == {"standing", "lying"}
+    assert [s.key for s in standing] == ["standing"]
+    assert [s.key for s in sources.empty] == ["room"]
+    np.testing.assert_allclose(street[0].boxes, [[20, 30 - 0.18 * 50, 60, 80]], rtol=1e-6)
+
+
+def test_evaluation_asks_for_something_to_look_at(tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="expected --data, --coco or --films"):
+        EvaluateDetector(weights=tmp_path / "x.safetensors").run()
+    with pytest.raises(TensorsimError, match="--films: got no --against"):
+        EvaluateDetector(weights=tmp_path / "x.safetensors", films=(tmp_path / "a.mp4",)).run()
+    with pytest.raises(TensorsimError, match="got 0 json files"):
+        EvaluateDetector(weights=tmp_path / "x.safetensors", coco=tmp_path).run()
+
+
+def test_evaluation_prints_a_line_per_detector(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], recipe: DetectorRecipe
+) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(encoded(recipe.held_out[0].image(), ".jpg"))
+    labels = {
+        "images": [{"id": 1, "file_name": "a.jpg"}],
+        "categories": [{"id": 1, "name": "person"}],
+        "annotations": [{"image_id": 1, "category_id": 1, "bbox": [40, 20, 30, 60]}],
+    }
+    (tmp_path / "labels.json").write_text(json.dumps(labels))
+    path = tmp_path / "w.safetensors"
+    save_weights(TrainedRTMDet("small-person"), path, {})
+    EvaluateDetector(weights=path, coco=tmp_path).run()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1
+    assert "ap50" in lines[0]
+    assert "people 1" in lines[0]

@@ -1,0 +1,167 @@
+"""Pictures to train a detector on: boxes stay on the people, and what is not known is marked."""
+
+import io
+import json
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tensorsim.errors import TensorsimError
+from tensorsim.training.cutouts import Cutouts
+from tensorsim.training.detector_data import KNOWN_CELLS, Canvas, Labelled, PictureMaker, Sources
+from tensorsim.training.shards import Sample, Shards
+
+RED, GREEN = (230, 20, 20), (20, 200, 20)
+
+
+def red_box(image: np.ndarray) -> np.ndarray:
+    """Box around everything red, corners."""
+    red = (image[..., 0].astype(int) - image[..., 1:].max(-1)) > 90
+    rows, columns = np.flatnonzero(red.any(1)), np.flatnonzero(red.any(0))
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
+
+
+def encoded(image: np.ndarray, suffix: str) -> bytes:
+    order = [2, 1, 0, 3][: image.shape[-1]]
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if suffix == ".jpg" else []
+    return cv2.imencode(suffix, np.ascontiguousarray(image[..., order]), quality)[1].tobytes()
+
+
+def write_tar(path: Path, files: dict[str, bytes]) -> Path:
+    with tarfile.open(path, "w") as tar:
+        for name, data in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+    return path
+
+
+def shard(path: Path, people: bool, everyone: bool = True) -> list[Sample]:
+    """One picture 120 x 160, with a red person of 30 x 60 at (40, 20) or with nobody."""
+    image = np.full((120, 160, 3), 90, np.uint8)
+    persons = []
+    if people:
+        image[20:80, 40:70] = RED
+        persons = [{"bbox": [40, 20, 30, 60], "keypoints": None}]
+    label = {"all_persons_labelled": everyone, "persons": persons}
+    files = {"a.jpg": encoded(image, ".jpg"), "a.json": json.dumps(label).encode()}
+    return list(Shards([write_tar(path, files)]))
+
+
+def cutouts(path: Path) -> Cutouts:
+    """A green ellipse with soft edges."""
+    rgba = np.zeros((90, 40, 4), np.uint8)
+    rgba[..., :3] = GREEN
+    alpha = cv2.ellipse(np.zeros((90, 40), np.uint8), (20, 45), (17, 42), 0, 0, 360, 255, -1)
+    rgba[..., 3] = cv2.blur(alpha, (3, 3))
+    label = json.dumps({"keypoints": [[20.0, 45.0, 2]] * 17}).encode()
+    return Cutouts([write_tar(path, {"0.png": encoded(rgba, ".png"), "0.json": label})])
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> Sources:
+    complete, empty = shard(tmp_path / "p.tar", True), shard(tmp_path / "e.tar", False)
+    partial = shard(tmp_path / "s.tar", True, everyone=False)
+    return Sources(complete, empty, [partial], cutouts(tmp_path / "c.tar"))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_placed_boxes_hold_the_person(sources: Sources, seed: int) -> None:
+    canvas = Canvas(128)
+    canvas.place(sources.complete[0], (0, 0, 128, 128), np.random.default_rng(seed))
+    boxes = canvas.final_boxes()
+    assert len(boxes) == 1
+    # A pixel on either side is what interpolation and jpeg smear.
+    np.testing.assert_allclose(boxes[0], red_box(canvas.image), atol=1.6)
+    assert canvas.known.all()
+
+
+def test_placing_flips_and_scales(sources: Sources) -> None:
+    """The twelve seeds of the test above are not all the same case."""
+    shapes = []
+    for seed in range(12):
+        canvas = Canvas(128)
+        canvas.place(sources.complete[0], (0, 0, 128, 128), np.random.default_rng(seed))
+        shapes.append(canvas.final_boxes()[0])
+    heights = np.array(shapes)[:, 3] - np.array(shapes)[:, 1]
+    assert heights.max() > 1.5 * heights.min()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_pictures_stay_in_their_rectangle(sources: Sources, seed: int) -> None:
+    canvas, rng = Canvas(128), np.random.default_rng(seed)
+    canvas.place(sources.complete[0], (50, 30, 128, 128), rng)
+    canvas.paste(sources.cutouts[0].rgba, (50, 30, 128, 128), rng)
+    assert (canvas.image[:30] == 114).all()
+    assert (canvas.image[:, :50] == 114).all()
+    boxes = canvas.final_boxes()
+    assert (boxes[:, :2] >= [50, 30]).all()
+    assert (boxes[:, 2:] <= 128).all()
+
+
+def test_beyond_partial_labels_nothing_is_known(sources: Sources) -> None:
+    canvas = Canvas(160)
+    canvas.place(sources.partial[0][0], (0, 0, 160, 160), np.random.default_rng(3))
+    box = canvas.final_boxes()[0]
+    cell = 160 / KNOWN_CELLS
+    left, top, right, bottom = (box / cell).round().astype(int)
+    assert canvas.known[top:bottom, left:right].all()
+    assert not canvas.known.all()
+    share = canvas.known.sum() * cell**2 / ((box[2] - box[0]) * (box[3] - box[1]))
+    assert share < 2.2  # 1.3 x 1.3, and whole cells
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_boxes_of_cut_outs_are_of_what_is_seen(sources: Sources, seed: int) -> None:
+    canvas, rng = Canvas(160), np.random.default_rng(seed)
+    for _ in range(3):
+        canvas.paste(sources.cutouts[0].rgba, (0, 0, 160, 160), rng)
+    green = (canvas.image[..., 1].astype(int) - canvas.image[..., 0]) > 90
+    boxes = canvas.final_boxes()
+    covered = np.zeros((160, 160), bool)
+    for x0, y0, x1, y1 in boxes.astype(int):
+        assert green[y0:y1, x0:x1].any()
+        covered[y0:y1, x0:x1] = True
+    cell = int(160 / KNOWN_CELLS)
+    doubtful = ~np.kron(canvas.known, np.ones((cell, cell), bool))
+    assert (covered | doubtful)[green].mean() > 0.97
+
+
+def test_a_picture_depends_on_its_random_numbers_alone(sources: Sources) -> None:
+    maker = PictureMaker(sources, size=128)
+
+    def make(seed: int) -> Labelled:
+        return maker(np.random.default_rng(seed))
+
+    first = [make(seed) for seed in range(6)]
+    again = [make(seed) for seed in reversed(range(6))][::-1]
+    for a, b in zip(first, again, strict=True):
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x, y)
+    assert len({p.image.tobytes() for p in first}) == 6
+    for picture in first:
+        assert picture.image.shape == (128, 128, 3)
+        assert picture.image.dtype == np.uint8
+        assert picture.boxes.shape[1:] == (4,)
+        assert picture.boxes.dtype == np.float32
+
+
+def test_cutout_shards_are_read_back(tmp_path: Path) -> None:
+    found = cutouts(tmp_path / "c.tar")
+    assert len(found) == 1
+    rgba, keypoints = found[0]
+    assert tuple(rgba[45, 20]) == (*GREEN, 255)
+    assert rgba[0, 0, 3] == 0
+    np.testing.assert_array_equal(keypoints, [[20, 45, 2]] * 17)
+
+
+def test_what_is_no_shard_of_cutouts_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.tar"
+    path.write_bytes(b"no tar")
+    with pytest.raises(TensorsimError, match="not a shard of cut-outs"):
+        Cutouts([path])
+    with pytest.raises(TensorsimError, match="not a shard of cut-outs"):
+        Cutouts([write_tar(path, {"a.png": b"", "a.json": b"{}"})])

@@ -1,0 +1,109 @@
+"""``tensorsim evaluate classifier`` and ``evaluate denoiser`` on networks that have learned nothing."""
+
+import csv
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from tensorsim.commands.evaluate_classifier import EvaluateClassifier
+from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
+from tensorsim.enhance.dncnn import DnCNN
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.recognition.spgnet import SPGNet
+from tensorsim.training.denoiser_scores import COLUMNS
+from tensorsim.training.film_maps import classify_poses, labelled_poses
+from tensorsim.training.maps import MapSettings
+from tensorsim.weights import save_weights
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A network that calls everything S9."""
+    network = SPGNet(12)
+    network.fc2.weight.data.zero_()
+    network.fc1.weight.data.fill_(1.0)
+    network.fc2.weight.data[8] = 1.0
+    network.norm.bias.data.fill_(1.0)
+    path = tmp_path / "w.safetensors"
+    save_weights(network, path, {"network": "SPGNet", "size": "32"})
+    return path
+
+
+def test_classifier_on_maps(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    settings = MapSettings(seed=1)
+    (maps / "settings.json").write_text(json.dumps(asdict(settings)))
+    shape = (12, settings.size, settings.size)
+    for person in range(2):
+        signal = torch.randint(0, 255, shape, generator=torch.Generator().manual_seed(person))
+        save_file(
+            {
+                "signal": signal.to(torch.uint8),
+                "cross": torch.zeros(shape, dtype=torch.int8),
+                "noise": torch.full(shape[1:], 255, dtype=torch.uint8),
+                "gain_db": torch.zeros(12),
+            },
+            maps / f"through-wall-{person:05d}.safetensors",
+        )
+    EvaluateClassifier(
+        weights, maps, ("through-wall",), people=2, snr=(50.0, 10.0), out=tmp_path / "out", quiet=True
+    ).run()
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[1].split() == ["through-wall", "8.3", "%", "8.3", "%", "24"]
+    for ratio in (50, 10):
+        with (tmp_path / "out" / f"confusion_through-wall_{ratio}dB.csv").open() as file:
+            rows = list(csv.reader(file))
+        assert rows[0][1:] == [f"S{k}" for k in range(1, 13)]
+        assert all([int(n) for n in row[1:]] == [0] * 8 + [2] + [0] * 3 for row in rows[1:])
+        assert (tmp_path / "out" / f"confusion_through-wall_{ratio}dB.png").stat().st_size > 1000
+
+
+def write_pose(folder: Path, activity: int) -> None:
+    motion = ActivityGenerator().generate(activity, duration_s=1.5, rate_hz=30.0)
+    folder.mkdir(parents=True)
+    np.savez(folder / "pose.npz", joints_m=motion.joints.numpy(), valid=motion.valid.numpy(), fps=30.0)
+
+
+def test_classifier_on_films(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    films = tmp_path / "films"
+    write_pose(films / "S8 Walking", 7)
+    write_pose(films / "more" / "S9-second", 8)
+    poses = labelled_poses(films)
+    assert sorted(pose.activity for pose in poses) == [7, 8]
+    assert poses[0].joints.shape == (1, 45, 14, 3)
+    right = classify_poses(weights, poses, "through-wall", 50.0, quiet=True)
+    assert right == [pose.activity == 8 for pose in poses]
+    EvaluateClassifier(weights, scenes=("through-wall",), poses=films, quiet=True).run()
+    assert "50.0 % of 2" in capsys.readouterr().out
+
+
+def test_refuses_films_without_a_class(weights: Path, tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match=r"got no pose\.npz"):
+        labelled_poses(tmp_path)
+    write_pose(tmp_path / "S13 Flying", 7)
+    with pytest.raises(TensorsimError, match="does not begin with S1 to S12"):
+        labelled_poses(tmp_path)
+    with pytest.raises(TensorsimError, match="got nothing to classify"):
+        EvaluateClassifier(weights).run()
+
+
+def test_denoiser(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "own.safetensors"
+    save_weights(DnCNN(depth=2, channels=4), path, {})
+    EvaluateDenoiser(
+        path, clips=1, scenes=("through-wall",), ksvd=False, out=tmp_path / "table.csv", quiet=True
+    ).run()
+    with (tmp_path / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["denoiser"] for row in rows} == {"none", "own", "Perona-Malik"}
+    assert {row["map"] for row in rows} == {"doppler_time", "range_time_mti"}
+    assert len(rows) == 6
+    assert all(row[COLUMNS[0]] for row in rows)
+    assert len(capsys.readouterr().out.splitlines()) == 7

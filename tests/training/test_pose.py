@@ -1,0 +1,198 @@
+"""The pose recipe: targets, losses, masks, metrics, a tiny network that learns, and a run that goes on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.training.cutouts import Cutouts
+from tensorsim.training.loop import LoopConfig, fit
+from tensorsim.training.pose import PoseRecipe, gaussian_maps, heatmap_loss, person_loss
+from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
+from tensorsim.training.pose_metrics import SIGMAS, evaluate_pose, oks, pck
+from tensorsim.training.shards import Sample
+from tensorsim.vision.heatmaps import HeatmapDecoder
+from tensorsim.vision.hrnet import HRNet, HRNetConfig
+from tensorsim.vision.topdown import MIRRORED
+from tests.training.test_pose_data import BOX, sample, standing, write_cutouts
+from tests.training.test_shards import jpg
+
+TINY = HRNetConfig(4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4)
+
+
+def test_targets_are_gaussians_that_the_decoder_takes_back() -> None:
+    points = torch.tensor([[10.3, 20.6], [14.0, 8.25]])
+    maps = gaussian_maps(points, (32, 24), 1.5)
+    v, u = np.mgrid[:32, :24]
+    for (x, y), found in zip(points.tolist(), maps.numpy(), strict=True):
+        expected = np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 1.5**2))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    decoded, _ = HeatmapDecoder("dark")(maps)
+    torch.testing.assert_close(decoded, 4 * points, atol=0.1, rtol=0)
+
+
+def test_loss_is_the_formula_and_zero_at_the_target_alone() -> None:
+    targets = gaussian_maps(torch.tensor([[5.0, 6.0]]), (16, 12), 1.5).double()
+    maps = (targets + 0.3 * torch.randn(1, 16, 12, dtype=torch.float64)).requires_grad_()
+    t, m = targets[0].numpy(), maps[0].detach().numpy()
+    p, q = (np.exp(10 * x) / np.exp(10 * x).sum() for x in (t, m))
+    squares = ((1 + 20 * t) * (m - t) ** 2).sum() / (t**2).sum() / 21
+    expected = squares + 0.1 * (p * np.log(p / q)).sum()
+    found = heatmap_loss(maps, targets)
+    assert found.shape == (1,)
+    np.testing.assert_allclose(found[0].item(), expected, rtol=1e-9)
+    assert torch.autograd.gradcheck(lambda x: heatmap_loss(x, targets), maps)
+    assert heatmap_loss(targets, targets).abs().max() < 1e-12
+
+
+def random_people(count: int = 3) -> tuple[Tensor, Tensor]:
+    points = 4 + torch.rand(count, 17, 2) * torch.tensor([40.0, 56.0])
+    return points, torch.rand(count, 17) < 0.7
+
+
+def test_unknown_keypoints_cost_nothing() -> None:
+    points, known = random_people()
+    maps = torch.rand(3, 17, 16, 12, requires_grad=True)
+    person_loss(maps, points, known, torch.tensor([True, False, True]), 1.5).sum().backward()
+    assert maps.grad is not None
+    told = maps.grad.abs().amax((-2, -1)) > 0
+    # A person whose sides are not sure is compared with straight labels as long as the net knows no better.
+    torch.testing.assert_close(told, known)
+    nobody = person_loss(maps, points, torch.zeros_like(known), torch.ones(3, dtype=torch.bool), 1.5)
+    assert (nobody == 0).all()
+
+
+def test_exchanged_sides_are_forgiven_only_where_they_may_be() -> None:
+    points, known = random_people()
+    truth = gaussian_maps(points / 4, (16, 12), 1.5)
+    wrong_points, wrong_known = points[:, list(MIRRORED)], known[:, list(MIRRORED)]
+    forgiven = person_loss(truth, wrong_points, wrong_known, torch.zeros(3, dtype=torch.bool), 1.5)
+    blamed = person_loss(truth, wrong_points, wrong_known, torch.ones(3, dtype=torch.bool), 1.5)
+    assert forgiven.abs().max() < 1e-5
+    assert blamed.min() > 0.1
+
+
+def test_oks_and_pck_by_hand() -> None:
+    points = torch.zeros(1, 17, 2, dtype=torch.float64)
+    area = torch.tensor([100.0], dtype=torch.float64)
+    known = torch.zeros(1, 17, dtype=torch.bool)
+    known[0, [0, 11]] = True
+    found = points.clone()
+    # exp(-d^2 / (2 area (2 sigma)^2)) = 1/2 for the nose; the hip is right; the others do not count.
+    found[0, 0, 0] = (2 * 100 * (2 * SIGMAS[0]) ** 2 * np.log(2)) ** 0.5
+    found[0, 5] = 1e3
+    np.testing.assert_allclose(oks(found, points, known, area), [0.75])
+    assert oks(found, points, torch.zeros_like(known), area).isnan().all()
+    found[0, 0] = torch.tensor([3.0, 4.0])
+    for side, share in ((51.0, 1.0), (49.0, 0.5)):
+        assert pck(found, points, known, torch.tensor([side], dtype=torch.float64)) == share
+
+
+class Brightness(nn.Module):
+    """Sees every keypoint where the crop is bright."""
+
+    def forward(self, crops: Tensor) -> Tensor:
+        return nn.functional.avg_pool2d(crops.mean(1, keepdim=True), 4).expand(-1, 17, -1, -1)
+
+
+def picture_of(place: tuple[int, int], path: Path) -> Person:
+    import cv2
+
+    image = np.zeros((120, 100, 3), np.uint8)
+    cv2.circle(image, place, 3, (255, 255, 255), -1)
+    cv2.imwrite(str(path), image)
+    keypoints = np.zeros((19, 3), np.float32)
+    keypoints[:17] = *place, 2
+    box = np.array([10, 10, 90, 110], np.float32)
+    whole = Sample("a", box[None], keypoints[None], np.array([4000.0], np.float32), True, path)
+    return Person(whole, box, keypoints, 4000.0)
+
+
+def test_evaluation_goes_through_the_pipeline(tmp_path: Path) -> None:
+    person = picture_of((60, 40), tmp_path / "a.png")
+    right = evaluate_pose(Brightness(), [person])
+    assert right["pck"] == right["pck_body"] == 1
+    assert right["oks"] > 0.85
+    elsewhere = person.keypoints + np.array([0, 30, 0], np.float32)
+    wrong = evaluate_pose(Brightness(), [person, person._replace(keypoints=elsewhere)])
+    assert wrong["pck"] == 0.5
+    assert wrong["oks"] == pytest.approx(right["oks"] / 2, abs=0.02)
+    with pytest.raises(TensorsimError, match="no people"):
+        evaluate_pose(Brightness(), [])
+
+
+def recipe(folder: Path, **options: object) -> PoseRecipe:
+    (folder / "a.jpg").write_bytes(jpg(1, 280, 200))
+    (folder / "place.jpg").write_bytes(jpg(3, 80, 60))
+    persons = [Person(sample(folder / "a.jpg"), BOX, standing(), 9000.0)]
+    rendered = RenderedPeople(
+        Cutouts([write_cutouts(folder / "cutouts-000.tar")]), [sample(folder / "place.jpg")]
+    )
+    torch.manual_seed(0)
+    net = HRNet(TINY, (64, 64))
+    return PoseRecipe(net, persons, persons, {"held_out": persons}, rendered, first_size=(32, 32), **options)  # type: ignore[arg-type]
+
+
+def test_samples_depend_on_seed_and_number_only(tmp_path: Path) -> None:
+    one, two = recipe(tmp_path, first_samples=6), recipe(tmp_path, first_samples=6, seed=1)
+    samples = [one.sample(n) for n in range(40)]
+    for n in (7, 3):
+        for name, value in one.sample(n).items():
+            np.testing.assert_array_equal(value, samples[n][name])
+    assert not np.array_equal(two.sample(3)["points"], samples[3]["points"])
+    assert [s["crops"].shape for s in samples[4:8]] == [(3, 32, 32)] * 2 + [(3, 64, 64)] * 2
+    assert {s["sided"] for s in samples} == {True, False}
+
+
+def test_sources_left_out(tmp_path: Path) -> None:
+    full = recipe(tmp_path)
+    only = PoseRecipe(full.net, full.sided, [], {}, None)  # type: ignore[arg-type]
+    assert all(only.sample(n)["sided"] for n in range(10))
+    with pytest.raises(TensorsimError, match="nobody"):
+        PoseRecipe(full.net, [], [], {}, None)  # type: ignore[arg-type]
+
+
+def test_loss_of_a_batch_reaches_the_network(tmp_path: Path) -> None:
+    some = recipe(tmp_path)
+    batch = some.collate([some.sample(n) for n in range(4)])
+    some.loss(some.net, batch)["loss"].backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in some.net.parameters())
+
+
+def test_eight_crops_are_learnt(tmp_path: Path) -> None:
+    some = recipe(tmp_path)
+    batch = some.collate([some.sample(n) for n in range(8)])
+    # Random pictures tell the crops apart; the tiny net only has to memorise.
+    crops = nn.functional.interpolate(torch.rand(8, 3, 8, 8), size=(64, 64), mode="bilinear")
+    net = HRNet(HRNetConfig(8, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=8), (64, 64))
+    optimiser = torch.optim.Adam(net.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(80):
+        loss = person_loss(net(crops), batch["points"], batch["known"], batch["sided"], 1.5).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_a_run_goes_on_to_the_same_result_and_loads(tmp_path: Path) -> None:
+    def train(out: Path, steps: int) -> dict[str, Tensor]:
+        some = recipe(tmp_path, first_samples=4, augmentation=Augmentation())
+        some.rate = lambda step, steps: 0.1  # type: ignore[method-assign]
+        config = LoopConfig(
+            out, steps, 2, workers=0, checkpoint_every=2, validate_every=2, precision="float32", quiet=True
+        )
+        fit(some, config)
+        return torch.load(out / "last.pt", weights_only=True)["net"]
+
+    whole = train(tmp_path / "whole", 4)
+    train(tmp_path / "parts", 2)
+    for name, value in train(tmp_path / "parts", 4).items():
+        assert torch.equal(value, whole[name]), name
+    loaded = HRNet.from_pretrained(tmp_path / "whole" / "best.safetensors")
+    assert loaded.config == TINY
+    assert loaded.input_size == (64, 64)

@@ -1,0 +1,63 @@
+"""The commands that train and judge the pose network, on made-up shards."""
+
+from pathlib import Path
+
+import pytest
+
+from tensorsim.commands.evaluate_pose import EvaluatePose
+from tensorsim.commands.train_pose import TrainPose
+from tensorsim.errors import TensorsimError
+from tensorsim.training.pose import HELD_OUT_PERCENT
+from tensorsim.training.pose_data import split
+from tensorsim.training.shards import Shards
+from tests.training.test_pose_data import BOX, standing, write_cutouts
+from tests.training.test_shards import jpg, label, write_shard
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    left, top, right, bottom = BOX.tolist()
+    person = {"bbox": [left, top, right - left, bottom - top], "keypoints": standing().tolist()}
+    pictures = {f"im{n}.jpg": jpg(n, 280, 200) for n in range(40)}
+    labels = {f"im{n}.json": label([person]) for n in range(40)}
+    for name in ("coco_small-00", "lspet-00"):
+        write_shard(tmp_path / f"{name}.tar", pictures | labels)
+    write_shard(tmp_path / "backgrounds-00.tar", {"place.jpg": jpg(0, 80, 60)})
+    write_cutouts(tmp_path / "cutouts-000.tar")
+    return tmp_path
+
+
+def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = data / "out"
+    options = {"cutouts": data, "rendered": 13, "size": (64, 64), "first_size": (32, 32), "width": 4}
+    TrainPose(data, out, steps=2, first_steps=1, batch=2, workers=0, quiet=True, **options).run()  # type: ignore[arg-type]
+    weights = out / "best.safetensors"
+    assert str(weights) in capsys.readouterr().out
+
+    EvaluatePose(weights, data=data).run()
+    rows = capsys.readouterr().out.splitlines()
+    held_out = {
+        name: len(split(Shards([data / f"{name}-00.tar"]), percent)[1])
+        for name, percent in HELD_OUT_PERCENT.items()
+    }
+    assert min(held_out.values()) > 0
+    assert len(rows) == 5
+    for name, count in held_out.items():
+        (row,) = (row for row in rows if row.startswith(f"{name}, held out   "))
+        assert int(row.split()[-4]) == count
+        assert all(0 <= float(figure) <= 1 for figure in row.split()[-3:])
+    # Training goes on from those weights.
+    more = TrainPose(
+        data, data / "more", steps=1, first_steps=0, batch=2, workers=0, quiet=True, init=weights, **options
+    )  # type: ignore[arg-type]
+    more.run()
+    assert (data / "more" / "best.safetensors").is_file()
+
+
+def test_missing_data_is_told(tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="no coco_small"):
+        TrainPose(tmp_path, tmp_path / "out").run()
+    with pytest.raises(TensorsimError, match="--data or --coco"):
+        EvaluatePose(tmp_path / "x.safetensors").run()
+    with pytest.raises(TensorsimError, match="expected one"):
+        EvaluatePose(tmp_path / "x.safetensors", coco=tmp_path).run()
