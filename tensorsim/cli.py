@@ -24,7 +24,8 @@ from tensorsim.errors import TensorsimError
 
 EXAMPLES = """
 examples:
-  tensorsim simulate clip.mp4 --out out/ --detector rtmdet_nano_person.onnx --pose simplepose_coco17_256x192.onnx
+  tensorsim simulate clip.mp4 --out out/
+  tensorsim simulate clip.mp4 --out out/ --detector rtmdet-m-person --pose hrnet-w32-coco
   tensorsim simulate clip.mp4 --out out/ --scene through-wall --person-height 1.75
   tensorsim simulate clip.mp4 --out out/ --start 2 --end 6 --initial-distance 4.0 --seed 7
   tensorsim simulate clip.mp4 --out out/ --radar ti-iwr6843
@@ -34,7 +35,7 @@ examples:
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
   tensorsim check
 
-Networks can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE to their paths.
+Networks come with tensorsim; others can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE.
 """
 
 #: Commands by name; a command that has commands of its own is a table of them after its description.

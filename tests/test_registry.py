@@ -106,7 +106,9 @@ def test_another_content_is_refused_and_removed(entry: ModelEntry) -> None:
 def test_offline_says_what_to_do(entry: ModelEntry) -> None:
     # Port 9 of this machine answers nobody.
     offline = dataclasses.replace(entry, url="http://127.0.0.1:9/test-net.pth")
-    with pytest.raises(TensorsimError, match=r"could not fetch http://127.0.0.1:9.*save it as .*test-net.pth"):
+    with pytest.raises(
+        TensorsimError, match=r"could not fetch http://127.0.0.1:9.*save it as .*test-net.pth"
+    ):
         registry.fetch(offline, quiet=True)
 
 
