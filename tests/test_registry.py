@@ -10,12 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
+import tensorsim
 from tensorsim import cli, registry
 from tensorsim.enhance import DnCNN
 from tensorsim.errors import TensorsimError
 from tensorsim.registry import PUBLISHED, ModelEntry
 from tensorsim.vision import HRNet, RTMDet
 from tensorsim.weights import save_weights
+from tests.stage import assert_same
 
 CONTENT = bytes(range(256)) * 16384
 
@@ -148,6 +150,37 @@ def test_shipped_entries_are_in_order(entry: ModelEntry) -> None:
     assert registry.verify(entry) == entry.sha256
     assert entry.licence
     assert entry.path.with_suffix(".md").is_file(), "a weight has a card"
+
+
+#: What each network of a shipped file is shown.
+SHOWN = {
+    "RTMDet": (1, 3, 96, 128),
+    "HRNet": (1, 3, 64, 64),
+    "DnCNN": (2, 24, 40),
+    "SPNet": (2, 1, 64, 64),
+    "SPGNet": (2, 1, 32, 32),
+}
+
+
+@pytest.mark.parametrize("entry", registry.shipped(), ids=lambda entry: entry.name)
+def test_shipped_networks_load_run_and_script(entry: ModelEntry) -> None:
+    rooms = (tensorsim.vision, tensorsim.enhance, tensorsim.recognition)
+    (room,) = (room for room in rooms if hasattr(room, entry.network))
+    network = getattr(room, entry.network).from_pretrained(entry.name)
+    assert not network.training
+    if entry.default:
+        default = getattr(room, entry.network).from_pretrained().state_dict()
+        assert all(torch.equal(value, default[key]) for key, value in network.state_dict().items())
+    images = torch.rand(SHOWN[entry.network], generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        assert_same(torch.jit.script(network)(images), network(images), atol=1e-5)
+
+
+def test_shipped_files_are_small() -> None:
+    sizes = {entry.name: entry.path.stat().st_size for entry in registry.shipped()}
+    assert sum(sizes.values()) <= 40e6
+    assert sizes["rtmdet-person-small"] <= 5e6
+    assert sizes["hrnet-pose-small"] <= 10e6
 
 
 def test_at_most_one_default_per_network() -> None:
