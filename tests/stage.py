@@ -31,7 +31,7 @@ def assert_same(actual: Any, expected: Any, rtol: float = 0.0, atol: float = 0.0
         e = e.to(a.device)
         if a.is_floating_point() or a.is_complex():
             finite = e.abs()[torch.isfinite(e.abs())]
-            peak = float(finite.max()) if finite.numel() else 1.0
+            peak = float(finite.detach().max()) if finite.numel() else 1.0
             e = e.to(a.dtype)
             torch.testing.assert_close(a, e, rtol=rtol, atol=atol * max(peak, 1e-30), equal_nan=True)
         else:
