@@ -265,7 +265,8 @@ class RadarSimulator(nn.Module):
         range_time = Columns(pulses, self.range_time_block)
         range_time_mti = Columns(seen, self.range_time_block)
         doppler_time = Columns(self.doppler.frames(seen))
-        peaks: list[Ridges] = []
+        # Small tensors kept from every piece would pin the freed memory of the large ones between them.
+        peak_bins, peak_magnitudes = Columns(doppler_time.total), Columns(doppler_time.total)
         pending: list[Pending] = []
         noise = torch.zeros_like(signal)
         for positions, rcs in self._pieces(source, pulses):
@@ -276,11 +277,10 @@ class RadarSimulator(nn.Module):
             range_time.push(piece.profiles[0].T.abs())
             range_time_mti.push(piece.moving[0].T.abs())
             doppler_time.push(piece.doppler_time[0])
-            peaks.append(self.ridges.peaks(piece.doppler_time[0]))
-        found = Ridges(
-            torch.cat([p.indices for p in peaks], -1), torch.cat([p.magnitudes for p in peaks], -1)
-        )
-        ridges = self.ridges.connect(found, self.doppler.bins)
+            peaks = self.ridges.peaks(piece.doppler_time[0])
+            peak_bins.push(peaks.indices)
+            peak_magnitudes.push(peaks.magnitudes)
+        ridges = self.ridges.connect(Ridges(peak_bins.result(), peak_magnitudes.result()), self.doppler.bins)
         whole = doppler_time.result()
         return RadarMaps(
             range_time.result(),
