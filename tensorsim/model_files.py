@@ -1,6 +1,8 @@
 """Where the shipped weights and pools lie."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 from tensorsim.errors import TensorsimError
 
@@ -20,6 +22,14 @@ def models_dir() -> Path:
     raise TensorsimError(
         f"shipped models: no manifest.json in {folders[0]} nor in {folders[1]}; reinstall tensorsim"
     )
+
+
+def manifest() -> list[dict[str, Any]]:
+    """Every shipped file with its name, SHA-256, licence, source and recipe, as ``manifest.json`` lists them."""
+    entries: list[dict[str, Any]] = json.loads((models_dir() / "manifest.json").read_text(encoding="utf-8"))[
+        "models"
+    ]
+    return entries
 
 
 def model_path(file: str) -> Path:

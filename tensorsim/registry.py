@@ -5,13 +5,12 @@ checked against their SHA-256. A path always works as well, and needs no registr
 """
 
 import hashlib
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from tensorsim.errors import TensorsimError
-from tensorsim.model_files import models_dir
+from tensorsim.model_files import manifest, models_dir
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,6 @@ PUBLISHED: tuple[ModelEntry, ...] = (
 
 def shipped() -> tuple[ModelEntry, ...]:
     """Networks that come with the package, as ``manifest.json`` lists them."""
-    manifest = json.loads((models_dir() / "manifest.json").read_text(encoding="utf-8"))
     return tuple(
         ModelEntry(
             name=entry["name"],
@@ -179,7 +177,7 @@ def shipped() -> tuple[ModelEntry, ...]:
             sha256=entry["sha256"],
             default=entry.get("default", False),
         )
-        for entry in manifest["models"]
+        for entry in manifest()
         if "network" in entry
     )
 

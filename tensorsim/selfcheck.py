@@ -2,7 +2,6 @@
 
 import hashlib
 import importlib
-import json
 from collections.abc import Callable
 
 import torch
@@ -31,9 +30,9 @@ def _libraries() -> str:
 
 
 def _shipped_files() -> str:
-    from tensorsim.model_files import model_path
+    from tensorsim.model_files import manifest, model_path
 
-    entries = json.loads(model_path("manifest.json").read_text(encoding="utf-8"))["models"]
+    entries = manifest()
     for entry in entries:
         digest = hashlib.sha256(model_path(entry["file"]).read_bytes()).hexdigest()
         if digest != entry["sha256"]:

@@ -143,6 +143,18 @@ def read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
         raise TensorsimError(f"{path}: damaged or not a safetensors file ({error})") from error
 
 
+def input_size_of(path: Path) -> tuple[int, int] | None:
+    """(height, width) of the pictures that weights were trained on: as their header states it (``"128x96"``), or as
+    published files have it in their names (``...384x288...``); None if neither does.
+
+    Raises:
+        TensorsimError: a damaged file.
+    """
+    stated = re.search(r"(\d+)x(\d+)", read_metadata(path).get("input_size", ""))
+    found = stated or re.search(r"(?<!\d)(\d{3})x(\d{3})(?!\d)", path.stem)
+    return (int(found[1]), int(found[2])) if found else None
+
+
 def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | os.PathLike[str]) -> None:
     """Copy weights into a module, or refuse and leave it as it was.
 

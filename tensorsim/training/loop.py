@@ -250,13 +250,12 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
             log.write(done, values | {"rate": factor, "samples_per_s": speed})
         if done % config.validate_every == 0 or done == config.steps:
             if log:
-                net = averaged.module if config.ema_decay else recipe.net
-                figures = _validate(recipe, net, config.quiet)
+                figures = _validate(recipe, averaged.module)
                 log.write(done, {f"validation/{name}": value for name, value in figures.items()})
                 bar.write(f"step {done}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
                 if figures["score"] > best["score"]:
                     best = figures | {"step": float(done)}
-                    save_weights(net, config.out / "best.safetensors", recipe.metadata)
+                    save_weights(averaged.module, config.out / "best.safetensors", recipe.metadata)
             if processes > 1:
                 distributed.barrier()
         if log and (done % config.checkpoint_every == 0 or done == config.steps):
@@ -289,7 +288,7 @@ def _to(batch: Any, device: torch.device) -> Any:
     return batch
 
 
-def _validate(recipe: Recipe, net: nn.Module, quiet: bool) -> dict[str, float]:
+def _validate(recipe: Recipe, net: nn.Module) -> dict[str, float]:
     was_training = net.training
     net.eval()
     with torch.no_grad():

@@ -142,24 +142,21 @@ class CPM(nn.Module):
 
         Args:
             source: a path of a ``.pth`` or ``.safetensors``, or a name that ``tensorsim models list`` prints.
-            input_size: (H, W) of the crops the weights were trained on. None: as the file's name has it, else
-                (256, 192).
+            input_size: (H, W) of the crops the weights were trained on. None: as the file states it or
+                has it in its name, else (256, 192).
 
         Raises:
             TensorsimError: an unknown name, weights that cannot be fetched, a file that cannot be read or trusted, or
                 keys and shapes that are not this network's.
         """
         from tensorsim.registry import locate
-        from tensorsim.weights import load_state_dict, load_strict
+        from tensorsim.weights import input_size_of, load_state_dict, load_strict
 
         path = locate(source, cls.__name__)
         state = load_state_dict(path)
         stages = 1 + len(
             {match[1] for key in state if (match := re.match(r"backbone\.cpm_stages\.(\d+)\.", key))}
         )
-        if input_size is None:
-            named = re.search(r"(?<!\d)(\d{3})x(\d{3})(?!\d)", path.stem)
-            input_size = (int(named[1]), int(named[2])) if named else (256, 192)
-        network = cls(stages, input_size)
+        network = cls(stages, input_size or input_size_of(path) or (256, 192))
         load_strict(network, state, path)
         return network.eval()

@@ -277,19 +277,14 @@ class HRNet(nn.Module):
                 keys or shapes that are not an HRNet's, or another variant than ``width``.
         """
         from tensorsim.registry import locate
-        from tensorsim.weights import load_state_dict, load_strict, read_metadata
+        from tensorsim.weights import input_size_of, load_state_dict, load_strict
 
         path = locate(source, cls.__name__)
         state = _original_names(load_state_dict(path))
         config = _read_config(state, str(path))
         if width is not None and VARIANTS.get(width) != config:
             raise TensorsimError(f"{path}: got the weights of {config}, expected HRNet width {width}")
-        if input_size is None:
-            stated = re.search(r"(\d+)x(\d+)", read_metadata(path).get("input_size", ""))
-            named = re.search(r"(?<!\d)(\d{3})x(\d{3})(?!\d)", path.stem)
-            found = stated or named
-            input_size = (int(found[1]), int(found[2])) if found else (256, 192)
-        network = cls(config, input_size)
+        network = cls(config, input_size or input_size_of(path) or (256, 192))
         load_strict(network, state, str(path))
         return network.eval()
 
