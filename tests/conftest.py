@@ -5,9 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 # FFmpeg reads its log level when OpenCV first uses it, which is often a test that writes a film, not the reader.
 os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
+
+# The same examples at every run: a failure on one machine is a failure on all.
+settings.register_profile("seeded", derandomize=True)
+settings.load_profile("seeded")
 
 #: Real videos, networks and motion beside the checkout; tests that read it skip where it is missing.
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

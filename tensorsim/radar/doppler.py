@@ -166,22 +166,31 @@ class DopplerTimeMap(DopplerFrames):
         elif self.integration == "coherent":
             series = coherent_sum(series.transpose(1, 2), self.samples).transpose(1, 2)
         frames = series.unfold(-1, self.length, self.hop)  # (B, R, K, L), a view
-        # Neighbouring frames share most of their pulses: blocks take frames first, then range bins and clips.
-        columns = max(1, min(64, frames.shape[2], self.block_size // self.bins))
-        clips = max(1, self.block_size // (columns * self.bins))
-        step = max(1, self.block_size // (min(clips, frames.shape[0]) * columns * self.bins))
-        maps: list[Tensor] = []
-        for clip in range(0, frames.shape[0], clips):
-            blocks: list[Tensor] = []
-            for first in range(0, frames.shape[2], columns):
+        batch, bins, count = frames.shape[0], frames.shape[1], frames.shape[2]
+        # Neighbouring frames share most of their pulses: blocks take frames first, then clips, then range bins.
+        columns = max(1, min(count, self.block_size // self.bins))
+        clips = max(1, self.block_size // (columns * self.bins)) if columns == count else 1
+        step = max(1, self.block_size // (min(clips, batch) * columns * self.bins))
+        # Autograd wants the blocks joined; without it each is written where it belongs, while it is in the cache.
+        joined = series.requires_grad
+        rows: list[Tensor] = []
+        doppler_time = torch.real(series).new_empty([0 if joined else batch * count, self.bins])
+        for clip in range(0, batch, clips):
+            for first in range(0, count, columns):
                 block = frames[clip : clip + clips, :, first : first + columns]
                 power = torch.real(series).new_zeros([])
-                for near in range(0, block.shape[1], step):
+                for near in range(0, bins, step):
                     for part in self.spectrum(block[:, near : near + step]).unbind(1):
                         power = torch.addcmul(power, part, part)
-                blocks.append(safe_sqrt(power[..., 0] + power[..., 1]))
-            maps.append(torch.cat(blocks, 1))
-        return unflatten_batch(torch.cat(maps).transpose(1, 2), list(profiles.shape[:-2]))
+                row = safe_sqrt(power[..., 0] + power[..., 1]).flatten(0, 1)
+                if joined:
+                    rows.append(row)
+                else:
+                    place = clip * count + first
+                    doppler_time[place : place + row.shape[0]] = row
+        if joined:
+            doppler_time = torch.cat(rows)
+        return unflatten_batch(doppler_time.unflatten(0, [batch, count]).transpose(1, 2), list(profiles.shape[:-2]))
 
 
 class RangeDopplerVideo(DopplerFrames):

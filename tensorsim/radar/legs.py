@@ -38,6 +38,8 @@ class Legs(NamedTuple):
 
 def safe_sqrt(x: Tensor) -> Tensor:
     """Square root whose gradient at 0 is 0 instead of infinite."""
+    if not x.requires_grad:
+        return x.sqrt()
     positive = x > 0
     return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
 

@@ -59,7 +59,8 @@ def scene(seed: int, count: int, side: int = 96) -> tuple[Tensor, Tensor, Tensor
     reach = torch.rand(n, 4, generator=generator, dtype=torch.float64) * 30 + 3
     boxes = torch.cat([points - reach[:, :2], points + reach[:, 2:]], dim=1)
     low = torch.rand(count, 2, generator=generator, dtype=torch.float64) * (side - 30)
-    size = torch.rand(count, 2, generator=generator, dtype=torch.float64) * 40 + 6
+    # Wider than the finest stride, so that each object has a cell inside.
+    size = torch.rand(count, 2, generator=generator, dtype=torch.float64) * 40 + 10
     return logits, boxes, points, strides, torch.cat([low, (low + size).clamp(max=side)], dim=1)
 
 
