@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, is_exporting
 from tensorsim.radar.paths import Paths, PropagationPaths, Resonance, chosen_paths
+from tensorsim.radar.range_profile import flatten_batch, unflatten_batch
 from tensorsim.radar.wall import place_wall
 
 
@@ -241,6 +242,8 @@ class EchoSynthesizer(nn.Module):
         self.prf_hz = float(radar.prf_hz)
         self.samples = radar.samples_per_chirp
         self.pulse_chunk = pulse_chunk
+        # Tones of about this many paths and pulses stay in the cache.
+        self.tone_block = 2**15
         fine = math.isqrt(self.samples - 1) + 1
         self.register_buffer("fine", torch.arange(fine).float(), persistent=False)
         self.register_buffer("coarse", torch.arange(-(-self.samples // fine)).float(), persistent=False)
@@ -265,15 +268,23 @@ class EchoSynthesizer(nn.Module):
 
     def _sum(self, delay_s: Tensor, gain: Tensor, dtype: torch.dtype) -> Tensor:
         """IF (..., N) of paths (..., P)."""
-        pulses = beat_sum(
-            delay_s,
-            gain,
-            self.carrier_hz,
-            self.slope_hz_per_s,
-            self.sample_rate_hz,
-            self.coarse.to(dtype),
-            self.fine.to(dtype),
-        )
+        lead = list(delay_s.shape[:-1])
+        delay_s, gain = flatten_batch(delay_s, 1), flatten_batch(gain, 1)
+        step = max(1, self.tone_block // max(1, delay_s.shape[1]))
+        parts: list[Tensor] = []
+        for first in range(0, delay_s.shape[0], step):
+            parts.append(
+                beat_sum(
+                    delay_s[first : first + step],
+                    gain[first : first + step],
+                    self.carrier_hz,
+                    self.slope_hz_per_s,
+                    self.sample_rate_hz,
+                    self.coarse.to(dtype),
+                    self.fine.to(dtype),
+                )
+            )
+        pulses = unflatten_batch(torch.cat(parts), lead)
         return pulses[..., : self.samples]
 
     @torch.jit.export

@@ -125,7 +125,7 @@ def plot(path, clock):
     import matplotlib.pyplot as plt
 
     radar = RadarConfig.free_space()
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     sweeps = {
         "clip, s": [(x, 14) for x in (1, 4, 15, 60, 600)],
         "scatterers": [(1, x) for x in (1, 5, 20, 100, 500)],
