@@ -382,18 +382,20 @@ class VideoToDoppler(nn.Module):
         cls,
         detector: str | os.PathLike[str] | None = None,
         pose: str | os.PathLike[str] | None = None,
+        flip_test: bool = True,
         **options: Any,
     ) -> "VideoToDoppler":
         """The whole with trained networks, in evaluation mode.
 
         Args:
             detector, pose: paths or names of ``tensorsim models list``; None: the shipped weights.
+            flip_test: see :func:`pretrained_pose`.
             **options: further arguments of the constructor.
 
         Raises:
             TensorsimError: weights that are not there or of another network.
         """
-        return cls(RTMDet.from_pretrained(detector), heatmap_network(pose), **options).eval()
+        return cls(RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test), **options).eval()
 
     def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Simulation:
         """Simulate what the radar sees of clips.
@@ -497,20 +499,23 @@ class VideoToActivity(nn.Module):
         )
 
 
-def heatmap_network(source: str | os.PathLike[str] | None = None) -> nn.Module:
-    """The pose network of a file or name: an ``.onnx`` runs in ONNX Runtime; others are CPM or HRNet.
+def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: bool = True) -> TopDownPose:
+    """Pose estimation with the network of a file or name: ``.onnx`` in ONNX Runtime; others are CPM or HRNet.
 
     Args:
         source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
+        flip_test: average with the mirror image, as published accuracies are measured: better, at twice the cost.
 
     Raises:
         TensorsimError: no such file or name, or weights of another network.
     """
     if source is not None and Path(source).suffix == ".onnx":
-        return OnnxHeatmaps(source)
-    if source is not None and "cpm" in Path(source).name:
-        return CPM.from_pretrained(source)
-    return HRNet.from_pretrained(source)
+        network: nn.Module = OnnxHeatmaps(source)
+    elif source is not None and "cpm" in Path(source).name:
+        network = CPM.from_pretrained(source)
+    else:
+        network = HRNet.from_pretrained(source)
+    return TopDownPose(network, flip_test=flip_test)
 
 
 def warn_of_empty_clips(valid: Tensor) -> None:

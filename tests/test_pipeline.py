@@ -13,6 +13,7 @@ from torch import Tensor
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
+from tensorsim.vision.topdown import FlipTest
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
 
@@ -115,6 +116,15 @@ def test_activity_adds_logits_to_the_simulation() -> None:
 def test_networks_must_be_given_or_replaced() -> None:
     with pytest.raises(TensorsimError, match=r"got no detector.*VideoToDoppler\.from_pretrained\(\)"):
         VideoToDoppler(RectangleDetector())
+
+
+def test_shipped_networks_look_into_the_mirror_unless_told_not_to() -> None:
+    asked_twice = VideoToDoppler.from_pretrained().video_to_pose.pose.network
+    assert isinstance(asked_twice, FlipTest)
+    once = VideoToDoppler.from_pretrained(flip_test=False).video_to_pose.pose.network
+    crops = torch.rand(1, 3, 128, 96)
+    assert torch.equal(asked_twice.network(crops), once(crops))
+    assert not torch.equal(asked_twice(crops), once(crops))
 
 
 def test_a_person_who_walks_away_is_where_they_are_and_recedes() -> None:

@@ -42,6 +42,8 @@ class Demo(RadarOptions):
     """Person detector, see `tensorsim simulate`. Default: $TENSORSIM_DETECTOR, else the shipped one."""
     pose: str | None = None
     """COCO-17 heat maps, see `tensorsim simulate`. Default: $TENSORSIM_POSE, else the shipped one."""
+    flip_test: bool = True
+    """Show the pose network every person mirrored as well: better, at twice the cost."""
     duration: float = 4.0
     """Length of the film in seconds."""
 
@@ -74,7 +76,7 @@ class Demo(RadarOptions):
 
         device = usable_device(self.device)
         with run.collected_warnings() as messages, torch.inference_mode():
-            networks = load_networks(detector, pose_network)
+            networks = load_networks(detector, pose_network, self.flip_test)
             maps_stage = self.pose_to_doppler(scene, self.duration).to(device).eval()
             true_stage = (
                 replace(self, motion="smooth").pose_to_doppler(scene, self.duration).to(device).eval()

@@ -20,7 +20,7 @@ class EvaluatePose:
     weights: Path | None = None
     data: Path | None = None
     coco: Path | None = None
-    flip_test: bool = False
+    flip_test: bool = True
 
     def run(self) -> None:
         """Do it."""

@@ -32,13 +32,13 @@ def _located(role: str, source: str | None, *networks: str) -> Path:
     return path
 
 
-def load_networks(detector: Path, pose: Path) -> tuple[Any, Any]:
-    """The two modules of these files: see :func:`tensorsim.pipeline.heatmap_network` for the second.
+def load_networks(detector: Path, pose: Path, flip_test: bool) -> tuple[Any, Any]:
+    """The two modules of these files: see :func:`tensorsim.pipeline.pretrained_pose` for the second.
 
     Raises:
         TensorsimError: files that are damaged, unsafe or of another network.
     """
-    from tensorsim.pipeline import heatmap_network
+    from tensorsim.pipeline import pretrained_pose
     from tensorsim.vision.rtmdet import RTMDet
 
-    return RTMDet.from_pretrained(detector), heatmap_network(pose)
+    return RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _MEANT_FOR = {
     "detector": ("video",),
     "pose": ("video",),
+    "flip_test": ("video",),
     "person_height": ("video", "keypoints"),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
@@ -50,6 +51,8 @@ class Simulate(RadarOptions):
     pose: str | None = None
     """COCO-17 heat maps: HRNet as .pth, .safetensors or name, or any such network as .onnx. Default: $TENSORSIM_POSE,
     else the shipped one."""
+    flip_test: bool = True
+    """Show the pose network every person mirrored as well: better, at twice the cost."""
     person_height: tuple[float, ...] = (1.80, 1.70)
     """Body heights in metres in order of appearance; the last one serves the rest."""
     initial_distance: tuple[float, ...] | None = None
@@ -164,7 +167,7 @@ class Simulate(RadarOptions):
         reader = VideoReader(
             self.source, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
         )
-        stage = self._video_to_pose(*load_networks(detector, pose)).to(device).eval()
+        stage = self._video_to_pose(*load_networks(detector, pose, self.flip_test)).to(device).eval()
         files = {"detector": str(detector), "pose": str(pose)}
         return sources.film_source(reader, stage, device), files
 

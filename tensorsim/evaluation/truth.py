@@ -208,15 +208,13 @@ def _cell(
 
 
 def _film(loop: TruthLoop, clip: Clip, networks: list[nn.Module]) -> Filmed:
-    from tensorsim.vision.hrnet import HRNet
-    from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
+    from tensorsim.pipeline import pretrained_pose
     from tensorsim.vision.rtmdet import RTMDet
 
     assert loop.detector is not None
     assert loop.pose is not None
     if not networks:
-        pose = OnnxHeatmaps(loop.pose) if loop.pose.suffix == ".onnx" else HRNet.from_pretrained(loop.pose)
-        networks += [RTMDet.from_pretrained(loop.detector).eval(), pose.eval()]
+        networks += [RTMDet.from_pretrained(loop.detector).eval(), pretrained_pose(loop.pose).eval()]
     key = hashlib.sha256(f"{loop.detector.stem} {loop.pose.stem}".encode()).hexdigest()[:8]
     path = loop.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{key}.npz"
     return filmed(path, clip, networks[0], networks[1])
