@@ -14,6 +14,7 @@ class TrainDetector:
         cutouts: folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given.
         rendered: number of rendered people.
         variant: of RTMDet.
+        init: weights to start from (.safetensors).
         steps: optimiser steps.
         batch: pictures per step.
         learning_rate: highest learning rate.
@@ -29,6 +30,7 @@ class TrainDetector:
     cutouts: Path | None = None
     rendered: int = 3000
     variant: str = "small-person"
+    init: Path | None = None
     steps: int = 4000
     batch: int = 16
     learning_rate: float = 1.5e-3
@@ -47,7 +49,7 @@ class TrainDetector:
         from tensorsim.training.detector_metrics import calibrate
         from tensorsim.training.loop import LoopConfig, fit
         from tensorsim.vision.rtmdet import RTMDet
-        from tensorsim.weights import save_weights
+        from tensorsim.weights import load_state_dict, load_strict, save_weights
 
         loop = LoopConfig(
             out=self.out,
@@ -62,6 +64,8 @@ class TrainDetector:
         )
         torch.manual_seed(self.seed)
         net = TrainedRTMDet(self.variant)
+        if self.init is not None:
+            load_strict(net, load_state_dict(self.init), self.init)
         folder = self.out / "cutouts" if self.cutouts is None else self.cutouts
         cutouts = Cutouts(render_cutouts(self.rendered, self.seed, folder, self.quiet))
         sources, held_out = read_sources(self.data, cutouts)

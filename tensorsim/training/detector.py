@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tensorsim.errors import TensorsimError
 from tensorsim.training.assign import detection_losses
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.detector_data import PictureMaker, Sources
@@ -22,8 +23,12 @@ from tensorsim.vision.rtmdet import RTMDet
 HELD_OUT_PERCENT = 20
 #: Heads stand out of the boxes of the street pictures by about this share of their height.
 PEDESTRIAN_HEAD = 0.18
-#: Sides of the pictures of a step, drawn anew for each.
+#: Sides of the pictures of a step, drawn anew for each, so often that all take about the same time.
 SIDES = (160, 192, 224, 256, 320)
+#: Side at which the network is used: within those. On larger pictures than most that it saw it finds less.
+USED_SIDE = 288
+#: Overlap from which two boxes are one person: boxes of one are wider apart than those of a network trained for long.
+USED_IOU = 0.5
 
 
 class TrainedRTMDet(RTMDet):
@@ -35,8 +40,17 @@ class TrainedRTMDet(RTMDet):
 
 
 def read_sources(data: Path, cutouts: Cutouts) -> tuple[Sources, list[Sample]]:
-    """What to train on, and the held-out pictures, of a folder of shards."""
+    """What to train on, and the held-out pictures, of a folder of shards.
+
+    Raises:
+        TensorsimError: shards are missing, or held-out pictures with or without people.
+    """
     coco, held_out = split(Shards(find_shards(data, "coco_small")), HELD_OUT_PERCENT)
+    peopled = sum(len(sample.boxes) > 0 for sample in held_out)
+    if not 0 < peopled < len(held_out):
+        raise TensorsimError(
+            f"{data}: got {len(held_out)} held-out pictures, {peopled} with people, expected some with and some without"
+        )
     lspet = list(Shards(find_shards(data, "lspet")))
     street = list(Shards(find_shards(data, "pedestrian")))
     for sample in street:
@@ -49,6 +63,7 @@ def read_sources(data: Path, cutouts: Cutouts) -> tuple[Sources, list[Sample]]:
         empty=empty + list(Shards(find_shards(data, "backgrounds"))),
         partial=[lspet, standing, street],
         cutouts=cutouts,
+        outlined=standing,
     ), held_out
 
 
@@ -79,7 +94,9 @@ class DetectorRecipe(Recipe):
             "seed": seed,
             "learning_rate": learning_rate,
         }
-        super().__init__(net, settings, {"model": "RTMDet", "variant": net.variant})
+        metadata = {"model": "RTMDet", "variant": net.variant}
+        metadata |= {"input_size": str(USED_SIDE), "nms_iou": str(USED_IOU)}
+        super().__init__(net, settings, metadata)
         self.detector = net
         self.held_out, self.seed, self.learning_rate, self.warm_up = held_out, seed, learning_rate, warm_up
         self.maker = PictureMaker(sources, net.input_size)
@@ -107,7 +124,10 @@ class DetectorRecipe(Recipe):
             valid[i, : len(sample["boxes"])] = True
         image = torch.stack([sample["image"] for sample in samples]).float()
         sides = [side for side in SIDES if side < image.shape[-1]] + [image.shape[-1]]
-        side = sides[int(np.random.default_rng([self.seed, samples[0]["index"], 1]).integers(len(sides)))]
+        shares = np.array(sides, float) ** -2
+        side = int(
+            np.random.default_rng([self.seed, samples[0]["index"], 1]).choice(sides, p=shares / shares.sum())
+        )
         if side < image.shape[-1]:
             boxes = boxes * (side / image.shape[-1])
             image = F.interpolate(image, (side, side), mode="bilinear", antialias=True)
@@ -146,7 +166,7 @@ class DetectorRecipe(Recipe):
         """Average precision and recall on the held-out pictures."""
         from tensorsim.training.detector_metrics import measure
 
-        detector = RTMDet(self.detector.variant).eval()
+        detector = RTMDet(self.detector.variant, input_size=USED_SIDE, nms_iou=USED_IOU).eval()
         detector.load_state_dict(net.state_dict())
         device = next(net.parameters()).device
         figures = measure(detector.to(device), self.held_out)

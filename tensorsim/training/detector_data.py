@@ -1,4 +1,4 @@
-"""Square pictures with people in them to train a detector on: real ones, mosaics of them, and rendered people.
+"""Square pictures with people in them to train a detector on: real ones, mosaics of them, and people pasted.
 
 Boxes are ``xyxy`` pixels with (0, 0) at the outer corner of the first pixel. Where a source does not label
 everybody, only the surroundings of its boxes count as known: beyond, nobody can say that there is no one.
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tensorsim.training.cutouts import Cutouts
+from tensorsim.training.detector_people import outline
 from tensorsim.training.shards import Floats, Sample
 
 Picture = npt.NDArray[np.uint8]
@@ -25,6 +26,10 @@ SURROUNDINGS = 0.15
 #: What is cut off by the edge of a picture is nobody's box if less than this is left.
 LEAST_VISIBLE = 0.25
 GREY = 114
+#: Of people who are pasted one after the other, this share stands beside or in front of the one before.
+TOGETHER = 0.5
+#: With every person who is pasted, a piece of something else is, with this probability.
+DISTRACTED = 0.5
 
 
 class Labelled(NamedTuple):
@@ -50,14 +55,18 @@ class Sources:
         empty: pictures without people.
         partial: lists of pictures where only some people are labelled, each list as likely as the next.
         cutouts: rendered people.
+        outlined: pictures whose first person is cut out of them, as often as a rendered one is taken; none is fine.
+        shares: how often a picture, or a part of a mosaic, is of which kind; in pasted ones, cut-outs are put on
+            pictures without people.
     """
 
     complete: Sequence[Sample]
     empty: Sequence[Sample]
     partial: Sequence[Sequence[Sample]]
     cutouts: Cutouts
+    outlined: Sequence[Sample] = ()
     shares: dict[str, float] = field(
-        default_factory=lambda: {"complete": 0.25, "partial": 0.45, "rendered": 0.2, "empty": 0.1}
+        default_factory=lambda: {"complete": 0.25, "partial": 0.35, "pasted": 0.3, "empty": 0.1}
     )
 
 
@@ -73,6 +82,9 @@ def _picture(sample: Sample, longest: int = 448) -> tuple[Picture, float]:
     return image, factor
 
 
+_outlined = functools.lru_cache(maxsize=4096)(outline)
+
+
 class PictureMaker:
     """Makes labelled pictures, each from random numbers of its own.
 
@@ -80,10 +92,11 @@ class PictureMaker:
         sources: what they are made of.
         size: side of the pictures in pixels.
         mosaic: probability that a picture is made of four.
+        film: probability that one that is not is wider than high, with grey below it, as films come to the detector.
     """
 
-    def __init__(self, sources: Sources, size: int = 320, mosaic: float = 0.5) -> None:
-        self.sources, self.size, self.mosaic = sources, size, mosaic
+    def __init__(self, sources: Sources, size: int = 320, mosaic: float = 0.5, film: float = 0.5) -> None:
+        self.sources, self.size, self.mosaic, self.film = sources, size, mosaic, film
 
     def __call__(self, rng: np.random.Generator) -> Labelled:
         """One picture."""
@@ -94,21 +107,33 @@ class PictureMaker:
             for rect in ((0, 0, x, y), (x, 0, size, y), (0, y, x, size), (x, y, size, size)):
                 self._fill(canvas, rect, rng)
         else:
-            self._fill(canvas, (0, 0, size, size), rng)
+            height = rng.choice([9 / 16, 3 / 4]) * size if rng.random() < self.film else size
+            self._fill(canvas, (0, 0, size, round(height)), rng)
         return Labelled(_coloured(canvas.image, rng), canvas.final_boxes(), canvas.known)
 
     def _fill(self, canvas: "Canvas", rect: tuple[int, int, int, int], rng: np.random.Generator) -> None:
         kind = rng.choice(list(self.sources.shares), p=list(self.sources.shares.values()))
-        if kind == "rendered":
+        if kind == "pasted":
             canvas.place(_one_of(self.sources.empty, rng), rect, rng)
+            beside = None
             for _ in range(rng.integers(1, 5)):
-                rgba = self.sources.cutouts[int(rng.integers(len(self.sources.cutouts)))].rgba
-                canvas.paste(_restyled(rgba, rng), rect, rng)
+                placed = canvas.paste(self._person(rng), rect, rng, beside)
+                beside = placed if rng.random() < TOGETHER else None
+                if rng.random() < DISTRACTED:
+                    canvas.distract(_one_of(self.sources.empty, rng), rect, rng)
         elif kind == "partial":
             samples = self.sources.partial[int(rng.integers(len(self.sources.partial)))]
             canvas.place(_one_of(samples, rng), rect, rng)
         else:
             canvas.place(_one_of(getattr(self.sources, kind), rng), rect, rng)
+
+    def _person(self, rng: np.random.Generator) -> Picture:
+        """Somebody cut out of a photograph, or rendered."""
+        if len(self.sources.outlined) and rng.random() < 0.5:
+            person = _outlined(_one_of(self.sources.outlined, rng))
+            if person is not None:
+                return person
+        return _restyled(self.sources.cutouts[int(rng.integers(len(self.sources.cutouts)))].rgba, rng)
 
 
 def _one_of(samples: Sequence[Sample], rng: np.random.Generator) -> Sample:
@@ -135,6 +160,8 @@ class Canvas:
         width, height = right - left, bottom - top
         fit = min(width / picture.shape[1], height / picture.shape[0])
         scale = fit * np.exp(rng.uniform(np.log(0.9), np.log(2.2)))
+        if rng.random() < 0.7:  # no grey around it
+            scale = max(scale, width / picture.shape[1], height / picture.shape[0])
         boxes = sample.boxes * factor
         focus = np.array([picture.shape[1], picture.shape[0]]) * rng.uniform(0.3, 0.7, 2)
         if len(boxes):
@@ -179,13 +206,32 @@ class Canvas:
             elif share > 0:
                 self._know(clipped, False)
 
-    def paste(self, rgba: Picture, rect: tuple[int, int, int, int], rng: np.random.Generator) -> None:
-        """Put a cut-out into a rectangle, at a random scale and place, partly outside at times."""
+    def paste(
+        self,
+        rgba: Picture,
+        rect: tuple[int, int, int, int],
+        rng: np.random.Generator,
+        beside: tuple[int, int, int, int] | None = None,
+    ) -> tuple[int, int, int, int]:
+        """Put a cut-out into a rectangle, at a random scale and place, partly outside at times.
+
+        Args:
+            rgba: the cut-out.
+            rect: left, top, right and bottom of the rectangle.
+            rng: random numbers.
+            beside: left, top, width and height of somebody whom it stands close to, as large and as low as that
+                one; None: anywhere.
+
+        Returns:
+            Left, top, width and height of the cut-out, also where it is outside.
+        """
         import cv2
 
         left, top, right, bottom = rect
         tall = (bottom - top) * np.exp(rng.uniform(np.log(0.2), np.log(1.3)))
         scale = tall / max(rgba.shape[:2])
+        if beside is not None:
+            scale = max(beside[2:]) * rng.uniform(0.85, 1.15) / max(rgba.shape[:2])
         size = (max(round(rgba.shape[1] * scale), 3), max(round(rgba.shape[0] * scale), 3))
         if rng.random() < 0.5:
             rgba = np.ascontiguousarray(rgba[:, ::-1])
@@ -193,15 +239,66 @@ class Canvas:
         rgba = cv2.resize(rgba, size, interpolation=how).astype(np.uint8)
         x = left + round(rng.uniform(-0.3, 1.0) * (right - left) - 0.35 * size[0] * rng.random())
         y = top + round(rng.uniform(-0.1, 1.0) * max(bottom - top - 0.7 * size[1], 1))
-        x0, y0, x1, y1 = max(x, left), max(y, top), min(x + size[0], right), min(y + size[1], bottom)
+        if beside is not None:
+            away = rng.uniform(0.25, 1.0) * (beside[2] + size[0]) / 2 * rng.choice([-1, 1])
+            x = round(beside[0] + beside[2] / 2 + away - size[0] / 2)
+            y = round(beside[1] + beside[3] - size[1] + rng.normal(0, 0.04) * size[1])
+        self.pasted.append(int((rgba[..., 3] > 127).sum()))
+        self._put(rgba, (x, y), rect, len(self.pasted))
+        return x, y, *size
+
+    def distract(self, sample: Sample, rect: tuple[int, int, int, int], rng: np.random.Generator) -> None:
+        """Put a piece of a picture without people into a rectangle: what has an edge of its own is not a person.
+
+        It may stand in front of people who were pasted before.
+        """
+        import cv2
+
+        picture, _ = _picture(sample)
+        left, top, right, bottom = rect
+        tall = (bottom - top) * np.exp(rng.uniform(np.log(0.06), np.log(0.6)))
+        size = (max(round(tall * np.exp(rng.uniform(np.log(0.3), np.log(2.0)))), 4), max(round(tall), 4))
+        part = (np.array(picture.shape[:2]) * np.exp(rng.uniform(np.log(0.05), np.log(0.6), 2))).astype(
+            int
+        ) + 2
+        y, x = (int(rng.integers(room + 1)) for room in np.array(picture.shape[:2]) - part)
+        piece = cv2.resize(
+            picture[y : y + part[0], x : x + part[1]], size, interpolation=cv2.INTER_AREA
+        ).astype(np.uint8)
+        if rng.random() < 0.2:  # of one colour and some shade
+            piece = (piece * 0.15 + rng.uniform(0, 215, 3)).astype(np.uint8)
+        alpha = np.full(size[::-1], 255, np.uint8)
+        shape = rng.random()
+        if shape < 0.3:
+            alpha[:] = 0
+            middle, radii = (size[0] // 2, size[1] // 2), (size[0] // 2, size[1] // 2)
+            cv2.ellipse(alpha, middle, radii, 0, 0, 360, (255,), -1)
+        elif shape < 0.7:  # a blot
+            coarse = rng.uniform(0, 1, (5, 4)).astype(np.float32)
+            coarse[[0, -1]] *= 0.4
+            coarse[:, [0, -1]] *= 0.4
+            alpha = (cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC) > 0.35).astype(np.uint8) * 255
+        rgba = np.dstack([piece, cv2.blur(alpha, (2, 2)).astype(np.uint8)])
+        corner = (
+            left + int(rng.uniform(-0.1, 1) * (right - left)),
+            top + int(rng.uniform(-0.1, 1) * (bottom - top)),
+        )
+        self._put(rgba, corner, rect, 0)
+
+    def _put(
+        self, rgba: Picture, corner: tuple[int, int], rect: tuple[int, int, int, int], owner: int
+    ) -> None:
+        """Blend a cut-out in with its corner there, as far as it is within the rectangle."""
+        (x, y), (left, top, right, bottom) = corner, rect
+        height, width = rgba.shape[:2]
+        x0, y0, x1, y1 = max(x, left), max(y, top), min(x + width, right), min(y + height, bottom)
         if x1 - x0 < 4 or y1 - y0 < 4:
             return
         part = rgba[y0 - y : y1 - y, x0 - x : x1 - x]
         alpha = part[..., 3:].astype(np.float32) / 255
         ground = self.image[y0:y1, x0:x1]
         self.image[y0:y1, x0:x1] = (part[..., :3] * alpha + ground * (1 - alpha) + 0.5).astype(np.uint8)
-        self.pasted.append(int((rgba[..., 3] > 127).sum()))
-        self.owner[y0:y1, x0:x1][part[..., 3] > 127] = len(self.pasted)
+        self.owner[y0:y1, x0:x1][part[..., 3] > 127] = owner
 
     def final_boxes(self) -> Floats:
         """Boxes (n, 4) of everybody, those of cut-outs around what is left to see of them."""

@@ -24,13 +24,14 @@ def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> 
     Returns:
         ``ap`` and ``ap50`` as COCO defines them (averaged over overlaps from 0.5 to 0.95, and at 0.5), and with
         detections of more than ``score``: ``recall`` and ``recall_large`` (share of the people, and of those
-        taller than a fifth of their picture, that one detection overlaps by at least 0.5) and
-        ``false_per_picture`` (detections that overlap nobody by 0.5).
+        taller than a fifth of their picture, that one detection overlaps by at least 0.5),
+        ``false_per_picture`` (detections that overlap nobody by 0.5) and ``alarms_per_picture`` (detections per
+        picture without people; NaN if there is none).
 
     Raises:
         TensorsimError: no people, or the libraries for average precision are missing.
     """
-    found = large = found_large = people = wrong = 0
+    found = large = found_large = people = wrong = alarms = empty = 0
     truths: list[Tensor] = []
     found_boxes: list[Tensor] = []
     for sample in samples:
@@ -45,6 +46,8 @@ def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> 
         large += int(tall.sum())
         found_large += int((hit.any(dim=0) & tall).sum())
         wrong += int((~hit.any(dim=1)).sum())
+        alarms += len(hit) if len(truth) == 0 else 0
+        empty += len(truth) == 0
     if people == 0:
         raise TensorsimError(f"detector: got {len(samples)} pictures without people, expected some with")
     ap, ap50 = average_precision(truths, found_boxes)
@@ -54,6 +57,7 @@ def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> 
         "recall": found / people,
         "recall_large": found_large / max(large, 1),
         "false_per_picture": wrong / len(samples),
+        "alarms_per_picture": alarms / empty if empty else float("nan"),
         "people": float(people),
     }
 
@@ -116,22 +120,30 @@ def people_in(detector: RTMDet, sample: Sample) -> tuple[Tensor, Tensor]:
     return seen.boxes[0][persons].cpu(), seen.scores[0][persons].cpu()
 
 
-def calibrate(detector: RTMDet, samples: Sequence[Sample], false_per_picture: float = 0.1) -> float:
+def calibrate(detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: float = 0.1) -> float:
     """Shift the scores of a one-class detector so that one of 0.5 means the same as in others.
 
     A network that is not trained to the end doubts what it rightly finds. A constant is added to its logits, in
-    place, with which it makes this many false detections per picture above a score of 0.5. The order of
-    detections, and with it average precision, stays.
+    place, with which it makes this many detections above a score of 0.5 per picture that shows nobody. Only
+    these pictures count: a box that is badly placed on a person is an error, but follows no one who is not there.
+    The order of detections, and with it average precision, stays.
+
+    Args:
+        detector: the detector, changed in place.
+        samples: pictures that it has not learnt from; those with people are passed over.
+        alarms_per_picture: detections per picture without people.
 
     Returns:
         The constant.
+
+    Raises:
+        TensorsimError: all pictures show people.
     """
-    wrong: list[Tensor] = []
-    for sample in samples:
-        boxes, scores = people_in(detector, sample)
-        wrong.append(scores[~_matches(boxes, torch.from_numpy(sample.boxes)).any(dim=1)])
-    highest = torch.cat(wrong).sort(descending=True).values
-    allowed = int(false_per_picture * len(samples))
+    empty = [sample for sample in samples if len(sample.boxes) == 0 and sample.all_labelled]
+    if not empty:
+        raise TensorsimError(f"calibrate: got {len(samples)} pictures with people, expected some without")
+    highest = torch.cat([people_in(detector, sample)[1] for sample in empty]).sort(descending=True).values
+    allowed = int(alarms_per_picture * len(empty))
     if allowed >= len(highest):
         return 0.0
     shift = -float(torch.logit(highest[allowed].double()))

@@ -102,8 +102,8 @@ class RTMDet(nn.Module):
             source: a published ``.pth``, a ``.safetensors`` of its keys, or an ``.onnx`` exported by mmdeploy; or a
                 name that ``tensorsim models list`` prints, such as ``"rtmdet-m-person"``; None: the shipped weights.
             variant: None tells it from the shapes in the file.
-            **options: further arguments of the constructor. An ``input_size`` that a ``.safetensors`` file states
-                is taken unless one is given here.
+            **options: further arguments of the constructor. An ``input_size`` and an ``nms_iou`` that a
+                ``.safetensors`` file states are taken unless given here.
 
         Raises:
             TensorsimError: an unknown name, weights that cannot be fetched, or a file that is damaged, unsafe or
@@ -116,6 +116,8 @@ class RTMDet(nn.Module):
         stated = read_metadata(path)
         if "input_size" in stated:
             options = {"input_size": int(stated["input_size"])} | options
+        if "nms_iou" in stated:
+            options = {"nms_iou": float(stated["nms_iou"])} | options
         if path.suffix == ".onnx":
             from tensorsim.vision.rtmdet_onnx import read_convolutions, unfold
 

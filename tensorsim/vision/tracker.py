@@ -81,8 +81,9 @@ class GNNTracker(nn.Module):
        one person seen twice.
     4. A track is confirmed by ``confirm_hits`` within ``confirm_window`` observed frames (else dropped) and
        ends after ``delete_misses`` within ``delete_window``.
-    5. People are the confirmed tracks with at least ``min_hits`` detections (in a clip with fewer observed
-       frames: one in each). Of more than ``max_tracks`` at a time the best, by sum of scores, are kept.
+    5. People are the confirmed tracks with at least ``min_hits`` detections of ``start_score`` or more (in a clip
+       with fewer observed frames: one in each): what a detector doubts most of the time is nobody. Of more than
+       ``max_tracks`` at a time the best, by sum of scores, are kept.
     6. A person is valid from first to last detection, gaps included, and in unobserved frames next to these.
        The boxes are Rauch-Tung-Striebel smoothed; they may reach beyond the image a little.
 
@@ -97,7 +98,7 @@ class GNNTracker(nn.Module):
         min_box_px: smallest width and height of a detection that counts.
         start_score: score from which a detection starts a track, and is matched without overlap.
         weak_iou: IoU with the predicted box that a detection of less needs.
-        min_hits: detections from which a confirmed track is a person.
+        min_hits: detections of at least ``start_score`` from which a confirmed track is a person.
         process_noise: density of the acceleration noise, size^2 / frame^3.
         measurement_noise: variance of a detected coordinate, size^2.
         initial_speed: prior standard deviation of the velocities, sizes / frame.
@@ -126,7 +127,7 @@ class GNNTracker(nn.Module):
         measurement_noise: float = 4e-4,
         initial_speed: float = 0.05,
         reach: float = 1.0,
-        duplicate_iou: float = 0.6,
+        duplicate_iou: float = 0.4,
         duplicate_part: float = 0.9,
     ) -> None:
         super().__init__()
@@ -316,7 +317,8 @@ class GNNTracker(nn.Module):
         """The rows of confirmed tracks that are people, in order of appearance."""
         hit = table >= 0
         detection = table.clamp(min=0).t()
-        score = (scores.gather(1, detection).t() * hit).sum(-1)
+        found = scores.gather(1, detection).t() * hit
+        score, strong = found.sum(-1), (found >= self.start_score) & hit
         area = (boxes[..., 2:] - boxes[..., :2]).prod(-1)
         mean_area = (area.gather(1, detection).t() * hit).sum(-1) / hit.sum(-1)
         crowd = torch.zeros(table.shape[1], dtype=torch.int64)
@@ -324,7 +326,7 @@ class GNNTracker(nn.Module):
         best_first: list[int] = score.argsort(descending=True, stable=True).tolist()
         for i in best_first:
             seen: list[int] = torch.nonzero(hit[i]).squeeze(-1).tolist()
-            if len(seen) >= min(self.min_hits, looks):
+            if int(strong[i].sum()) >= min(self.min_hits, looks):
                 span = crowd[seen[0] : seen[-1] + 1]
                 if int(span.max()) < self.max_tracks:
                     span += 1

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.commands.evaluate_detector import EvaluateDetector
+from tensorsim.commands.train_detector import TrainDetector
 from tensorsim.errors import TensorsimError
-from tensorsim.training.detector import DetectorRecipe, TrainedRTMDet, read_sources
+from tensorsim.training.detector import USED_IOU, USED_SIDE, DetectorRecipe, TrainedRTMDet, read_sources
 from tensorsim.training.detector_data import Sources
 from tensorsim.training.detector_metrics import (
     average_precision,
@@ -109,6 +110,53 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(recipe: DetectorRecipe, 
         torch.testing.assert_close(states[1][key], value, rtol=0, atol=0, msg=key)
 
 
+def test_command_trains_and_goes_on_from_weights(
+    recipe: DetectorRecipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    points = [[50 + 4 * (-1) ** i, 22 + 3 * i, 2] for i in range(19)]
+    files = {}
+    for n in range(40):
+        image = np.full((120, 160, 3), 90, np.uint8)
+        image[20:80, 40:70] = (230, 20, 20) if n % 2 else 90
+        persons = [{"bbox": [40, 20, 30, 60], "keypoints": points}] if n % 2 else []
+        files[f"{n}.jpg"] = encoded(image, ".jpg")
+        files[f"{n}.json"] = json.dumps({"all_persons_labelled": True, "persons": persons}).encode()
+    write_tar(tmp_path / "coco_small-00.tar", files)
+    write_tar(tmp_path / "backgrounds-00.tar", {"0.jpg": files["0.jpg"]})
+    for name in ("lspet", "pedestrian"):
+        write_tar(tmp_path / f"{name}-00.tar", {key: files[key] for key in ("1.jpg", "1.json")})
+    cutouts(tmp_path / "cutouts-000.tar")
+
+    def train(out: str, **options: Path) -> dict[str, Tensor]:
+        TrainDetector(
+            tmp_path, tmp_path / out, tmp_path, 20, "test", steps=1, batch=2, workers=0, quiet=True, **options
+        ).run()
+        assert f"{out}/detector.safetensors" in capsys.readouterr().out
+        return RTMDet.from_pretrained(tmp_path / out / "best.safetensors").state_dict()
+
+    first = train("a")
+    # The size and the suppression that the network is used with travel with the weights.
+    trained = tmp_path / "a" / "detector.safetensors"
+    detector = RTMDet.from_pretrained(trained)
+    assert (detector.input_size, detector.nms_iou) == (USED_SIDE, USED_IOU)
+    detector = RTMDet.from_pretrained(trained, input_size=64, nms_iou=0.7)
+    assert (detector.input_size, detector.nms_iou) == (64, 0.7)
+    # At a learning rate of next to nothing the second run ends where it began: at the weights of the first.
+    monkeypatch.setattr(DetectorRecipe, "rate", lambda self, step, steps: 0.0)
+    for name, value in train("b", init=tmp_path / "a" / "best.safetensors").items():
+        if "running" not in name and "num_batches" not in name:
+            torch.testing.assert_close(value, first[name], rtol=2e-3, atol=1e-6, msg=name)
+
+
+def test_held_out_pictures_must_be_of_both_kinds(tmp_path: Path) -> None:
+    shard(tmp_path / "coco_small-00.tar", True)
+    with pytest.raises(TensorsimError, match="held-out"):
+        read_sources(tmp_path, cutouts(tmp_path / "c.tar"))
+
+
 def test_weights_of_the_small_network_load_by_path(tmp_path: Path) -> None:
     net = TrainedRTMDet("small-person").eval()
     path = tmp_path / "small.safetensors"
@@ -173,23 +221,25 @@ def test_figures_of_a_detector_that_is_told_the_answer(tmp_path: Path) -> None:
         measure(Told(), samples[1:])  # type: ignore[arg-type]
 
 
-def test_calibrated_scores_mean_the_same_number_of_mistakes(tmp_path: Path, recipe: DetectorRecipe) -> None:
+def test_calibrated_scores_mean_the_same_number_of_alarms(tmp_path: Path, recipe: DetectorRecipe) -> None:
     torch.manual_seed(1)
     detector = RTMDet("test", score_threshold=0.0).eval()
-    samples = shard(tmp_path / "n.tar", False) * 5
-    samples += shard(tmp_path / "o.tar", True) * 5
-    before = [people_in(detector, sample) for sample in samples]
+    empty, peopled = shard(tmp_path / "n.tar", False) * 5, shard(tmp_path / "o.tar", True)
+    before = [people_in(detector, sample) for sample in empty]
     assert max(float(scores.max()) for _, scores in before) < 0.5
-    shift = calibrate(detector, samples, false_per_picture=0.5)
+    # However many people there are, and however badly they are found, only the pictures without any count.
+    shift = calibrate(detector, empty + 5 * peopled, alarms_per_picture=0.6)
     assert shift > 0
-    after = [people_in(detector, sample) for sample in samples]
+    after = [people_in(detector, sample) for sample in empty]
     for (boxes, scores), (shifted_boxes, shifted_scores) in zip(before, after, strict=True):
         torch.testing.assert_close(shifted_boxes, boxes)
         torch.testing.assert_close(shifted_scores.logit(), scores.logit() + shift, rtol=0, atol=1e-3)
-    assert measure(detector, samples)["false_per_picture"] <= 0.5
+    assert measure(detector, empty + peopled)["alarms_per_picture"] <= 0.6
     # The next one would be one too many.
     highest = torch.cat([scores for _, scores in after]).sort(descending=True).values
-    assert float(highest[5]) == pytest.approx(0.5, abs=1e-4)
+    assert float(highest[3]) == pytest.approx(0.5, abs=1e-4)
+    with pytest.raises(TensorsimError, match="pictures with people"):
+        calibrate(detector, peopled)
 
 
 def test_shared_person_frames() -> None:
@@ -237,6 +287,7 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
     shoulders, hips = {5: (50.0, 30.0), 6: (40.0, 30.0)}, {11: (50.0, 60.0), 12: (40.0, 60.0)}
     lying = {5: (20.0, 30.0), 6: (20.0, 40.0), 11: (60.0, 30.0), 12: (60.0, 40.0)}
     write("coco_small", [f"c{i}" for i in range(40)], [person({})], True)
+    write_tar(tmp_path / "coco_small-01.tar", {f"n{i}.jpg": encoded(picture, ".jpg") for i in range(40)})
     write("lspet", ["standing"], [person(shoulders | hips)], False)
     write_tar(tmp_path / "lspet-01.tar", {
         "lying.jpg": encoded(picture, ".jpg"),
@@ -247,13 +298,15 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
 
     sources, held_out = read_sources(tmp_path, cutouts(tmp_path / "people.tar"))
     keys = {sample.key for sample in sources.complete}
-    assert keys | {sample.key for sample in held_out} == {f"c{i}" for i in range(40)}
+    assert keys | {sample.key for sample in held_out} >= {f"c{i}" for i in range(40)}
     assert not keys & {sample.key for sample in held_out}
-    assert 0 < len(held_out) < 20
+    assert 0 < len(held_out) < 40
     everybody, standing, street = sources.partial
     assert {s.key for s in everybody} == {"standing", "lying"}
     assert [s.key for s in standing] == ["standing"]
-    assert [s.key for s in sources.empty] == ["room"]
+    empty = {s.key for s in sources.empty}
+    assert "room" in empty
+    assert empty <= {"room", *(f"n{i}" for i in range(40))} - {sample.key for sample in held_out}
     np.testing.assert_allclose(street[0].boxes, [[20, 30 - 0.18 * 50, 60, 80]], rtol=1e-6)
 
 

@@ -12,7 +12,8 @@ import pytest
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.detector_data import KNOWN_CELLS, Canvas, Labelled, PictureMaker, Sources
-from tensorsim.training.shards import Sample, Shards
+from tensorsim.training.detector_people import outline
+from tensorsim.training.shards import POINTS, Sample, Shards
 
 RED, GREEN = (230, 20, 20), (20, 200, 20)
 
@@ -37,6 +38,52 @@ def write_tar(path: Path, files: dict[str, bytes]) -> Path:
             info.size = len(data)
             tar.addfile(info, io.BytesIO(data))
     return path
+
+
+PERSON = {
+    "neck": (60, 40), "head_top": (60, 22), "left_shoulder": (50, 42), "right_shoulder": (70, 42),
+    "left_elbow": (46, 58), "right_elbow": (74, 58), "left_wrist": (44, 72), "right_wrist": (76, 72),
+    "left_hip": (54, 75), "right_hip": (66, 75), "left_knee": (53, 98), "right_knee": (67, 98),
+    "left_ankle": (52, 120), "right_ankle": (68, 120),
+}  # fmt: skip
+
+
+def drawn_person(path: Path, thickness: float = 1.0) -> tuple[Sample, np.ndarray]:
+    """A person of red lines on noisy ground, with joints, and which pixels show it."""
+    mask = np.zeros((144, 120), np.uint8)
+    lines = [("neck", "head_top", 9), ("left_shoulder", "right_shoulder", 9), ("left_hip", "right_hip", 9)]
+    lines += [("left_shoulder", "left_hip", 13), ("right_shoulder", "right_hip", 13), ("neck", "left_hip", 9)]
+    lines += [(f"{s}_{a}", f"{s}_{b}", 7) for s in ("left", "right") for a, b in (
+        ("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")
+    )]  # fmt: skip
+    for a, b, wide in lines:
+        cv2.line(mask, PERSON[a], PERSON[b], 1, max(1, round(wide * thickness)))
+    image = np.where(mask[..., None] > 0, RED, (60, 90, 150)).astype(float)
+    image += np.random.default_rng(0).normal(0, 6, image.shape)
+    points = [[*PERSON[name], 2] if name in PERSON else [0, 0, 0] for name in POINTS]
+    persons = [{"bbox": [38, 16, 44, 112], "keypoints": points}]
+    label = {"all_persons_labelled": False, "persons": persons}
+    files = {
+        "a.jpg": encoded(np.clip(image, 0, 255).astype(np.uint8), ".jpg"),
+        "a.json": json.dumps(label).encode(),
+    }
+    return Shards([write_tar(path, files)])[0], mask > 0
+
+
+def test_people_are_cut_out_along_their_outline(tmp_path: Path) -> None:
+    sample, truth = drawn_person(tmp_path / "d.tar")
+    rgba = outline(sample, side=144)
+    assert rgba is not None
+    rows, columns = np.flatnonzero(truth.any(1)), np.flatnonzero(truth.any(0))
+    wanted = truth[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    inside = cv2.resize(rgba[..., 3], wanted.shape[::-1]) > 127
+    assert (inside & wanted).sum() / (inside | wanted).sum() > 0.85
+
+
+def test_people_around_whom_all_has_their_colour_are_not_cut_out(tmp_path: Path) -> None:
+    assert outline(drawn_person(tmp_path / "d.tar", thickness=2.5)[0]) is None
+    # Nor are those whose joints nobody labelled.
+    assert outline(shard(tmp_path / "s.tar", True)[0]) is None
 
 
 def shard(path: Path, people: bool, everyone: bool = True) -> list[Sample]:
@@ -128,6 +175,47 @@ def test_boxes_of_cut_outs_are_of_what_is_seen(sources: Sources, seed: int) -> N
     cell = int(160 / KNOWN_CELLS)
     doubtful = ~np.kron(canvas.known, np.ones((cell, cell), bool))
     assert (covered | doubtful)[green].mean() > 0.97
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_somebody_beside_another_stands_close(sources: Sources, seed: int) -> None:
+    canvas, rng = Canvas(400), np.random.default_rng(seed)
+    rgba = sources.cutouts[0].rgba
+    one = canvas.paste(rgba, (0, 0, 400, 400), rng)
+    other = canvas.paste(rgba, (0, 0, 400, 400), rng, beside=one)
+    assert 0.8 < other[3] / one[3] < 1.2
+    assert abs(other[1] + other[3] - one[1] - one[3]) < 0.2 * one[3]
+    apart = abs(other[0] + other[2] / 2 - one[0] - one[2] / 2)
+    assert 0.2 < apart / ((one[2] + other[2]) / 2) < 1.1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pieces_of_other_pictures_are_nobody(sources: Sources, seed: int) -> None:
+    """They change the picture within the rectangle, get no box, and boxes of people are of what they leave to see."""
+    canvas, rng = Canvas(160), np.random.default_rng(seed)
+    canvas.image[:] = (20, 20, 200)
+    for _ in range(3):
+        canvas.distract(sources.empty[0], (40, 0, 160, 160), rng)
+    assert len(canvas.final_boxes()) == 0
+    assert (canvas.image != (20, 20, 200)).any()
+    assert (canvas.image[:, :40] == (20, 20, 200)).all()
+    assert canvas.known.all()
+    canvas.paste(sources.cutouts[0].rgba, (0, 0, 160, 160), rng)
+    shown = (canvas.owner == 1).sum()
+    for _ in range(6):
+        canvas.distract(sources.empty[0], (0, 0, 160, 160), rng)
+    assert (canvas.owner == 1).sum() <= shown
+    green = (canvas.image[..., 1].astype(int) - canvas.image[..., 0]) > 90
+    assert green[canvas.owner == 1].sum() >= 0.9 * (canvas.owner == 1).sum()
+
+
+def test_pictures_of_films_have_grey_below(sources: Sources) -> None:
+    maker = PictureMaker(sources, size=128, mosaic=0.0, film=1.0)
+    for seed in range(6):
+        picture = maker(np.random.default_rng(seed))
+        assert np.ptp(picture.image[97:].astype(int).mean(-1)) < 60  # noise at most
+        assert picture.known[-5:].all()
+        assert (picture.boxes[:, 3] <= 96).all()
 
 
 def test_a_picture_depends_on_its_random_numbers_alone(sources: Sources) -> None:

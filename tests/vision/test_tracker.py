@@ -207,6 +207,32 @@ def test_flicker_and_weak_detections_are_not_people() -> None:
     assert GNNTracker(start_score=0.3)(detections).boxes.shape[1] == 2
 
 
+def test_what_is_doubted_most_of_the_time_is_nobody() -> None:
+    person, chair = walker(300, 500, 60), walker(900, 900, 60)
+    seen, doubted = film([person], seed=1), film([chair], score=0.35)
+    doubted.scores[0, :4] += 0.3  # four times, it is taken for a person
+    detections = Detections(*(torch.cat([a, b], dim=2) for a, b in zip(seen, doubted, strict=True)))
+    tracks = GNNTracker()(detections)
+    assert tracks.boxes.shape[1] == 1
+    assert (overlap(tracks, 0, person) > 0.9).all()
+    # A person is found that often in a second or less, and then followed however weakly.
+    doubted.scores[0, :5] = 0.65
+    detections = Detections(*(torch.cat([a, b], dim=2) for a, b in zip(seen, doubted, strict=True)))
+    tracks = GNNTracker()(detections)
+    assert tracks.boxes.shape[1] == 2
+    assert bool(tracks.valid.all())
+
+
+@pytest.mark.parametrize(("apart", "people"), [(0.35, 1), (0.6, 2)])
+def test_boxes_that_overlap_much_start_one_track(apart: float, people: int) -> None:
+    """Moved sideways by this part of their width, they overlap by (1 - apart) / (1 + apart): 0.48 and 0.25."""
+    one = walker(300, 300, 30)
+    other = one + torch.tensor([1.0, 0, 1, 0]) * apart * (one[:, 2:3] - one[:, :1])
+    best, second = film([one]), film([other], score=0.6)
+    detections = Detections(*(torch.cat([a, b], dim=2) for a, b in zip(best, second, strict=True)))
+    assert GNNTracker()(detections).boxes.shape[1] == people
+
+
 def test_lost_person_is_not_found_in_furniture() -> None:
     person = walker(300, 300, 50)
     chair = film([hidden(walker(360, 360, 50, height=130), slice(0, 20))], score=0.35)
