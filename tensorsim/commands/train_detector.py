@@ -3,42 +3,34 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tensorsim.commands.training import TrainOptions
+
 
 @dataclass(frozen=True)
-class TrainDetector:
+class TrainDetector(TrainOptions):
     """Train RTMDet, small, on tar shards of people; run again with the same arguments, it goes on where it stopped.
+
+    OUT/detector.safetensors has the best weights with calibrated scores.
 
     Attributes:
         data: folder of coco_small-*.tar, lspet-*.tar, pedestrian-*.tar and backgrounds-*.tar.
-        out: folder for checkpoints, logs, best.safetensors and, of these with calibrated scores, detector.safetensors.
         cutouts: folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given.
         rendered: number of rendered people.
         variant: of RTMDet.
-        init: weights to start from (.safetensors).
         steps: optimiser steps.
         batch: pictures per step.
         learning_rate: highest learning rate.
         validate_every: steps between measurements on the held-out pictures.
-        seed: of everything random.
-        device: auto, cpu or cuda.
-        workers: processes that prepare pictures.
-        quiet: no progress bar.
     """
 
     data: Path
-    out: Path
     cutouts: Path | None = None
     rendered: int = 3000
     variant: str = "small-person"
-    init: Path | None = None
     steps: int = 4000
     batch: int = 16
     learning_rate: float = 1.5e-3
     validate_every: int = 250
-    seed: int = 0
-    device: str = "auto"
-    workers: int = 1
-    quiet: bool = False
 
     def run(self) -> None:
         """Do it."""
@@ -47,20 +39,14 @@ class TrainDetector:
         from tensorsim.training.cutouts import Cutouts, render_cutouts
         from tensorsim.training.detector import DetectorRecipe, TrainedRTMDet, read_sources
         from tensorsim.training.detector_metrics import calibrate
-        from tensorsim.training.loop import LoopConfig, fit
         from tensorsim.vision.rtmdet import RTMDet
         from tensorsim.weights import load_state_dict, load_strict, save_weights
 
-        loop = LoopConfig(
-            out=self.out,
+        loop = self.loop(
             steps=self.steps,
             batch=self.batch,
-            seed=self.seed,
-            device=self.device,
-            workers=self.workers,
             checkpoint_every=100,
             validate_every=self.validate_every,
-            quiet=self.quiet,
         )
         torch.manual_seed(self.seed)
         net = TrainedRTMDet(self.variant)
@@ -70,10 +56,8 @@ class TrainDetector:
         cutouts = Cutouts(render_cutouts(self.rendered, self.seed, folder, self.quiet))
         sources, held_out = read_sources(self.data, cutouts)
         recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate)
-        figures = fit(recipe, loop)
-        detector = RTMDet.from_pretrained(self.out / "best.safetensors")
+        detector = RTMDet.from_pretrained(self.train(recipe, loop))
         calibrate(detector, held_out)
-        save_weights(detector, self.out / "detector.safetensors", recipe.metadata)
-        print(
-            f"{self.out / 'detector.safetensors'}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items())
-        )
+        calibrated = self.out / "detector.safetensors"
+        save_weights(detector, calibrated, recipe.metadata)
+        print(f"{calibrated}: these with calibrated scores")

@@ -132,7 +132,16 @@ def test_command_trains_and_goes_on_from_weights(
 
     def train(out: str, **options: Path) -> dict[str, Tensor]:
         TrainDetector(
-            tmp_path, tmp_path / out, tmp_path, 20, "test", steps=1, batch=2, workers=0, quiet=True, **options
+            tmp_path,
+            tmp_path,
+            20,
+            "test",
+            steps=1,
+            batch=2,
+            out=tmp_path / out,
+            workers=0,
+            quiet=True,
+            **options,
         ).run()
         assert f"{out}/detector.safetensors" in capsys.readouterr().out
         return RTMDet.from_pretrained(tmp_path / out / "best.safetensors").state_dict()

@@ -30,7 +30,7 @@ def data(tmp_path: Path) -> Path:
 def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = data / "out"
     options = {"cutouts": data, "rendered": 13, "size": (64, 64), "first_size": (32, 32), "width": 4}
-    TrainPose(data, out, steps=2, first_steps=1, batch=2, workers=0, quiet=True, **options).run()  # type: ignore[arg-type]
+    TrainPose(data, out=out, steps=2, first_steps=1, batch=2, workers=0, quiet=True, **options).run()  # type: ignore[arg-type]
     weights = out / "best.safetensors"
     assert str(weights) in capsys.readouterr().out
 
@@ -48,7 +48,15 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
         assert all(0 <= float(figure) <= 1 for figure in row.split()[-3:])
     # Training goes on from those weights.
     more = TrainPose(
-        data, data / "more", steps=1, first_steps=0, batch=2, workers=0, quiet=True, init=weights, **options
+        data,
+        out=data / "more",
+        steps=1,
+        first_steps=0,
+        batch=2,
+        workers=0,
+        quiet=True,
+        init=weights,
+        **options,
     )  # type: ignore[arg-type]
     more.run()
     assert (data / "more" / "best.safetensors").is_file()
@@ -56,7 +64,7 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_missing_data_is_told(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no coco_small"):
-        TrainPose(tmp_path, tmp_path / "out").run()
+        TrainPose(tmp_path, out=tmp_path / "out").run()
     with pytest.raises(TensorsimError, match="--data or --coco"):
         EvaluatePose(tmp_path / "x.safetensors").run()
     with pytest.raises(TensorsimError, match="expected one"):
