@@ -17,6 +17,8 @@ class EvaluateClassifier:
         scenes: what to evaluate on.
         people: people per scene, each doing all 12 activities.
         held_out: only every fifth of them: for a folder that the network was trained on.
+        filmed: the maps are of motion as the pipeline finds it in films, imitated without rendering; see ``train
+            classifier --film-maps``.
         maps_seed: of people, motion and noise; one that the network was not trained on makes a test set.
         snr: signal-to-noise ratios in dB.
         poses: folder with a pose.npz of ``tensorsim simulate`` per film, in folders whose names begin with S1 to S12.
@@ -29,6 +31,7 @@ class EvaluateClassifier:
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     people: int = 40
     held_out: bool = False
+    filmed: bool = False
     maps_seed: int = 1
     snr: tuple[float, ...] = (50.0, 40.0, 30.0, 20.0, 10.0)
     poses: Path | None = None
@@ -49,12 +52,16 @@ class EvaluateClassifier:
     def _on_maps(self) -> None:
         from tensorsim import plot
         from tensorsim.config import ACTIVITIES
+        from tensorsim.evaluation.films import FPS
         from tensorsim.training.classifier import clips_of, confusion, load_classifier, logits_of
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         assert self.maps is not None
         network, size = load_classifier(self.weights)
-        build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
+        settings = MapSettings(seed=self.maps_seed)
+        if self.filmed:
+            settings = MapSettings(seed=self.maps_seed, motion_hz=FPS, filmed=True)
+        build_maps(self.maps, self.people, self.scenes, settings, quiet=self.quiet)
         store = MapStore(self.maps)
         print(f"{'scene':14s}" + "".join(f"{ratio:8.0f} dB" for ratio in self.snr) + "   clips")
         matrices = {}

@@ -33,14 +33,12 @@ class EvaluateDenoiser:
 
     def run(self) -> None:
         """Do it."""
-        from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
+        from tensorsim.enhance.dncnn import MapDenoiser
         from tensorsim.enhance.perona_malik import PeronaMalik
         from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, KSVDMaps, compare
 
         rivals: Denoisers = {"none": None}
-        rivals |= {
-            path.stem: MapDenoiser(DnCNN.from_pretrained(path)) for path in (self.weights, *self.against)
-        }
+        rivals |= {path.stem: MapDenoiser.from_pretrained(path) for path in (self.weights, *self.against)}
         rivals["Perona-Malik"] = MapDenoiser(PeronaMalik())
         if self.ksvd:
             rivals["K-SVD"] = KSVDMaps()

@@ -91,7 +91,7 @@ class RadarOptions:
 
     def pose_to_doppler(self, scene: "RadarScene", length_s: float) -> "PoseToDoppler":
         """The stage from joints to maps, for people over about this many seconds."""
-        from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
+        from tensorsim.enhance.dncnn import MapDenoiser
         from tensorsim.motion.resample import PoseResampler
         from tensorsim.motion.savgol import SavitzkyGolay
         from tensorsim.pipeline import PoseToDoppler
@@ -126,7 +126,7 @@ class RadarOptions:
             resampler=resampler,
             pulse_smoother=pulse_smoother,
             scatterers=self._scatterers(scene),
-            denoiser=None if self.denoiser is None else MapDenoiser(DnCNN.from_pretrained(self.denoiser)),
+            denoiser=None if self.denoiser is None else MapDenoiser.from_pretrained(self.denoiser),
         )
 
     def recognizer(self, scene: "RadarScene") -> "ActivityRecognizer | None":

@@ -18,10 +18,15 @@ class TrainClassifier:
         snr: lowest and highest signal-to-noise ratio in dB; 50 50 is the paper's.
         size: height and width of the pictures, a divisor of 224; the network's own if not given.
         init: weights to start from (.safetensors).
+        film_maps: folder of more maps to train on, of motion as the pipeline finds it in films; those that are missing
+            are made first, without rendering.
+        film_people: people per scene in it.
+        learning_rate: of the first half of the epochs; the second has a tenth of it. Less is better from ``init`` on.
         epochs: passes over the training clips.
         batch: clips per step.
         seed: of everything random but the maps.
         maps_seed: of people, motion and noise of the maps.
+        film_seed: of people, motion and noise of ``film_maps``.
         device: auto, cpu or cuda.
         workers: processes that prepare pictures.
         quiet: no progress bar.
@@ -35,21 +40,31 @@ class TrainClassifier:
     snr: tuple[float, float] = (10.0, 50.0)
     size: int | None = None
     init: Path | None = None
+    film_maps: Path | None = None
+    film_people: int = 40
+    learning_rate: float = 1.47e-3
     epochs: int = 20
     batch: int = 64
     seed: int = 0
     maps_seed: int = 0
+    film_seed: int = 2
     device: str = "auto"
     workers: int = 1
     quiet: bool = False
 
     def run(self) -> None:
         """Do it."""
+        from tensorsim.evaluation.films import FPS
         from tensorsim.training.classifier import ClassifierRecipe
         from tensorsim.training.loop import LoopConfig, fit
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
+        filmed = None
+        if self.film_maps is not None:
+            settings = MapSettings(seed=self.film_seed, motion_hz=FPS, filmed=True)
+            build_maps(self.film_maps, self.film_people, self.scenes, settings, quiet=self.quiet)
+            filmed = MapStore(self.film_maps)
         recipe = ClassifierRecipe(
             self.network,
             MapStore(self.maps),
@@ -59,6 +74,9 @@ class TrainClassifier:
             self.seed,
             self.init,
             self.size,
+            filmed,
+            self.film_people,
+            self.learning_rate,
         )
         epoch = max(1, len(recipe.training) // self.batch)
         config = LoopConfig(

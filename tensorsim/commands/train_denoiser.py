@@ -51,7 +51,7 @@ class TrainDenoiser:
             device=self.device,
             workers=self.workers,
             checkpoint_every=min(100, self.steps),
-            validate_every=min(500, self.steps),
+            validate_every=min(200, self.steps),
             quiet=self.quiet,
         )
         figures = fit(recipe, config)

@@ -14,6 +14,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 from tensorsim.enhance.perona_malik import PeronaMalik
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_not_empty
 
+#: What a network's pixels are to a map, see :class:`MapDenoiser`.
+SCALES = ("peak", "floor")
+
 
 class DnCNN(nn.Module):
     """Noisy images in [0, 1] -> clean images ``x - Q(x)``, Q the noise that the network sees.
@@ -132,37 +135,56 @@ def _convolution(in_channels: int, out_channels: int) -> nn.Conv2d:
     return convolution
 
 
+def map_floor(maps: Tensor) -> Tensor:
+    """Median (..., 1, 1) of each map (..., H, W): the level of its noise, if echoes fill less than half of it."""
+    return maps.flatten(-2).median(-1).values.unsqueeze(-1).unsqueeze(-1)
+
+
 class MapDenoiser(nn.Module):
-    """Denoise magnitude maps with a network for images: scale each map to [0, 1], clean it, scale back.
+    """Denoise magnitude maps with a network for images.
+
+    The network sees a map as an image x, and what it takes away from it, ``x - network(x)``, is taken from the map:
+
+    - ``scale="peak"``: ``x = (map - min) / (max - min)``, for networks made for pictures;
+    - ``scale="floor"``: ``x = log(1 + map / floor)`` with the map's median as floor, and what is taken away counts in
+      floors. Noise fills more than half of a map, so that at every signal-to-noise ratio and behind every gain the
+      network meets the same noise. For networks that were trained so.
 
     Maps are cleaned in tiles of columns that overlap by the reach of the network, so the result is that of
     the whole map and memory does not grow with its length.
 
     Args:
-        network: noisy images (..., H, W) in [0, 1] -> clean ones, :class:`DnCNN` or
+        network: noisy images (..., H, W) -> clean ones, :class:`DnCNN` or
             :class:`~tensorsim.enhance.perona_malik.PeronaMalik`.
         tile: columns (time) cleaned at once.
+        scale: ``"peak"`` or ``"floor"``.
+
+    Example:
+        >>> MapDenoiser.from_pretrained()(maps.doppler_time)  # the shipped weights, which say their scale
 
     Raises:
-        TensorsimError: a tile without columns.
+        TensorsimError: a tile without columns, an unknown scale.
     """
 
-    def __init__(self, network: DnCNN | PeronaMalik, tile: int = 1024) -> None:
+    def __init__(self, network: DnCNN | PeronaMalik, tile: int = 1024, scale: str = "peak") -> None:
         super().__init__()
         if tile < 1:
             raise TensorsimError(f"MapDenoiser.tile: got {tile} columns, expected at least 1")
+        if scale not in SCALES:
+            raise TensorsimError(f"MapDenoiser.scale: got {scale!r}, expected one of {SCALES}")
         self.network = network
         self.tile = tile
+        self.scale = scale
         self.reach: int = network.reach
 
     def forward(self, maps: Tensor) -> Tensor:
         """Clean magnitude maps (..., H, W), each on its own scale.
 
-        Differentiable, except where the clean map would lie below the smallest value of the map and is held
-        there.
+        Differentiable, except where the clean map is held at its lower bound.
 
         Returns:
-            Tensor of the shape of ``maps``, not below each map's minimum: magnitudes stay magnitudes.
+            Tensor of the shape of ``maps``. Magnitudes stay magnitudes: nothing is below the smallest value of the
+            map (``"peak"``) or below 0 (``"floor"``). A map whose floor is 0 has no noise and is returned as it is.
 
         Raises:
             TensorsimError: not real, fewer than two dimensions, empty, or NaN.
@@ -171,16 +193,22 @@ class MapDenoiser(nn.Module):
         check_min_rank(maps, 2, "MapDenoiser", "(..., H, W)")
         check_not_empty(maps, "MapDenoiser")
         check_finite(maps, "MapDenoiser")
+        if self.scale == "floor":
+            floor = map_floor(maps)
+            images = torch.log1p(maps / torch.where(floor > 0, floor, torch.ones_like(floor)))
+            return (maps - floor * (images - self.clean(images))).clamp(min=0.0)
         low, high = maps.amin(dim=(-2, -1), keepdim=True), maps.amax(dim=(-2, -1), keepdim=True)
         span = high - low
-        images = ((maps - low) / torch.where(span > 0, span, torch.ones_like(span))).reshape(
-            -1, maps.shape[-2], maps.shape[-1]
-        )
-        clean = torch.stack([self.clean_in_tiles(image) for image in images.unbind(0)]).reshape(maps.shape)
-        return clean.clamp(min=0.0) * span + low
+        images = (maps - low) / torch.where(span > 0, span, torch.ones_like(span))
+        return self.clean(images).clamp(min=0.0) * span + low
+
+    def clean(self, images: Tensor) -> Tensor:
+        """Clean images (..., H, W), one after another."""
+        flat = images.reshape(-1, images.shape[-2], images.shape[-1])
+        return torch.stack([self.clean_in_tiles(image) for image in flat.unbind(0)]).reshape(images.shape)
 
     def clean_in_tiles(self, image: Tensor) -> Tensor:
-        """Clean one image (H, W) in [0, 1], tile after tile."""
+        """Clean one image (H, W), tile after tile."""
         width = image.shape[-1]
         tiles: list[Tensor] = []
         for start in range(0, width, self.tile):
@@ -189,3 +217,21 @@ class MapDenoiser(nn.Module):
             last = min(width, start + count + self.reach)
             tiles.append(self.network(image[:, first:last])[:, start - first : start - first + count])
         return torch.cat(tiles, dim=-1)
+
+    @classmethod
+    def from_pretrained(cls, source: str | os.PathLike[str] | None = None, tile: int = 1024) -> "MapDenoiser":
+        """A :class:`DnCNN` on the scale that its weight file states; one that states none is for pictures.
+
+        Args:
+            source: see :meth:`DnCNN.from_pretrained`.
+            tile: columns cleaned at once.
+
+        Raises:
+            TensorsimError: see :meth:`DnCNN.from_pretrained`; a file that states an unknown scale.
+        """
+        from tensorsim.registry import locate
+        from tensorsim.weights import read_metadata
+
+        path = locate(source, "DnCNN")
+        network = DnCNN.from_pretrained(path).folded()
+        return cls(network, tile, read_metadata(path).get("scale", "peak")).eval()

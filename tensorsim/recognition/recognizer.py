@@ -80,7 +80,7 @@ class ActivityRecognizer(nn.Module):
 
         Args:
             radar: of the maps to come.
-            source: a path of a ``.safetensors``, a name of ``tensorsim models list``, or None for the shipped weights.
+            source: a path of a ``.safetensors``, a name of ``tensorsim models list``, or None for the shipped SPGNet.
 
         Raises:
             TensorsimError: no such file or name, or a file that does not say what it was trained on.
@@ -88,7 +88,7 @@ class ActivityRecognizer(nn.Module):
         from tensorsim.registry import locate
         from tensorsim.weights import read_metadata
 
-        path = locate(source, "SPNet", "SPGNet")
+        path = locate(source, "SPGNet", "SPNet")
         stated = read_metadata(path)
         networks: dict[str, type[SPNet] | type[SPGNet]] = {"SPNet": SPNet, "SPGNet": SPGNet}
         if stated.get("network") not in networks or "size" not in stated:

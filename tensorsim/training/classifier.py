@@ -21,6 +21,7 @@ from tensorsim.weights import load_state_dict, load_strict, read_metadata
 #: Networks by name, each with the size of the pictures that its authors give it.
 NETWORKS: dict[str, tuple[type[nn.Module], int]] = {"spnet": (SPNet, 224), "spgnet": (SPGNet, 32)}
 RANGE_DB = 40.0
+LEARNING_RATE = 1.47e-3
 
 
 class Clip(NamedTuple):
@@ -88,6 +89,9 @@ class ClassifierRecipe(Recipe):
         seed: of weights, order and noise.
         init: weights to start from.
         size: height and width of the pictures, a divisor of the store's; None takes that of :data:`NETWORKS`.
+        filmed: a second store, of motion that a camera saw, to train on beside the first.
+        filmed_people: how many of it.
+        learning_rate: of the first half.
 
     Raises:
         TensorsimError: an unknown network, a range that does not ascend, or a store without the people.
@@ -103,14 +107,20 @@ class ClassifierRecipe(Recipe):
         seed: int = 0,
         init: Path | None = None,
         size: int | None = None,
+        filmed: MapStore | None = None,
+        filmed_people: int = 40,
+        learning_rate: float = LEARNING_RATE,
     ) -> None:
         if network not in NETWORKS:
             raise TensorsimError(f"network: got {network!r}, expected one of {', '.join(NETWORKS)}")
         if not snr_db[0] <= snr_db[1]:
             raise TensorsimError(f"snr_db: got {snr_db}, expected the lower one first")
-        self.store, self.snr_db, self.seed = store, snr_db, seed
-        self.training = clips_of(store, scenes, people, validation=False)
-        self.validation = clips_of(store, scenes, people, validation=True)
+        self.snr_db, self.seed = snr_db, seed
+        stores = [(store, people)] if filmed is None else [(store, people), (filmed, filmed_people)]
+        self.training = [(s, clip) for s, n in stores for clip in clips_of(s, scenes, n, validation=False)]
+        self.validation = {
+            "" if s is store else " films": (s, clips_of(s, scenes, n, validation=True)) for s, n in stores
+        }
         kind, usual = NETWORKS[network]
         self.size = usual if size is None else size
         torch.manual_seed(seed)
@@ -124,6 +134,8 @@ class ClassifierRecipe(Recipe):
             "seed": seed,
             "store_seed": store.settings.seed,
             "init": None if init is None else str(init),
+            "learning_rate": learning_rate,
+            "filmed": None if filmed is None else [filmed.settings.seed, filmed_people],
         }
         metadata = {
             "network": kind.__name__,
@@ -146,9 +158,9 @@ class ClassifierRecipe(Recipe):
     def sample(self, index: int) -> dict[str, Any]:
         """Picture (1, H, W) and label."""
         epoch, place = divmod(index, len(self.training))
-        clip = self.training[int(self.order(epoch)[place])]
+        store, clip = self.training[int(self.order(epoch)[place])]
         snr_db = drawn_snr(self.seed, index, self.snr_db)
-        return {"picture": picture(self.store, clip, snr_db, self.size), "label": clip.activity}
+        return {"picture": picture(store, clip, snr_db, self.size), "label": clip.activity}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """Cross-entropy and accuracy."""
@@ -161,7 +173,8 @@ class ClassifierRecipe(Recipe):
         weights = [p for p in self.net.parameters() if p.dim() > 1]
         rest = [p for p in self.net.parameters() if p.dim() <= 1]
         return torch.optim.Adam(
-            [{"params": weights, "weight_decay": 1e-4}, {"params": rest, "weight_decay": 0.0}], lr=1.47e-3
+            [{"params": weights, "weight_decay": 1e-4}, {"params": rest, "weight_decay": 0.0}],
+            lr=self.settings["learning_rate"],
         )
 
     def rate(self, step: int, steps: int) -> float:
@@ -169,16 +182,18 @@ class ClassifierRecipe(Recipe):
         return 1.0 if 2 * step < steps else 0.1
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Accuracy in each scene and the loss, at ratios drawn once and for all; the lowest loss is best."""
-        logits = logits_of(net, self.store, self.validation, self.snr_db, self.size)
-        labels = torch.tensor([clip.activity for clip in self.validation])
-        correct = (logits.argmax(-1) == labels).float()
-        loss = float(F.cross_entropy(logits, labels))
-        figures = {"score": -loss, "loss": loss}
-        for scene in self.settings["scenes"]:
-            of_scene = torch.tensor([clip.scene == scene for clip in self.validation])
-            figures[f"accuracy {scene}"] = float(correct[of_scene].mean())
-        return figures
+        """Accuracy in each scene and the mean loss, at ratios drawn once and for all; the lowest loss is best."""
+        losses, figures = [], {}
+        for name, (store, clips) in self.validation.items():
+            logits = logits_of(net, store, clips, self.snr_db, self.size)
+            labels = torch.tensor([clip.activity for clip in clips])
+            losses.append(float(F.cross_entropy(logits, labels)))
+            correct = (logits.argmax(-1) == labels).float()
+            for scene in self.settings["scenes"]:
+                of_scene = torch.tensor([clip.scene == scene for clip in clips])
+                figures[f"accuracy {scene}{name}"] = float(correct[of_scene].mean())
+        loss = sum(losses) / len(losses)
+        return {"score": -loss, "loss": loss} | figures
 
 
 @torch.no_grad()

@@ -1,9 +1,12 @@
 """The recipe of the map denoiser: patches of simulated maps with and without noise, the noise to be predicted.
 
 Every clip is simulated twice with one draw of the noise, at a ratio between 0 and 40 dB and at 50 dB, which counts as
-clean. Both are scaled as ``MapDenoiser`` scales the noisy one, so the network learns what it will be asked.
+clean. Images and noise are on the ``"floor"`` scale of ``MapDenoiser``, so the network learns what it will be asked.
+There the noise has the same strength at all ratios: over the peak of the map its power spans six orders of magnitude,
+the error of the noisiest maps is all that counts, and a network trained on that spoils the others.
 """
 
+import math
 import os
 import warnings
 from pathlib import Path
@@ -15,7 +18,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.enhance.dncnn import DnCNN
+from tensorsim.enhance.dncnn import DnCNN, map_floor
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.resample import PoseResampler
@@ -67,22 +70,22 @@ def views(maps: RadarMaps, prf_hz: float) -> dict[str, Tensor]:
 
 
 def on_scale(noisy: Tensor, clean: Tensor) -> tuple[Tensor, Tensor]:
-    """Both maps on the scale that brings the noisy one to [0, 1]."""
-    low, high = noisy.amin(), noisy.amax()
-    return (noisy - low) / (high - low), (clean - low) / (high - low)
+    """What the network is shown of a map (H, W), ``log(1 + noisy / floor)``, and the noise in floors."""
+    floor = map_floor(noisy)
+    return torch.log1p(noisy / floor), (noisy - clean) / floor
 
 
 def cut_patches(
-    noisy: Tensor, clean: Tensor, count: int, generator: torch.Generator
+    image: Tensor, noise: Tensor, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """``count`` patches (N, STORED, STORED) of two images, half of them drawn anywhere, half where there is an echo."""
-    height, width = noisy.shape
-    padded = [
-        F.pad(x[None, None], [0, max(0, STORED - width), 0, max(0, STORED - height)], mode="replicate")[0, 0]
-        for x in (noisy, clean)
-    ]
+    """``count`` patches (N, STORED, STORED) of an image and its noise, half from anywhere, half near an echo."""
+    height, width = image.shape
+    beyond = [0, max(0, STORED - width), 0, max(0, STORED - height)]
+    padded = [F.pad(x[None, None], beyond, mode="replicate")[0, 0] for x in (image, noise)]
     height, width = padded[0].shape
-    blocks = F.max_pool2d(padded[1][None, None], 8, ceil_mode=True)[0, 0]
+    # Of the floor scale: what is left of the map in floors, clean.
+    echo = (padded[0].expm1() - padded[1]).clamp_min(0.0)
+    blocks = F.max_pool2d(echo[None, None], 8, ceil_mode=True)[0, 0]
     strong = torch.multinomial(
         blocks.clamp_min(1e-9).flatten(), count // 2, replacement=True, generator=generator
     )
@@ -92,8 +95,8 @@ def cut_patches(
         row, column = divmod(place, blocks.shape[1])
         top = min(max(0, row * 8 - STORED // 2), height - STORED)
         left = min(max(0, column * 8 - STORED // 2), width - STORED)
-        for piece, image in zip(pieces, padded, strict=True):
-            piece.append(image[top : top + STORED, left : left + STORED])
+        for piece, whole in zip(pieces, padded, strict=True):
+            piece.append(whole[top : top + STORED, left : left + STORED])
     return torch.stack(pieces[0]), torch.stack(pieces[1])
 
 
@@ -122,7 +125,7 @@ def build_pairs(
         pairs = zip(views(noisy, prf_hz).values(), views(clean, prf_hz).values(), strict=True)
         patches = [cut_patches(*on_scale(a.float(), b.float()), per_map, generator) for a, b in pairs]
         scratch = path.with_suffix(f".{os.getpid()}.tmp")
-        stored = {"noisy": torch.cat([p[0] for p in patches]), "clean": torch.cat([p[1] for p in patches])}
+        stored = {"image": torch.cat([p[0] for p in patches]), "noise": torch.cat([p[1] for p in patches])}
         save_file({name: x.half().contiguous() for name, x in stored.items()}, scratch)
         os.replace(scratch, path)
 
@@ -152,12 +155,13 @@ class DenoiserRecipe(Recipe):
                 f"{folder}: got {len(files)} files of patches, expected at least 10 clips per scene"
             )
         self.training, self.held_out = (
-            {name: torch.cat([file[name] for file in part]) for name in ("noisy", "clean")}
+            {name: torch.cat([file[name] for file in part]) for name in ("image", "noise")}
             for part in (parts[False], parts[True])
         )
         self.seed = seed
         torch.manual_seed(seed)
         net = DnCNN(depth)
+        nn.init.zeros_(net.model[-1].get_parameter("weight"))  # begin by doing nothing
         if init is not None:
             from tensorsim.weights import load_state_dict, load_strict
 
@@ -168,14 +172,14 @@ class DenoiserRecipe(Recipe):
             "files": len(files),
             "init": None if init is None else str(init),
         }
-        super().__init__(net, settings, {"network": "DnCNN", "depth": str(depth), "scale": "linear"})
+        super().__init__(net, settings, {"network": "DnCNN", "depth": str(depth), "scale": "floor"})
 
     def sample(self, index: int) -> dict[str, Any]:
-        """A noisy and a clean patch (1, TRAINED, TRAINED), cut and mirrored at random."""
+        """A patch and its noise (1, TRAINED, TRAINED), cut and mirrored at random."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
         which, top, left, mirror = (
             int(torch.randint(most, (), generator=generator))
-            for most in (len(self.training["noisy"]), STORED - TRAINED + 1, STORED - TRAINED + 1, 4)
+            for most in (len(self.training["image"]), STORED - TRAINED + 1, STORED - TRAINED + 1, 4)
         )
         dims = [dim for dim in (1, 2) if mirror & dim]
         found = {}
@@ -185,9 +189,10 @@ class DenoiserRecipe(Recipe):
         return found
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Half the mean square error of the residual, which is that of the image."""
-        error = (net(batch["noisy"]).float() - batch["clean"]).square().mean()
-        return {"loss": error / 2, "psnr": -10 * error.detach().log10()}
+        """Half the mean square error of the residual, which is that of the map in floors."""
+        error = (batch["image"] - net(batch["image"]).float() - batch["noise"]).square().mean()
+        before = batch["noise"].square().mean()
+        return {"loss": error / 2, "gain_db": -10 * (error.detach() / before).log10()}
 
     def optimiser(self) -> torch.optim.Optimizer:
         """Adam."""
@@ -200,20 +205,15 @@ class DenoiserRecipe(Recipe):
         return rise * (0.01 + 0.99 * cosine)
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """PSNR over the patches of held-out clips, and what it gains over doing nothing."""
+        """By how much the error of the patches of held-out clips falls."""
         parameter = next(net.parameters())
-        error, before, count = 0.0, 0.0, 0
-        noisy, clean = self.held_out["noisy"][::4], self.held_out["clean"][::4]
-        for a, b in zip(noisy.split(32), clean.split(32), strict=True):
-            a, b = a.to(parameter).unsqueeze(1), b.to(parameter).unsqueeze(1)
+        error, before = 0.0, 0.0
+        images, noises = self.held_out["image"][::4], self.held_out["noise"][::4]
+        for image, noise in zip(images.split(32), noises.split(32), strict=True):
+            x, wanted = image.to(parameter).unsqueeze(1), noise.to(parameter).unsqueeze(1)
             with torch.autocast(parameter.device.type, torch.bfloat16):
-                cleaned = net(a.to(memory_format=torch.channels_last)).float()
-            error += float((cleaned - b).square().sum())
-            before += float((a - b).square().sum())
-            count += b.numel()
-        psnr = -10 * torch.tensor(error / count).log10().item()
-        return {
-            "score": psnr,
-            "psnr": psnr,
-            "gain_db": psnr + 10 * torch.tensor(before / count).log10().item(),
-        }
+                found = x - net(x.to(memory_format=torch.channels_last)).float()
+            error += float((found - wanted).square().sum())
+            before += float(wanted.square().sum())
+        gain_db = 10 * math.log10(before / error)
+        return {"score": gain_db, "gain_db": gain_db}

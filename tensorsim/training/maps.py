@@ -27,7 +27,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import PoseResampler
-from tensorsim.motion.scatterers import JointScatterers
+from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.radar.closed_form import RangeBinSynthesizer
 from tensorsim.radar.doppler import DopplerFrames
 from tensorsim.radar.echo import EchoSynthesizer
@@ -36,6 +36,7 @@ from tensorsim.radar.noise import mean_power
 from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.range_profile import RangeProfile
 from tensorsim.recognition.map_image import MapToImage
+from tensorsim.training.film_maps import FilmLoss
 
 SCENES = ("free-space", "through-wall")
 
@@ -58,6 +59,8 @@ class MapSettings:
         duration_s: length of a clip.
         motion_hz: joints are sampled at this rate before the spline to the pulses: 240 is the true motion, 30 what
             a camera leaves of it.
+        filmed: joints are those that the pipeline finds on a film of that rate, see
+            :class:`~tensorsim.training.film_maps.FilmLoss`.
 
     Raises:
         TensorsimError: a size below 1, or a span or rate that is not positive.
@@ -68,6 +71,7 @@ class MapSettings:
     speed_m_s: float = 3.8
     duration_s: float = 4.0
     motion_hz: float = _MOTION_HZ
+    filmed: bool = False
 
     def __post_init__(self) -> None:
         if self.size < 1 or not (self.speed_m_s > 0 and self.duration_s > 0 and self.motion_hz > 0):
@@ -120,6 +124,7 @@ class MapMaker:
         self.mti = MovingTargetIndicator()
         self.scatterers = JointScatterers()
         self.resampler = PoseResampler(self.radar.prf_hz)
+        self.film = FilmLoss() if settings.filmed else None
         pulses = round(settings.duration_s * self.radar.prf_hz)
         # A frame per column is enough: what lies between is averaged in a pixel anyway.
         usual = DopplerFrames(self.radar)
@@ -186,8 +191,15 @@ class MapMaker:
         for k in range(count):
             if not bool(motion.valid[k].any()):
                 continue
-            positions = self.resampler(motion.joints[k : k + 1], self.settings.motion_hz)
-            points, rcs = self.scatterers(positions.unsqueeze(0), torch.ones(1, 1, pulses))
+            joints, presence = motion.joints[k], torch.ones(1, 1, pulses)
+            if self.film is not None:
+                rate = self.settings.motion_hz
+                joints, seen = self.film(joints, float(people.height_m[k]), rate, generator)
+                if not bool(seen.any()):
+                    continue
+                presence = visibility_fade(seen[None, None], rate, self.radar.prf_hz, 0, pulses)
+            positions = self.resampler(joints[None], self.settings.motion_hz)
+            points, rcs = self.scatterers(positions.unsqueeze(0), presence)
             points, rcs = points[0], rcs[0]
             every = max(1, pulses // 512)
             power = mean_power(self.echo.target_echo(points[::every], rcs[::every]))
@@ -234,7 +246,7 @@ def build_maps(
     described = folder / "settings.json"
     if described.is_file():
         there = json.loads(described.read_text(encoding="utf-8"))
-        if there != asdict(settings):
+        if MapSettings(**there) != settings:
             raise TensorsimError(f"{folder}: it holds maps of {there}, expected {asdict(settings)}")
     else:
         _write(described, json.dumps(asdict(settings), indent=2).encode())

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
 from tensorsim.errors import TensorsimError
+from tensorsim.weights import save_weights
 from tests.stage import StageTester, assert_same
 
 
@@ -57,6 +58,11 @@ class TestMapDenoiser(TestDnCNN):
 
     def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
         return [*super().bad_inputs(), ((torch.full((6, 9), float("nan")),), "got NaN or infinite values")]
+
+
+class TestMapDenoiserOnTheFloorScale(TestMapDenoiser):
+    def make(self) -> nn.Module:
+        return MapDenoiser(small(), tile=4, scale="floor")
 
 
 @pytest.mark.parametrize(
@@ -229,11 +235,40 @@ def test_each_map_is_cleaned_on_its_own_scale() -> None:
     assert_same([*MapDenoiser(network)(maps)], [*expected], atol=1e-5)
 
 
+def test_noise_counts_in_floors() -> None:
+    """Convention: of the map over its median, what the network takes away from log(1 + map) is taken from the map."""
+    network = small().double()
+    maps = 3 + 40 * torch.rand(2, 7, 9, dtype=torch.float64)
+    floor = np.median(maps.numpy(), axis=(1, 2), keepdims=True)
+    ratio = torch.from_numpy(maps.numpy() / floor)
+    expected = (ratio - network.noise(torch.log(1 + ratio))).clamp(min=0) * torch.from_numpy(floor)
+    clean = MapDenoiser(network, scale="floor")(maps)
+    assert_same(clean, expected, atol=1e-9)
+    assert_same(MapDenoiser(network, scale="floor")(1e-6 * maps), 1e-6 * clean, atol=1e-15)
+
+
+def test_a_map_without_a_floor_has_no_noise() -> None:
+    maps = torch.zeros(6, 9)
+    maps[2] = 5.0
+    assert torch.equal(MapDenoiser(small(), scale="floor")(maps), maps)
+
+
+def test_a_weight_file_says_its_scale(tmp_path: Path) -> None:
+    for stated, scale in (({"scale": "floor"}, "floor"), ({}, "peak")):
+        save_weights(small(), tmp_path / "w.safetensors", stated)
+        denoiser = MapDenoiser.from_pretrained(tmp_path / "w.safetensors", tile=7)
+        assert (denoiser.scale, denoiser.tile, denoiser.training) == (scale, 7, False)
+    save_weights(small(), tmp_path / "w.safetensors", {"scale": "cubic"})
+    with pytest.raises(TensorsimError, match="scale: got 'cubic', expected one of"):
+        MapDenoiser.from_pretrained(tmp_path / "w.safetensors")
+
+
 def test_magnitudes_stay_magnitudes() -> None:
     maps = torch.rand(4, 6, 9)
     clean = MapDenoiser(small())(maps)
     assert bool((small()(maps) < 0).any())
     assert bool((clean >= maps.amin(dim=(-2, -1), keepdim=True)).all())
+    assert float(MapDenoiser(small(), scale="floor")(maps).min()) == 0.0
 
 
 def test_an_even_map_stays_as_it_is() -> None:
@@ -248,3 +283,5 @@ def test_refuses_bad_settings() -> None:
             DnCNN(*arguments)
     with pytest.raises(TensorsimError, match="tile: got 0 columns"):
         MapDenoiser(small(), tile=0)
+    with pytest.raises(TensorsimError, match="scale: got 'sqrt', expected one of"):
+        MapDenoiser(small(), scale="sqrt")

@@ -107,10 +107,21 @@ def test_a_weight_file_says_which_network_it_is(network: str, size: int, tmp_pat
 
 def test_no_body_is_in_both_parts(store: MapStore) -> None:
     mine = recipe(store)
-    trained, kept = ({clip.person for clip in part} for part in (mine.training, mine.validation))
+    trained = {clip.person for _, clip in mine.training}
+    kept = {clip.person for clip in mine.validation[""][1]}
     assert not trained & kept
     assert kept == {4, 9} == {p for p in range(10) if held_out(p)}
     assert len(mine.training) == 8 * 12
+
+
+def test_trains_on_motion_that_a_camera_saw_as_well(store: MapStore) -> None:
+    filmed = MapStore(store.folder)
+    mine = recipe(store, filmed=filmed, filmed_people=5)
+    assert [sum(s is one for s, _ in mine.training) for one in (store, filmed)] == [8 * 12, 4 * 12]
+    assert {clip.person for clip in mine.validation[" films"][1]} == {4}
+    with torch.no_grad():
+        figures = mine.validate(mine.net.eval())
+    assert set(figures) == {"score", "loss", "accuracy through-wall", "accuracy through-wall films"}
 
 
 def test_an_epoch_shows_every_clip_once_in_another_order(store: MapStore) -> None:

@@ -42,19 +42,31 @@ def test_a_pair_differs_by_its_noise() -> None:
 
 
 def test_the_scale_is_that_of_the_map_denoiser() -> None:
-    """A network that returned the stored clean image would make MapDenoiser return the clean map."""
+    """A network that took the stored noise away would make MapDenoiser return the clean map."""
     noisy, clean = simulate_pair("through-wall", 7, 3, 10.0)
-    target = on_scale(noisy.doppler_time, clean.doppler_time)[1]
+    image, noise = on_scale(noisy.doppler_time, clean.doppler_time)
 
     class Oracle(nn.Module):
         reach = 1
 
         def forward(self, images: Tensor) -> Tensor:
-            return target
+            torch.testing.assert_close(images, image)
+            return images - noise
 
-    whole = MapDenoiser(Oracle(), tile=10_000)(noisy.doppler_time)  # type: ignore[arg-type]
-    expected = clean.doppler_time.clamp_min(float(noisy.doppler_time.min()))
-    torch.testing.assert_close(whole, expected, rtol=1e-4, atol=1e-6 * float(expected.max()))
+    whole = MapDenoiser(Oracle(), tile=10_000, scale="floor")(noisy.doppler_time)  # type: ignore[arg-type]
+    expected = clean.doppler_time
+    torch.testing.assert_close(whole, expected, rtol=1e-4, atol=1e-5 * float(expected.max()))
+
+
+@pytest.mark.parametrize("scene", ["through-wall", "free-space"])
+def test_noise_is_alike_at_all_ratios(scene: str) -> None:
+    """What the floor scale is for: between 0 and 20 dB its deviation on the peak scale changes tenfold."""
+    for view in ("doppler_time", "range_time_mti"):
+        rms = []
+        for ratio in (0.0, 20.0):
+            noisy, clean = (getattr(maps, view) for maps in simulate_pair(scene, 7, 3, ratio))
+            rms.append(float(on_scale(noisy, clean)[1].square().mean().sqrt()))
+        assert all(0.5 < x < 1.5 for x in rms)
 
 
 def test_views_of_maps() -> None:
@@ -68,29 +80,41 @@ def test_views_of_maps() -> None:
 @pytest.mark.parametrize("shape", [(100, 300), (40, 500), (200, 50)])
 def test_patches_lie_at_one_place_in_both_maps(shape: tuple[int, int]) -> None:
     """Half of them where the echo is: of a single bright point every such patch shows it."""
+    noise = torch.rand(shape, generator=torch.Generator().manual_seed(1))
     clean = torch.zeros(shape)
-    clean[shape[0] // 2, shape[1] // 2] = 1.0
-    noisy, wanted = cut_patches(2 * clean + 1, clean, 10, torch.Generator().manual_seed(0))
-    assert noisy.shape == wanted.shape == (10, STORED, STORED)
-    torch.testing.assert_close(noisy, 2 * wanted + 1)
-    assert bool((wanted[:5].amax((1, 2)) == 1).all())
+    clean[shape[0] // 2, shape[1] // 2] = 100.0
+    image = torch.log1p(clean + noise)
+    images, noises = cut_patches(image, noise, 10, torch.Generator().manual_seed(0))
+    assert images.shape == noises.shape == (10, STORED, STORED)
+    left = images.expm1() - noises
+    assert bool((left[:5].amax((1, 2)) > 99).all())
+    torch.testing.assert_close(left[left < 50], torch.zeros_like(left[left < 50]), rtol=0, atol=1e-5)
 
 
 def test_learns_to_predict_the_noise(folder: Path, tmp_path: Path) -> None:
     recipe = DenoiserRecipe(folder, depth=3)
-    assert (len(recipe.training["noisy"]), len(recipe.held_out["noisy"])) == (9 * 12, 12)
-    noisy, clean = (recipe.training[name].float() for name in ("noisy", "clean"))
-    noisiest = (noisy - clean).square().mean((1, 2)).topk(12).indices
-    noisy, clean = noisy[noisiest].unsqueeze(1), clean[noisiest].unsqueeze(1)
+    assert (len(recipe.training["image"]), len(recipe.held_out["image"])) == (9 * 12, 12)
     config = LoopConfig(
         tmp_path, 60, 8, workers=0, validate_every=60, ema_decay=0.0, quiet=True, log_every=10
     )
     fit(recipe, config)
     network = DnCNN.from_pretrained(tmp_path / "best.safetensors")
     assert (network.depth, network.training) == (3, False)
+    noisy, clean = simulate_pair("through-wall", 7, 3, 15.0)
+    denoiser = MapDenoiser.from_pretrained(tmp_path / "best.safetensors")
+    assert denoiser.scale == "floor"
     with torch.no_grad():
-        error = (network(noisy) - clean).square().mean()
-    assert float(error) < 0.5 * float((noisy - clean).square().mean())
+        found = denoiser(noisy.range_time_mti.float())
+    error, before = ((x - clean.range_time_mti).square().mean() for x in (found, noisy.range_time_mti))
+    assert float(error) < 0.3 * float(before)
+
+
+def test_begins_by_doing_nothing(folder: Path) -> None:
+    recipe = DenoiserRecipe(folder, depth=3)
+    image = torch.rand(1, 1, 9, 9)
+    assert torch.equal(recipe.net(image), image)
+    with torch.no_grad():
+        assert recipe.validate(recipe.net.eval())["gain_db"] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
@@ -103,10 +127,13 @@ def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
 
 def test_loss_is_half_the_error_of_the_residual(folder: Path) -> None:
     recipe = DenoiserRecipe(folder, depth=2)
+    nn.init.normal_(recipe.net.model[-1].weight)  # type: ignore[index,union-attr]
     sample = {name: patch[None] for name, patch in recipe.sample(0).items()}
-    residual = recipe.net.noise(sample["noisy"]) - (sample["noisy"] - sample["clean"])  # type: ignore[operator]
-    expected = residual.square().mean() / 2
-    torch.testing.assert_close(recipe.loss(recipe.net, sample)["loss"], expected)
+    residual = recipe.net.noise(sample["image"]) - sample["noise"]  # type: ignore[operator]
+    losses = recipe.loss(recipe.net, sample)
+    torch.testing.assert_close(losses["loss"], residual.square().mean() / 2)
+    expected = -10 * (residual.square().mean() / sample["noise"].square().mean()).log10()
+    torch.testing.assert_close(losses["gain_db"], expected)
 
 
 def test_goes_on_and_refuses(folder: Path, tmp_path: Path) -> None:

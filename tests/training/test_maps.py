@@ -1,4 +1,5 @@
 import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -129,3 +130,22 @@ def test_free_space_pictures_are_those_of_the_simulator(tmp_path: Path) -> None:
     difference = difference_db(tmp_path, "free-space", 7, 20.0)
     assert abs(float(difference.mean())) < 0.3
     assert float(difference.abs().median()) < 1.0
+
+
+def test_motion_that_a_camera_saw() -> None:
+    """Empty stays empty; somebody walking is found in the same place within the store's span of speeds."""
+    settings = MapSettings(size=28, duration_s=1.0, motion_hz=30.0, filmed=True)
+    seen, true = (MapMaker("through-wall", s).person(0) for s in (settings, replace(settings, filmed=False)))
+    assert int(seen["signal"][0].max()) == 0
+    assert bool((seen["signal"][1:].flatten(1).amax(1) == 255).all())
+    assert not torch.equal(seen["signal"][7], true["signal"][7])
+    fastest = [(from_bytes(x["signal"][7]) > 1e-2).any(1).nonzero().flatten() for x in (seen, true)]
+    assert abs(float(fastest[0].double().mean() - fastest[1].double().mean())) < 3
+
+
+def test_stores_of_before_are_read(tmp_path: Path) -> None:
+    stated = asdict(SMALL)
+    del stated["filmed"]
+    (tmp_path / "settings.json").write_text(json.dumps(stated))
+    build_maps(tmp_path, 0, ("through-wall",), SMALL, quiet=True)
+    assert MapStore(tmp_path).settings == SMALL
