@@ -48,8 +48,8 @@ class RadarOptions:
     """Static mirror reflection of the wall."""
     snr: float = 50.0
     """Signal-to-noise ratio in dB of the people's echo, per IF sample."""
-    denoiser: Path | None = None
-    """DnCNN weights (.pth or .safetensors) to clean the shown maps."""
+    denoiser: str | None = None
+    """DnCNN weights (.pth or .safetensors, or a name such as dncnn-radar-maps) to clean the shown maps."""
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""

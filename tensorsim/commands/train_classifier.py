@@ -4,59 +4,48 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.training import TrainOptions
+
 
 @dataclass(frozen=True)
-class TrainClassifier:
+class TrainClassifier(TrainOptions):
     """Train SPNet or SPGNet on Doppler-time maps; run again with the same arguments, it goes on where it stopped.
 
     Attributes:
         maps: folder of maps; those that are missing are made first (hours: 12 clips per person and scene).
-        out: folder for checkpoints, logs and best.safetensors.
         network: SPNet on 224x224 pictures, or SPGNet (s2p6) on 32x32.
         scenes: what to train on.
         people: people per scene; each does all 12 activities, and every fifth is held out.
         snr: lowest and highest signal-to-noise ratio in dB; 50 50 is the paper's.
         size: height and width of the pictures, a divisor of 224; the network's own if not given.
-        init: weights to start from (.safetensors).
         film_maps: folder of more maps to train on, of motion as the pipeline finds it in films; those that are missing
             are made first, without rendering.
         film_people: people per scene in it.
         learning_rate: of the first half of the epochs; the second has a tenth of it. Less is better from ``init`` on.
         epochs: passes over the training clips.
         batch: clips per step.
-        seed: of everything random but the maps.
         maps_seed: of people, motion and noise of the maps.
         film_seed: of people, motion and noise of ``film_maps``.
-        device: auto, cpu or cuda.
-        workers: processes that prepare pictures.
-        quiet: no progress bar.
     """
 
     maps: Path
-    out: Path
     network: Literal["spnet", "spgnet"] = "spnet"
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     people: int = 300
     snr: tuple[float, float] = (10.0, 50.0)
     size: int | None = None
-    init: Path | None = None
     film_maps: Path | None = None
     film_people: int = 40
     learning_rate: float = 1.47e-3
     epochs: int = 20
     batch: int = 64
-    seed: int = 0
     maps_seed: int = 0
     film_seed: int = 2
-    device: str = "auto"
-    workers: int = 1
-    quiet: bool = False
 
     def run(self) -> None:
         """Do it."""
         from tensorsim.evaluation.films import FPS
         from tensorsim.training.classifier import ClassifierRecipe
-        from tensorsim.training.loop import LoopConfig, fit
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
@@ -79,17 +68,11 @@ class TrainClassifier:
             self.learning_rate,
         )
         epoch = max(1, len(recipe.training) // self.batch)
-        config = LoopConfig(
-            out=self.out,
+        loop = self.loop(
             steps=self.epochs * epoch,
             batch=self.batch,
-            seed=self.seed,
-            device=self.device,
-            workers=self.workers,
             checkpoint_every=min(50, epoch),
             validate_every=epoch,
             ema_decay=0.0,
-            quiet=self.quiet,
         )
-        figures = fit(recipe, config)
-        print(f"{self.out / 'best.safetensors'}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+        self.train(recipe, loop)

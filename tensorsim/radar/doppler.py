@@ -190,7 +190,9 @@ class DopplerTimeMap(DopplerFrames):
                     doppler_time[place : place + row.shape[0]] = row
         if joined:
             doppler_time = torch.cat(rows)
-        return unflatten_batch(doppler_time.unflatten(0, [batch, count]).transpose(1, 2), list(profiles.shape[:-2]))
+        return unflatten_batch(
+            doppler_time.unflatten(0, [batch, count]).transpose(1, 2), list(profiles.shape[:-2])
+        )
 
 
 class RangeDopplerVideo(DopplerFrames):
