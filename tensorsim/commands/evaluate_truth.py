@@ -25,7 +25,7 @@ class EvaluateTruth:
     motion: tuple[Path, ...] = ()
     """Motion capture (.npz, .bvh), each file a row."""
     motion_fps: float | None = None
-    """Frames per second of motion capture that does not say."""
+    """Frames per second of the motion capture, instead of what the files say; needed where they say nothing."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Radars."""
     settings: tuple[Literal["a", "b", "c"], ...] = ("a", "b")

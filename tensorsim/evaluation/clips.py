@@ -113,7 +113,7 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
     Args:
         path: ``.bvh``, or an ``.npz`` in which every array with three dimensions is a motion.
         count: at most so many.
-        fps: frames per second where the file says nothing.
+        fps: frames per second; overrides the file, needed where it says nothing.
 
     Raises:
         TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; nothing long enough.

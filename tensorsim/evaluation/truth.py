@@ -41,7 +41,7 @@ class TruthLoop:
         clips: per row of the table.
         activities: by name; none is all twelve.
         motions: motion capture files, each a row.
-        motion_fps: their frame rate where they say nothing.
+        motion_fps: their frame rate; overrides what they say.
         scenes: names of radar presets.
         sources: of ``SOURCES``.
         stages: also replace every stage by the truth, in the last of the sources that has it.
