@@ -31,7 +31,7 @@ class EvaluateDetector:
         from tensorsim.training.detector import HELD_OUT_PERCENT
         from tensorsim.training.detector_metrics import compare_tracks, measure, tracks_of_film
         from tensorsim.training.pose_data import split
-        from tensorsim.training.shards import Sample, Shards, find_shards, read_coco
+        from tensorsim.training.shards import Sample, Shards, find_shards, read_coco_folder
         from tensorsim.vision.rtmdet import RTMDet
 
         groups: dict[str, list[Sample]] = {}
@@ -39,10 +39,7 @@ class EvaluateDetector:
             held_out = split(Shards(find_shards(self.data, "coco_small")), HELD_OUT_PERCENT)[1]
             groups["coco_small, held out"] = held_out
         if self.coco is not None:
-            files = sorted(self.coco.glob("*.json"))
-            if len(files) != 1:
-                raise TensorsimError(f"--coco: got {len(files)} json files in {self.coco}, expected one")
-            groups[str(self.coco)] = read_coco(files[0], self.coco / "images")
+            groups[str(self.coco)] = read_coco_folder(self.coco)
         if not groups and not self.films:
             raise TensorsimError(
                 "evaluate detector: got nothing to look at, expected --data, --coco or --films"

@@ -24,14 +24,11 @@ class EvaluatePose:
 
     def run(self) -> None:
         """Do it."""
-        from torch import nn
-
+        from tensorsim.pipeline import pretrained_pose
         from tensorsim.training.pose import HELD_OUT_PERCENT
         from tensorsim.training.pose_data import Person, people, split, upright
         from tensorsim.training.pose_metrics import evaluate_pose
-        from tensorsim.training.shards import Shards, find_shards, read_coco
-        from tensorsim.vision.hrnet import HRNet
-        from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
+        from tensorsim.training.shards import Shards, find_shards, read_coco_folder
 
         groups: dict[str, list[Person]] = {}
         if self.data is not None:
@@ -39,18 +36,14 @@ class EvaluatePose:
                 found = people(split(Shards(find_shards(self.data, name)), percent)[1])
                 groups |= {f"{name}, held out": found, f"{name}, held out, upright": upright(found)}
         if self.coco is not None:
-            files = sorted(self.coco.glob("*.json"))
-            if len(files) != 1:
-                raise TensorsimError(f"--coco: got {len(files)} json files in {self.coco}, expected one")
-            found = people(read_coco(files[0], self.coco / "images"))
+            found = people(read_coco_folder(self.coco))
             groups |= {str(self.coco): found, f"{self.coco}, upright": upright(found)}
         if not groups:
             raise TensorsimError("evaluate pose: got no pictures, expected --data or --coco")
 
-        onnx = self.weights is not None and self.weights.suffix == ".onnx"
-        network: nn.Module = OnnxHeatmaps(self.weights) if onnx else HRNet.from_pretrained(self.weights)  # type: ignore[arg-type]
+        pose = pretrained_pose(self.weights, self.flip_test).eval()
         print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s} {'body':>7s}")
         for name, persons in groups.items():
-            figure = evaluate_pose(network, persons, self.flip_test)
+            figure = evaluate_pose(pose, persons)
             row = f"{figure['oks']:7.3f} {figure['pck']:8.3f} {figure['pck_body']:7.3f}"
             print(f"{name:40s} {len(persons):5d} {row}")

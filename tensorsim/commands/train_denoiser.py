@@ -30,12 +30,12 @@ class TrainDenoiser(TrainOptions):
         """Do it."""
         from tensorsim.training.denoiser import DenoiserRecipe, build_pairs
 
-        build_pairs(self.maps, self.clips, self.maps_seed, quiet=self.quiet)
-        recipe = DenoiserRecipe(self.maps, self.depth, self.seed, self.init)
         loop = self.loop(
             steps=self.steps,
             batch=self.batch,
             checkpoint_every=min(100, self.steps),
             validate_every=min(200, self.steps),
         )
+        build_pairs(self.maps, self.clips, self.maps_seed, quiet=self.quiet)
+        recipe = DenoiserRecipe(self.maps, self.depth, self.seed, self.init)
         self.train(recipe, loop)

@@ -55,13 +55,13 @@ def pck(found: Tensor, points: Tensor, known: Tensor, side: Tensor, share: float
     return (right & known).sum() / known.sum()
 
 
-def evaluate_pose(network: nn.Module, persons: Sequence[Person], flip_test: bool = False) -> dict[str, float]:
+def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, float]:
     """Find the keypoints of people in their boxes, as the pipeline does, and compare with the labels.
 
     Args:
-        network: crops to heat maps, as :class:`~tensorsim.vision.hrnet.HRNet`; in evaluation mode.
+        network: a :class:`~tensorsim.vision.topdown.TopDownPose`, or crops to heat maps, as
+            :class:`~tensorsim.vision.hrnet.HRNet`; in evaluation mode.
         persons: whom to look for.
-        flip_test: average with the mirror image.
 
     Returns:
         ``oks``, the mean over people; ``pck``, PCK@0.1 over all keypoints; ``pck_body``, without the face.
@@ -72,7 +72,7 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person], flip_test: bool
     if not persons:
         raise TensorsimError("evaluate_pose: got no people, expected some with labelled keypoints")
     device = next(iter(network.parameters()), torch.zeros(0)).device
-    pose = TopDownPose(network, flip_test=flip_test).to(device)
+    pose = (network if isinstance(network, TopDownPose) else TopDownPose(network)).to(device)
     found = []
     with torch.no_grad():
         for person in persons:

@@ -145,6 +145,18 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
         raise TensorsimError(f"{path}: not a COCO annotation file ({error})") from error
 
 
+def read_coco_folder(folder: Path) -> list[Sample]:
+    """:func:`read_coco` of the one annotation file (``.json``) in a folder, with its pictures in ``images/``.
+
+    Raises:
+        TensorsimError: no such file, or several; another content.
+    """
+    files = sorted(folder.glob("*.json"))
+    if len(files) != 1:
+        raise TensorsimError(f"{folder}: got {len(files)} json files, expected one")
+    return read_coco(files[0], folder / "images")
+
+
 def _read_tar(path: Path) -> list[Sample]:
     pictures: dict[str, tarfile.TarInfo] = {}
     labels: dict[str, Any] = {}
