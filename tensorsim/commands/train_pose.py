@@ -64,7 +64,7 @@ class TrainPose(TrainOptions):
             load_strict(net, load_state_dict(self.init), self.init)
         recipe = PoseRecipe(
             net,
-            sided=people(coco),
+            sided=people(coco, least=4, least_px=32),
             unsided=people(lspet),
             validation={"coco": people(coco_held_out), "lspet": upright(people(lspet_held_out))},
             rendered=RenderedPeople(cutouts, places),

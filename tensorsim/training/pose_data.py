@@ -68,6 +68,7 @@ class Augmentation:
         shift: of the centre, standard deviation in sizes of the box.
         upright: probability that a person who lies or leans is stood upright before that turn.
         half: probability that only the upper or the lower body is cropped.
+        cut: probability that the picture ends within the person, mostly below.
     """
 
     scale: float = 0.15
@@ -75,6 +76,7 @@ class Augmentation:
     shift: float = 0.04
     upright: float = 0.6
     half: float = 0.3
+    cut: float = 0.25
 
 
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
@@ -181,6 +183,9 @@ def crop_person(
         mirrored = bool(generator.random() < 0.5)
         if generator.random() < 0.5:
             border = cv2.BORDER_REPLICATE
+        if generator.random() < augmentation.cut:
+            image, box, keypoints = cut_picture(image, box, keypoints, generator)
+            frame = box.astype(np.float64)
         turn, frame = _vary(box, keypoints, augmentation, generator)
     matrix = box_matrix(frame, size, mirrored)
     matrix[:, :2] = matrix[:, :2] @ turn
@@ -192,6 +197,31 @@ def crop_person(
     points = body[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     inside = ((points >= -0.5) & (points <= np.array([size[1], size[0]]) - 0.5)).all(1)
     return Crop(warped.astype(np.uint8, copy=False), points.astype(np.float32), inside & (body[:, 2] > 0))
+
+
+def cut_picture(
+    image: Picture, box: Floats, keypoints: Floats, generator: np.random.Generator
+) -> tuple[Picture, Floats, Floats]:
+    """Picture, box and keypoints of a person as if the edge of the picture went through them.
+
+    Half the time the lower edge does, else one of the others, a quarter to three quarters into the box; points
+    beyond are not labelled any more. With fewer than four labelled points left, all stays as it is.
+    """
+    axis = int(generator.random() < 0.6)  # 0 cuts at a u, 1 at a v
+    keep_low = bool(generator.random() < (0.5 if axis == 0 else 0.85))
+    edge = int(box[axis] + generator.uniform(0.25, 0.75) * (box[2 + axis] - box[axis]))
+    edge = min(max(edge, 1), image.shape[1 - axis] - 1)
+    kept = (keypoints[:, axis] < edge) == keep_low
+    if ((keypoints[:, 2] > 0) & kept).sum() < 4:
+        return image, box, keypoints
+    box, keypoints = box.copy(), keypoints.copy()
+    keypoints[~kept, 2] = 0
+    part = slice(0, edge) if keep_low else slice(edge, None)
+    box[axis if not keep_low else 2 + axis] = edge - int(keep_low)
+    if not keep_low:
+        box[[axis, 2 + axis]] -= edge
+        keypoints[:, axis] -= edge
+    return (image[:, part] if axis == 0 else image[part]), box, keypoints
 
 
 def _vary(

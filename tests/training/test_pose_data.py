@@ -18,6 +18,7 @@ from tensorsim.training.pose_data import (
     RenderedPeople,
     box_matrix,
     crop_person,
+    cut_picture,
     lean_deg,
     people,
     rotation,
@@ -92,7 +93,9 @@ def test_points_stay_on_what_they_label_and_sides_are_exchanged_in_the_mirror() 
     image = drawn(keypoints)
     straight = mirrored = 0
     for seed in range(60):
-        crop = crop_person(image, BOX, keypoints, SIZE, Augmentation(half=0), np.random.default_rng(seed))
+        crop = crop_person(
+            image, BOX, keypoints, SIZE, Augmentation(half=0, cut=0), np.random.default_rng(seed)
+        )
         red, green, blue = (centroid(crop.image, channel) for channel in range(3))
         # Anticlockwise or not: the mirror alone changes it.
         (a, b), (c, d) = red - blue, green - blue
@@ -124,13 +127,40 @@ def test_half_bodies() -> None:
     keypoints = standing()
     shown = set()
     for seed in range(30):
-        options = Augmentation(scale=0, turn_deg=0, shift=0, half=1)
+        options = Augmentation(scale=0, turn_deg=0, shift=0, half=1, cut=0)
         known = crop_person(
             drawn(keypoints), BOX, keypoints, SIZE, options, np.random.default_rng(seed)
         ).known
         assert known[[11, 12]].all()
         shown.add((bool(known[NOSE]), bool(known[15])))
     assert shown == {(True, False), (False, True)}
+
+
+def test_pictures_that_end_within_the_person() -> None:
+    keypoints = standing()
+    image = drawn(keypoints)
+    edges = set()
+    for seed in range(60):
+        part, box, points = cut_picture(image, BOX, keypoints, np.random.default_rng(seed))
+        height, width = part.shape[:2]
+        assert (points[:, 2] > 0).sum() >= 4
+        assert (box[:2] >= 0).all() and (box[2:] <= [width - 1, height - 1]).all()
+        known = points[points[:, 2] > 0]
+        assert (known[:, :2] < [width, height]).all() and (known[:, :2] >= 0).all()
+        for joint, channel in ((LEFT_WRIST, 0), (RIGHT_WRIST, 1), (NOSE, 2)):
+            u, v = points[joint, :2]
+            if points[joint, 2] > 0 and 6 < u < width - 7 and 6 < v < height - 7:
+                np.testing.assert_allclose(centroid(part, channel), [u, v], atol=0.05)
+        edges.add((part.shape[0] < image.shape[0], part.shape[1] < image.shape[1], points[NOSE, 2] > 0))
+    assert {(True, False, True), (True, False, False), (False, True, True)} <= edges
+
+
+def test_a_person_with_few_labels_is_not_cut() -> None:
+    keypoints = standing()
+    keypoints[4:, 2] = 0
+    for seed in range(10):
+        part, box, points = cut_picture(drawn(keypoints), BOX, keypoints, np.random.default_rng(seed))
+        assert box is BOX or (points[:4, 2] > 0).all()
 
 
 @pytest.mark.parametrize("angle", [-120, -30, 0, 45, 90])
@@ -150,7 +180,7 @@ def test_who_lies_is_stood_upright() -> None:
     keypoints = standing((-100, -130))
     keypoints[:, :2] = keypoints[:, :2] @ rotation(100).T + [120, 100]
     box = np.concatenate([keypoints[:, :2][keypoints[:, 2] > 0].min(0), keypoints[:, :2].max(0)])
-    options = Augmentation(scale=0, turn_deg=0, shift=0, half=0, upright=1)
+    options = Augmentation(scale=0, turn_deg=0, shift=0, half=0, cut=0, upright=1)
     for seed in range(5):
         crop = crop_person(
             np.zeros((200, 240, 3), np.uint8), box, keypoints, SIZE, options, np.random.default_rng(seed)
@@ -233,7 +263,7 @@ def test_rendered_people_cover_the_place_and_nothing_else(tmp_path: Path) -> Non
     colour = place.image()[0, 0].astype(int)
     rendered = RenderedPeople(Cutouts([write_cutouts(tmp_path / "cutouts-000.tar")]), [place])
     for seed in range(8):
-        crop = rendered.crop(0, SIZE, Augmentation(half=0), np.random.default_rng(seed))
+        crop = rendered.crop(0, SIZE, Augmentation(half=0, cut=0), np.random.default_rng(seed))
         at = np.rint(crop.points[crop.known]).astype(int).clip(0, [95, 127])
         assert (np.abs(crop.image[at[:, 1], at[:, 0]].astype(int) - [255, 0, 0]) <= 8).all()
         # Every pixel is a mixture of the two colours: no black seam, no repeated border.
