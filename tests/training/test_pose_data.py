@@ -144,9 +144,11 @@ def test_pictures_that_end_within_the_person() -> None:
         part, box, points = cut_picture(image, BOX, keypoints, np.random.default_rng(seed))
         height, width = part.shape[:2]
         assert (points[:, 2] > 0).sum() >= 4
-        assert (box[:2] >= 0).all() and (box[2:] <= [width - 1, height - 1]).all()
+        assert (box[:2] >= 0).all()
+        assert (box[2:] <= [width - 1, height - 1]).all()
         known = points[points[:, 2] > 0]
-        assert (known[:, :2] < [width, height]).all() and (known[:, :2] >= 0).all()
+        assert (known[:, :2] < [width, height]).all()
+        assert (known[:, :2] >= 0).all()
         for joint, channel in ((LEFT_WRIST, 0), (RIGHT_WRIST, 1), (NOSE, 2)):
             u, v = points[joint, :2]
             if points[joint, 2] > 0 and 6 < u < width - 7 and 6 < v < height - 7:
@@ -159,7 +161,7 @@ def test_a_person_with_few_labels_is_not_cut() -> None:
     keypoints = standing()
     keypoints[4:, 2] = 0
     for seed in range(10):
-        part, box, points = cut_picture(drawn(keypoints), BOX, keypoints, np.random.default_rng(seed))
+        _part, box, points = cut_picture(drawn(keypoints), BOX, keypoints, np.random.default_rng(seed))
         assert box is BOX or (points[:4, 2] > 0).all()
 
 
