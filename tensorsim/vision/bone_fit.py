@@ -12,7 +12,8 @@ lengths L and Cauchy's loss c(x) = log(1 + x^2), which lets go of a lifter that 
 
 The acceleration sa to be expected of a joint along its line of sight is told by its own across it and by that of the
 whole body. Where height and tilt of the camera are known, no joint is below the floor and the lowest one is near the
-height at which it rests.
+height at which it rests; a foot that stands is there to 2 mm, one that moves may have its heel up. A joint that the
+camera does not see says nothing of bones and floor: it stays near the place that the lifter gave it.
 
 Levenberg-Marquardt from r' finds a minimum; its normal equations couple a frame to the two before it and are solved
 frame pair by frame pair, so the work grows with the length of the clip and no faster. Which of the many minima that
@@ -111,6 +112,8 @@ class _Clip(NamedTuple):
         shares: (S, 8) expected lengths in metres.
         height: (S, T, 13, 2) of joints over where they rest, at distance 0 and how much more per metre.
         stiff: (S, T + 2, 13) weights of squared second differences that end in a frame; 0 where there is none.
+        rest: (S, T, 13) weights of squared heights of the lowest joint; 0 of joints that are not seen.
+        hidden: (S, T, 12) variance in m^2 that bones to joints have which are not seen.
     """
 
     lines: Tensor
@@ -118,6 +121,8 @@ class _Clip(NamedTuple):
     shares: Tensor
     height: Tensor
     stiff: Tensor
+    rest: Tensor
+    hidden: Tensor
 
 
 class BoneFit(nn.Module):
@@ -139,9 +144,9 @@ class BoneFit(nn.Module):
         rounds: at most so many times the branches are chosen anew.
 
     Shape:
-        joints (..., P, T, 14, 3) in world metres, valid (..., P, T) bool and frames per second -> joints, moved
-        along their lines of sight; the neck comes out in the middle of the shoulders. Invalid frames and clips of
-        fewer than 4 frames stay. Computed in float64. Differentiable by joints, but for the choice of branches.
+        joints (..., P, T, 14, 3) in world metres, seen (..., P, T, 14) bool and frames per second -> joints, moved
+        along their lines of sight; the neck comes out in the middle of the shoulders. Frames in which nothing is
+        seen and clips of fewer than 4 frames stay. Computed in float64. Differentiable by joints, but for the choice of branches.
 
     Raises:
         TensorsimError: settings that are not positive, wrong shapes, NaN.
@@ -154,6 +159,7 @@ class BoneFit(nn.Module):
     length_of_bone: Tensor
     shares: Tensor
     rest: Tensor
+    ankle: Tensor
 
     def __init__(
         self,
@@ -161,7 +167,7 @@ class BoneFit(nn.Module):
         person_height_m: tuple[float, ...] = (1.80, 1.70),
         calibrated: bool = False,
         bone_m: float = 0.0001,
-        length_share: float = 0.04,
+        length_share: float = 0.025,
         acceleration_m_s2: float = 4.0,
         acceleration_ratio: float = 3.0,
         depth_m: float = 0.05,
@@ -191,6 +197,8 @@ class BoneFit(nn.Module):
         self.trust, self.floor_m, self.steps, self.rounds = trust, floor_m, steps, rounds
         self.calibrated = calibrated
         self.floor_reach_m = 0.03  # a lowest joint further off the floor than this is likely off it
+        self.standing_m, self.heel_s = 0.002, 0.02  # deviation of ankles that rest, and how much more per m/s
+        self.hidden_m = 0.1  # deviation of bones to joints that are not seen
         # All 14 joints and the middle of the hips from the 13 that are free.
         spread = torch.zeros(15, 13, dtype=torch.float64)
         for column, joint in enumerate((0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13)):
@@ -207,26 +215,28 @@ class BoneFit(nn.Module):
             ("length_of_bone", torch.tensor(LENGTH_OF_BONE)),
             ("shares", torch.tensor(LENGTH_SHARES, dtype=torch.float64)),
             ("rest", rest),
+            ("ankle", rest == ANKLE_SHARE),
         ):
             self.register_buffer(name, constant, persistent=False)
 
-    def forward(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
-        """Joints, valid frames and frame rate -> joints."""
+    def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
+        """Joints, which of them are seen and frame rate -> joints."""
         layout = "(..., P, T, 14, 3) joints in metres"
         check_floating(joints, "joints")
         check_min_rank(joints, 4, "joints", layout)
         check_size(joints, -2, 14, "joints", layout)
         check_size(joints, -1, 3, "joints", layout)
-        if valid.dtype != torch.bool or valid.shape != joints.shape[:-2]:
+        if seen.dtype != torch.bool or seen.shape != joints.shape[:-1]:
             raise TensorsimError(
-                f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(joints.shape[:-2])}"
+                f"seen: got {seen.dtype} of {list(seen.shape)}, expected bool of {list(joints.shape[:-1])}"
             )
         check_finite(joints, "joints")
         check_positive(fps, "fps")
         people, frames = joints.shape[-4], joints.shape[-3]
         if frames < 4 or joints.numel() == 0:
             return joints
-        # Invalid frames repeat the nearest valid one.
+        # Frames in which nothing is seen repeat the nearest one.
+        valid = seen.any(dim=-1)
         source = nearest_valid(valid)[..., None, None].expand_as(joints)
         sight = joints.gather(-3, source).reshape(-1, frames, 14, 3).double() - self.camera
         distance = sight.square().sum(dim=-1).sqrt().clamp(min=1e-3)
@@ -235,19 +245,26 @@ class BoneFit(nn.Module):
         free = torch.cat([torch.arange(1, device=joints.device), torch.arange(2, 14, device=joints.device)])
         lines, given = (sight / distance[..., None]).index_select(2, free), distance.index_select(2, free)
 
-        there = valid.reshape(-1, 1, frames)
-        shake = jitter(lines.transpose(1, 2), there.expand(-1, 13, -1)).mean(dim=(1, 2))
+        there = seen.reshape(-1, frames, 14).index_select(2, free)
+        shake = jitter(lines.transpose(1, 2), there.transpose(1, 2)).mean(dim=(1, 2))
         away = given.mean(dim=(1, 2))
         noise = 2 * shake * away
+        across = away[:, None, None, None] * lines
         acceleration = expected_acceleration(
-            away[:, None, None, None] * lines, shake * away, fps, self.acceleration, self.acceleration_ratio
+            across, shake * away, fps, self.acceleration, self.acceleration_ratio
         )
         stiff = F.pad((fps**2 / acceleration[:, 1:-1]).square(), [0, 0, 2, 2])
         base = (self.camera[2] - self.rest * tall[:, None])[:, None].expand_as(given)
         if not self.calibrated:
             base = base + 1e6  # no floor anywhere near
         height = torch.stack([base, lines[..., 2]], dim=-1)
-        clip = _Clip(lines, given, tall[:, None] * self.shares, height, stiff)
+        square = (fps / 2) ** 2 * (across[:, 2:] - across[:, :-2]).square().sum(dim=-1)  # of speeds
+        square = torch.cat([square[:, :1], square, square[:, -1:]], dim=1)
+        ankle_m2 = self.standing_m**2 + self.heel_s**2 * square
+        rest = there / torch.where(self.ankle, ankle_m2, torch.full_like(ankle_m2, self.floor_m**2))
+        ends = torch.matmul((~there).to(lines.dtype), (self.bones != 0).to(lines.dtype).t())
+        hidden = self.hidden_m**2 * ends.clamp(max=1.0)
+        clip = _Clip(lines, given, tall[:, None] * self.shares, height, stiff, rest, hidden)
 
         r, stretch, loose_m = given, torch.zeros_like(clip.shares), noise
         for slack in (90.0, 30.0, 9.0):
@@ -277,12 +294,12 @@ class BoneFit(nn.Module):
     def _bones(
         self, clip: _Clip, r: Tensor, stretch: Tensor, bone_m: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Directions (S, T, 12, 3) of bones, wanted lengths (S, 12), errors (S, T, 12) in ``bone_m`` (S), cost (S)."""
+        """Directions (S, T, 12, 3) of bones, wanted lengths (S, 12), errors and their deviations (S, T, 12)."""
         vectors = torch.matmul(self.bones, r[..., None] * clip.lines)
         lengths = vectors.square().sum(dim=-1).clamp(min=1e-12).sqrt()
         wanted = (clip.shares * stretch.exp())[:, self.length_of_bone]
-        error = (lengths - wanted[:, None]) / bone_m[:, None, None]
-        return vectors / lengths[..., None], wanted, error, error.square().sum(dim=(1, 2))
+        deviation = (bone_m.square()[:, None, None] + clip.hidden).sqrt()
+        return vectors / lengths[..., None], wanted, (lengths - wanted[:, None]) / deviation, deviation
 
     def _given(self, clip: _Clip, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Half the gradient (S, T, 13) and Hessian (S, T, 13, 13) of deviations from what is given, and cost (S)."""
@@ -301,16 +318,17 @@ class BoneFit(nn.Module):
         over = clip.height[..., 0] + clip.height[..., 1] * r
         square = (over / self.floor_reach_m).square()
         # Geman and McClure's for the lowest joint, as who jumps rests on none; nothing for others unless they sink.
-        lowest = F.one_hot(over.argmin(dim=-1), 13).to(r.dtype)
-        sunk = (over < 0).to(r.dtype)
-        weight = (lowest / (1 + square).square() + sunk) / self.floor_m**2
+        lowest = F.one_hot(over.argmin(dim=-1), 13) * clip.rest
+        sunk = ((over < 0) & (clip.rest > 0)).to(r.dtype) / self.floor_m**2
+        weight = lowest / (1 + square).square() + sunk
         loss = lowest * self.floor_reach_m**2 * square / (1 + square) + sunk * over.square()
         slope = clip.height[..., 1]
-        return weight * over * slope, weight * slope.square(), loss.sum(dim=(1, 2)) / self.floor_m**2
+        return weight * over * slope, weight * slope.square(), loss.sum(dim=(1, 2))
 
     def _cost(self, clip: _Clip, r: Tensor, stretch: Tensor, bone_m: Tensor) -> Tensor:
         bend = (r[:, 2:] - 2 * r[:, 1:-1] + r[:, :-2]).square() * clip.stiff[:, 2:-2]
-        cost = self._bones(clip, r, stretch, bone_m)[3] + bend.sum(dim=(1, 2)) + self._given(clip, r)[2]
+        error = self._bones(clip, r, stretch, bone_m)[2]
+        cost = error.square().sum(dim=(1, 2)) + bend.sum(dim=(1, 2)) + self._given(clip, r)[2]
         cost = cost + (stretch / self.length_share).square().sum(dim=1)
         return cost + self._floor(clip, r)[2] if self.calibrated else cost
 
@@ -343,10 +361,10 @@ class BoneFit(nn.Module):
         damping = torch.ones(tracks, dtype=r.dtype, device=r.device)
         cost = self._cost(clip, r, stretch, bone_m)
         for _ in range(steps):
-            directions, wanted, error, _ = self._bones(clip, r, stretch, bone_m)
+            directions, wanted, error, deviation = self._bones(clip, r, stretch, bone_m)
             along = torch.matmul(directions, clip.lines.transpose(-1, -2))
-            slope = along * self.bones / bone_m[:, None, None, None]  # of errors by distances, (S, T, 12, 13)
-            by_length = -(wanted / bone_m[:, None])[..., None] * owner  # (S, 12, 8)
+            slope = along * self.bones / deviation[..., None]  # of errors by distances, (S, T, 12, 13)
+            by_length = -(wanted[:, None] / deviation)[..., None] * owner  # (S, T, 12, 8)
 
             bend = (r[:, 2:] - 2 * r[:, 1:-1] + r[:, :-2]) * clip.stiff[:, 2:-2]
             force = F.pad(bend, [0, 0, 2, 0]) - 2 * F.pad(bend, [0, 0, 1, 1]) + F.pad(bend, [0, 0, 0, 2])
@@ -357,7 +375,7 @@ class BoneFit(nn.Module):
             if self.calibrated:
                 push_up, firm, _ = self._floor(clip, r)
                 force, blocks = force + push_up, blocks + torch.diag_embed(firm)
-            cross = torch.matmul(slope.transpose(-1, -2), by_length[:, None])
+            cross = torch.matmul(slope.transpose(-1, -2), by_length)
             right = torch.cat([-force[..., None], -cross], dim=-1)
             if frames % 2 == 1:  # a frame of its own fills the last pair
                 blocks = torch.cat([blocks, eye.expand(tracks, 1, 13, 13)], dim=1)
@@ -373,9 +391,9 @@ class BoneFit(nn.Module):
             solved = solve_block_tridiagonal(diagonal, below, right.reshape(tracks, pairs, 26, 9))
             solved = solved.reshape(tracks, 2 * pairs, 13, 9)[:, :frames]
             # The lengths, then the distances given the lengths.
-            push = torch.matmul(by_length.transpose(-1, -2), error.sum(dim=1)[..., None])[..., 0]
+            push = torch.matmul(by_length.transpose(-1, -2), error[..., None])[..., 0].sum(dim=1)
             push = push + stretch / self.length_share**2
-            firmness = frames * torch.matmul(by_length.transpose(-1, -2), by_length)
+            firmness = torch.matmul(by_length.transpose(-1, -2), by_length).sum(dim=1)
             firmness = firmness + (1 / self.length_share**2 + 1e3 * damping[:, None, None]) * torch.eye(
                 8, dtype=r.dtype, device=r.device
             )

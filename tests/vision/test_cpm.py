@@ -11,19 +11,14 @@ from torch.utils.flop_counter import FlopCounterMode
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.cpm import CPM
 from tensorsim.vision.topdown import TopDownPose
+from tests.networks import settled
 from tests.stage import StageTester
 
 
 def make_network(stages: int = 2) -> CPM:
     """A seeded net in evaluation mode whose normalisations are far from the identity."""
     torch.manual_seed(1)
-    network = CPM(stages)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.running_mean.normal_(std=0.1)
-            module.running_var.uniform_(0.5, 2)
-            nn.init.uniform_(module.weight, 0.5, 1.5)
-    return network.eval()
+    return settled(CPM(stages))
 
 
 class TestCPM(StageTester):

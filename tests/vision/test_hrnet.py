@@ -12,6 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.hrnet import HRNet, HRNetConfig
+from tests.networks import settled
 from tests.stage import StageTester
 
 TINY = HRNetConfig(width=4, blocks=1, modules=(1, 2, 2), bottlenecks=2, planes=4)
@@ -20,15 +21,9 @@ TINY = HRNetConfig(width=4, blocks=1, modules=(1, 2, 2), bottlenecks=2, planes=4
 def make_network(config: HRNetConfig | int = TINY) -> HRNet:
     """A seeded net in evaluation mode whose normalisations are far from the identity."""
     torch.manual_seed(1)
-    network = HRNet(config)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.running_mean.normal_(std=0.1)
-            module.running_var.uniform_(0.5, 2)
-            nn.init.uniform_(module.weight, 0.5, 1.5)
-            nn.init.normal_(module.bias, std=0.1)
+    network = settled(HRNet(config))
     nn.init.normal_(network.final_layer.weight)
-    return network.eval()
+    return network
 
 
 class TestHRNet(StageTester):

@@ -9,18 +9,13 @@ from torch.nn import functional as F
 
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.videopose3d import VideoPose3D
+from tests.networks import settled
 from tests.stage import StageTester
 
 
 def make_network(kernels: tuple[int, ...] = (3, 3, 5)) -> VideoPose3D:
     torch.manual_seed(1)
-    network = VideoPose3D(kernels, channels=16)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm1d):
-            module.running_mean.normal_(std=0.1)
-            module.running_var.uniform_(0.5, 2)
-            nn.init.uniform_(module.weight, 0.5, 1.5)
-    return network.eval()
+    return settled(VideoPose3D(kernels, channels=16))
 
 
 class TestVideoPose3D(StageTester):
