@@ -1,8 +1,10 @@
 """The command line: the list of commands in ``tensorsim.commands``."""
 
+import os
 import sys
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Union
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
@@ -82,6 +84,7 @@ def _choice(commands: Mapping[str, Any]) -> Any:
             ]
             for name, command in commands.items()
         )
+        + ((Annotated[None, tyro.conf.Suppress],) if len(commands) == 1 else ())  # one type is no union
     ]
 
 
@@ -94,23 +97,50 @@ def _group(description: str, commands: Mapping[str, Any]) -> Callable[..., Any]:
     return choose
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the ``tensorsim`` command. Exit status: 0 done, 2 bad input, 130 interrupted."""
-    command = tyro.cli(
+@contextmanager
+def _one_line_of_why() -> Iterator[None]:
+    """Whatever input, the file system or the keyboard stops the program with ends in one line and a status."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Who reads the lines has seen enough (`| head`). Python would try to flush them once more at the exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except TensorsimError as error:
+        _stop(2, f"error: {error}")
+    except OSError as error:
+        _stop(2, f"error: {f'{error.filename}: {error.strerror}' if error.filename else error}")
+    except KeyboardInterrupt:
+        _stop(130, "interrupted")
+
+
+def _stop(status: int, why: str) -> NoReturn:
+    print(f"tensorsim: {' '.join(why.split())}", file=sys.stderr)
+    sys.exit(status)
+
+
+def parse(arguments: list[str] | None = None) -> Any:
+    """The command that these words ask for, by default those of the command line; exits where they ask for none."""
+    return tyro.cli(
         _choice(COMMANDS),
         prog="tensorsim",
         description=f"What a radar would have seen of the people in a video.\n{EXAMPLES}",
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
-    try:
-        command.run()
-    except TensorsimError as error:
-        print(f"tensorsim: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("tensorsim: interrupted, nothing written", file=sys.stderr)
-        sys.exit(130)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the ``tensorsim`` command.
+
+    Exit status: 0 done, 2 bad input or a file that cannot be read or written, 130 interrupted, 141 nobody reads the
+    output.
+    """
+    with _one_line_of_why():
+        parse(arguments).run()
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Out of Python: TorchScript files that run where tensorsim is not installed."""
 
 import os
-import tempfile
 import warnings
-from pathlib import Path
 
 import torch
 from torch import nn
+
+from tensorsim.files import complete_file
 
 
 def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
@@ -22,7 +22,6 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
     Raises:
         TensorsimError: the module holds an edge that is no graph node, such as ``OnnxHeatmaps``.
     """
-    target = Path(path)
     training = module.training
     with warnings.catch_warnings():
         # TorchScript is deprecated upstream; whoever calls this function asks for it nevertheless.
@@ -31,11 +30,5 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
             scripted = torch.jit.script(module.eval())
         finally:
             module.train(training)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".tmp")
-        os.close(handle)
-        try:
-            torch.jit.save(scripted, temporary)
-            os.replace(temporary, target)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+        with complete_file(path) as scratch:
+            torch.jit.save(scripted, str(scratch))

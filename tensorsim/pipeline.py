@@ -2,7 +2,7 @@
 
 Each class is one ``nn.Module`` made of the stages beside it; every stage can be replaced by another with the
 same interface. ``forward`` works on whole clips in memory and scripts; the methods it is made of are public so
-that a long film can be streamed through them piece by piece (see ``tensorsim.cli``).
+that a long film can be streamed through them piece by piece (see ``tensorsim.run``).
 """
 
 import os
@@ -214,7 +214,7 @@ class VideoToPose(nn.Module):
         told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
-        joints = self.bone_fit(joints, told, fps)
+        joints = self.bone_fit(joints, seen & told.unsqueeze(-1), fps)
         # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
         # the pose that was found stands in for it, as long as the person is in the scene.
         in_scene = told.unsqueeze(-1).expand_as(seen)
@@ -226,7 +226,7 @@ class VideoToPose(nn.Module):
 class _AsPlaced(nn.Module):
     """No :class:`~tensorsim.vision.bone_fit.BoneFit`."""
 
-    def forward(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+    def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
         return joints
 
 

@@ -2,9 +2,6 @@
 
 import json
 import math
-import os
-import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -102,20 +99,6 @@ def maps_of_pose(
 
         maps = stage.simulator.stream(source, pulses)
     return RadarMaps(*(field.cpu() for field in stage.denoise(maps)))
-
-
-@contextmanager
-def complete_or_nothing(out: Path) -> Iterator[Path]:
-    """A scratch folder whose files move to ``out`` when the block ends well; otherwise nothing remains of it."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
-    try:
-        yield scratch
-        out.mkdir(exist_ok=True)
-        for file in scratch.iterdir():
-            os.replace(file, out / file.name)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 @dataclass(frozen=True)

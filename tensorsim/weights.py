@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 
 PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
 
@@ -231,9 +232,8 @@ def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict
             if not bool(torch.isfinite(value).all()):
                 raise TensorsimError(f"{path}: {key} has values that float16 cannot hold")
         stored[key] = value
-    scratch = path.with_suffix(".tmp")
-    save_file(stored, scratch, metadata)
-    os.replace(scratch, path)
+    with complete_file(path) as scratch:
+        save_file(stored, scratch, metadata)
 
 
 def _equal(state_dict: dict[str, Tensor], first: str, second: str) -> bool:

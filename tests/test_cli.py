@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 import re
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from tensorsim.commands.options import RadarOptions
 from tensorsim.data.video import VideoReader
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.presets import PRESETS
+from tensorsim.weights import save_weights
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import assert_same
 
@@ -233,3 +235,50 @@ def test_importing_tensorsim_is_light() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_reader_who_has_seen_enough_ends_the_program_quietly() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "tensorsim.cli", "models", "list"]
+    with os.fdopen(write, "w") as nobody:
+        done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.stderr == ""
+    assert done.returncode == 141
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--out", "a_file/out"], r"a_file\S*: (File exists|Not a directory)$"),
+        (["--out", "out", "--radar", "broken.yaml"], r"--radar: broken\.yaml: .* line 2"),
+        (["--out", "out", "--seed", "-1"], r"--seed: got -1, expected an integer from 0"),
+        (["--out", "out", "--seed", str(2**80)], r"--seed: got \d+, expected an integer from 0"),
+    ],
+)
+def test_one_line_says_what_is_wrong(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a_file").touch()
+    Path("broken.yaml").write_text("carrier_hz: [1\n")
+    np.savez("walk.npz", joints=np.random.default_rng(0).random((30, 14, 3)), fps=30.0)
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["simulate", "walk.npz", "--scene", "through-wall", "--quiet", *arguments])
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("tensorsim: error: ")
+    assert re.search(message, line), line
+    assert {p.name for p in tmp_path.iterdir()} == {"a_file", "broken.yaml", "walk.npz"}
+
+
+def test_a_classifier_of_other_classes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "five.safetensors"
+    save_weights(ts.recognition.SPGNet(5), path, {"network": "SPGNet", "size": "32"})
+    options = RadarOptions(classifier=str(path))
+    with pytest.raises(ts.TensorsimError, match=r"--classifier: .* 5 classes, expected the 12 activities"):
+        options.recognizer(options.radar_scene())

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 import tensorsim as ts
+from tensorsim import cli
+from tensorsim.model_files import manifest
 from tests.bvh import write_bvh
 from tests.film import STANDING
 from tests.test_sources import coco_json
@@ -33,6 +36,15 @@ def test_generated_motion_becomes_maps_and_film() -> None:
     (block,) = (b for b in blocks("python") if "ActivityGenerator" in b)
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=True)
     assert "torch.Size([5, 3, 180, 320])" in done.stdout
+
+
+def test_recipes_of_the_shipped_files_are_commands() -> None:
+    recipes = [line for entry in manifest() for line in entry["recipe"].split("; ")]
+    assert len(recipes) >= 6
+    for recipe in recipes:
+        program, *words = shlex.split(recipe)
+        assert program == "tensorsim"
+        assert callable(cli.parse(words).run)
 
 
 @pytest.mark.slow

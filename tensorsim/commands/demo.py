@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tensorsim.commands.networks import default_networks, load_networks
+from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions
 from tensorsim.errors import TensorsimError
 
@@ -26,7 +26,7 @@ CAMERA_M = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Demo(RadarOptions):
+class Demo(NetworkOptions, RadarOptions):
     """Film a rendered person and turn the film into what a radar would have seen. Needs no file.
 
     Writes what `simulate` writes, film.mp4, and the truth: maps_truth.npz, pose_truth.npz; every picture of a map
@@ -38,12 +38,6 @@ class Demo(RadarOptions):
     walking, walking to sitting, falling to walking, walking to falling, or empty."""
     out: Path = Path("demo")
     """Folder for the results; its files appear together, when all are complete."""
-    detector: str | None = None
-    """Person detector, see `tensorsim simulate`. Default: $TENSORSIM_DETECTOR, else the shipped one."""
-    pose: str | None = None
-    """COCO-17 heat maps, see `tensorsim simulate`. Default: $TENSORSIM_POSE, else the shipped one."""
-    flip_test: bool = True
-    """Show the pose network every person mirrored as well: better, at twice the cost."""
     duration: float = 4.0
     """Length of the film in seconds."""
 
@@ -68,6 +62,7 @@ class Demo(RadarOptions):
         from tensorsim.data.render import PersonRenderer
         from tensorsim.data.video import VideoReader, write_video
         from tensorsim.device import usable_device
+        from tensorsim.files import complete_or_nothing
         from tensorsim.motion.activities import ActivityGenerator
         from tensorsim.motion.people import PeopleConfig
         from tensorsim.pipeline import VideoToPose
@@ -104,7 +99,7 @@ class Demo(RadarOptions):
                 camera=camera,
                 smoother=KalmanSmoother(mode="forward" if self.motion == "paper" else "rts"),
             )
-            with run.complete_or_nothing(self.out) as folder:
+            with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people.to(device).eval(), device)
                 pose, maps = run.simulate(source, maps_stage, folder, self.seed, device, self.quiet)

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.options import check_seed
+from tensorsim.errors import TensorsimError
+
 
 @dataclass(frozen=True)
 class EvaluateDenoiser:
@@ -37,8 +40,17 @@ class EvaluateDenoiser:
         from tensorsim.enhance.perona_malik import PeronaMalik
         from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, KSVDMaps, compare
 
+        check_seed(self.seed)
+        counts = {"--clips": self.clips, "--scenes": len(self.scenes), "--snr": len(self.snr)}
+        for name, count in counts.items():
+            if count < 1:
+                raise TensorsimError(f"{name}: got {count}, expected at least 1")
+        if self.out is not None and (self.out.is_dir() or not self.out.parent.is_dir()):
+            raise TensorsimError(
+                f"--out: got {self.out}, expected the name of a file in a folder that is there"
+            )
         rivals: Denoisers = {"none": None}
-        rivals |= {path.stem: MapDenoiser.from_pretrained(path) for path in (self.weights, *self.against)}
+        rivals |= {str(path): MapDenoiser.from_pretrained(path) for path in (self.weights, *self.against)}
         rivals["Perona-Malik"] = MapDenoiser(PeronaMalik())
         if self.ksvd:
             rivals["K-SVD"] = KSVDMaps()

@@ -47,19 +47,18 @@ class EvaluateDetector:
         if self.films and self.against is None:
             raise TensorsimError("--films: got no --against, the detector to compare with")
 
-        detectors = {
-            "shipped" if self.weights is None else str(self.weights): RTMDet.from_pretrained(self.weights)
-        }
-        if self.against is not None:
-            detectors[str(self.against)] = RTMDet.from_pretrained(self.against)
+        files = [self.weights] if self.against is None else [self.weights, self.against]
+        detectors = [
+            ("shipped" if file is None else str(file), RTMDet.from_pretrained(file)) for file in files
+        ]
         with torch.inference_mode():
             for name, samples in groups.items():
-                for source, detector in detectors.items():
+                for source, detector in detectors:
                     figures = measure(detector, samples)
                     told = ", ".join(f"{key} {value:.3g}" for key, value in figures.items())
                     print(f"{name}, {source}: {told}")
             for film in self.films:
-                tracks = [tracks_of_film(detector, film) for detector in detectors.values()]
+                tracks = [tracks_of_film(detector, film) for _, detector in detectors]
                 followed = compare_tracks(*tracks)
                 share = followed.shared / max(followed.reference_frames, 1)
                 print(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.networks import default_networks
+from tensorsim.commands.options import check_seed
 from tensorsim.errors import TensorsimError
 
 
@@ -47,9 +48,14 @@ class EvaluateTruth:
         """Do it."""
         if self.out.exists() and not self.out.is_dir():
             raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        check_seed(self.seed)
+        if self.motion_fps is not None and not self.motion:
+            raise TensorsimError("--motion-fps: got it without --motion, which it is of")
         detector = pose = None
         if "c" in self.settings:
             detector, pose = default_networks(self.detector, self.pose)
+        elif self.detector is not None or self.pose is not None:
+            raise TensorsimError("--detector, --pose: got them without setting c, which they are for")
 
         from tensorsim.evaluation.report import markdown, save_pictures, write_csv
         from tensorsim.evaluation.settings import Pipelines
@@ -69,7 +75,9 @@ class EvaluateTruth:
         self.out.mkdir(parents=True, exist_ok=True)
         (self.out / "truth.md").write_text(text, encoding="utf-8")
         write_csv(self.out / "truth.csv", cells)
+        pipelines = Pipelines({scene: PRESETS[scene] for scene in self.scenes})
         for scene in self.scenes:
-            speed = Pipelines({scene: PRESETS[scene]}).speed_m_s(scene)
-            save_pictures(self.out / f"doppler_time_{scene}.png", example_maps(loop, scene), speed)
+            pictures = example_maps(loop, pipelines, scene)
+            if pictures:
+                save_pictures(self.out / f"doppler_time_{scene}.png", pictures, pipelines.speed_m_s(scene))
         print(text)

@@ -1,13 +1,12 @@
 """``tensorsim library build``: a pool of poses for nearest-match lifting."""
 
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from tensorsim.commands.options import check_seed
 from tensorsim.errors import TensorsimError
 
 #: What motion files are called.
@@ -42,6 +41,7 @@ class BuildLibrary:
         files = _files(self.sources)
         if not files and self.generate == 0:
             raise TensorsimError("library build: got nothing to build from, expected SOURCES or --generate N")
+        check_seed(self.seed)
         if self.generate < 0:
             raise TensorsimError(f"--generate: got {self.generate}, expected a number of poses")
         if self.most is not None and self.most < 1:
@@ -53,6 +53,7 @@ class BuildLibrary:
         from safetensors.torch import save_file
         from tqdm import tqdm
 
+        from tensorsim.files import complete_file
         from tensorsim.training import pose_pool
 
         generator = torch.Generator().manual_seed(self.seed)
@@ -70,15 +71,8 @@ class BuildLibrary:
         different = len(poses)
         poses = poses[: self.most]
 
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        handle, scratch = tempfile.mkstemp(dir=self.out.parent, prefix=f".{self.out.name}-")
-        os.close(handle)
-        try:
+        with complete_file(self.out) as scratch:
             save_file({"poses": poses.half().contiguous()}, scratch)
-            os.chmod(scratch, 0o644)
-            os.replace(scratch, self.out)
-        finally:
-            Path(scratch).unlink(missing_ok=True)
         print(f"{self.out}: {len(poses)} poses, of {different} that differ, of {given}")
 
 

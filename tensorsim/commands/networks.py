@@ -1,10 +1,25 @@
 """What several commands ask for: the detector and the pose network, by path or name."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions:
+    """Which networks find people in films."""
+
+    detector: str | None = None
+    """Person detector: RTMDet as .pth, .safetensors or .onnx, or a name of `tensorsim models list`. Default:
+    $TENSORSIM_DETECTOR, else the shipped one."""
+    pose: str | None = None
+    """COCO-17 heat maps: HRNet as .pth, .safetensors or name, or any such network as .onnx. Default: $TENSORSIM_POSE,
+    else the shipped one."""
+    flip_test: bool = True
+    """Show the pose network every person mirrored as well: better, at twice the cost."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:

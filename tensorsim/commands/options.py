@@ -21,6 +21,12 @@ FULL_RATE_PULSES = 1 << 17
 DISPLAY_RATE_HZ = 256.0
 
 
+def check_seed(seed: int, option: str = "--seed") -> None:
+    """Refuse a seed that some generator would not take."""
+    if not 0 <= seed < 2**32:
+        raise TensorsimError(f"{option}: got {seed}, expected an integer from 0 to 2^32 - 1")
+
+
 @dataclass(frozen=True, kw_only=True)
 class RadarOptions:
     """How people's joints become maps."""
@@ -62,6 +68,7 @@ class RadarOptions:
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
+        check_seed(self.seed)
         if not math.isfinite(self.snr):
             raise TensorsimError(f"--snr: got {self.snr}, expected a finite number of dB")
         if out.exists() and not out.is_dir():
@@ -95,22 +102,18 @@ class RadarOptions:
         from tensorsim.motion.resample import PoseResampler
         from tensorsim.motion.savgol import SavitzkyGolay
         from tensorsim.pipeline import PoseToDoppler
-        from tensorsim.radar.echo import EchoSynthesizer
         from tensorsim.radar.simulator import RadarSimulator
 
         radar, wall, floor = scene
         behind_wall = wall is not None
         simulator = RadarSimulator(
             radar,
-            echo=EchoSynthesizer(
-                radar,
-                wall=wall,
-                multipath=behind_wall if self.multipath is None else self.multipath,
-                leakage=self.leakage,
-                wall_echo=self.wall_echo,
-                wall_paths=self.wall_paths,
-                floor=floor,
-            ),
+            wall,
+            multipath=behind_wall if self.multipath is None else self.multipath,
+            leakage=self.leakage,
+            wall_echo=self.wall_echo,
+            wall_paths=self.wall_paths,
+            floor=floor,
             snr_db=self.snr,
             integration=self.integration,
             display_rate_hz=DISPLAY_RATE_HZ if length_s * radar.prf_hz > FULL_RATE_PULSES else None,
@@ -131,14 +134,21 @@ class RadarOptions:
 
     def recognizer(self, scene: "RadarScene") -> "ActivityRecognizer | None":
         """What tells the activity from the maps of this radar; None if it is not wanted."""
+        from tensorsim.config import ACTIVITIES
         from tensorsim.recognition import ActivityRecognizer
 
         if self.classifier == "none":
             return None
         try:
-            return ActivityRecognizer.from_pretrained(scene.radar, self.classifier)
+            recognizer = ActivityRecognizer.from_pretrained(scene.radar, self.classifier)
         except TensorsimError as error:
             raise TensorsimError(f"--classifier: {error}") from None
+        if recognizer.network.num_classes != len(ACTIVITIES):
+            raise TensorsimError(
+                f"--classifier: {self.classifier} tells {recognizer.network.num_classes} classes, expected the "
+                f"{len(ACTIVITIES)} activities"
+            )
+        return recognizer
 
     def _scatterers(self, scene: "RadarScene") -> "nn.Module":
         from tensorsim.motion import Body13Scatterers, JointScatterers, LimbScatterers

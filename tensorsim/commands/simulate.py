@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tensorsim.commands.networks import default_networks, load_networks
+from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions
 from tensorsim.errors import TensorsimError
 
@@ -34,7 +34,7 @@ _MEANT_FOR = {
 
 
 @dataclass(frozen=True)
-class Simulate(RadarOptions):
+class Simulate(NetworkOptions, RadarOptions):
     """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
 
     Writes maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
@@ -45,14 +45,6 @@ class Simulate(RadarOptions):
     keypoints of a video as .json, or a folder with one per frame."""
     out: Path
     """Folder for the results; its files appear together, when all are complete."""
-    detector: str | None = None
-    """Person detector: RTMDet as .pth, .safetensors or .onnx, or a name of `tensorsim models list`. Default:
-    $TENSORSIM_DETECTOR, else the shipped one."""
-    pose: str | None = None
-    """COCO-17 heat maps: HRNet as .pth, .safetensors or name, or any such network as .onnx. Default: $TENSORSIM_POSE,
-    else the shipped one."""
-    flip_test: bool = True
-    """Show the pose network every person mirrored as well: better, at twice the cost."""
     person_height: tuple[float, ...] = (1.80, 1.70)
     """Body heights in metres in order of appearance; the last one serves the rest."""
     initial_distance: tuple[float, ...] | None = None
@@ -88,6 +80,7 @@ class Simulate(RadarOptions):
 
         from tensorsim import run
         from tensorsim.device import usable_device
+        from tensorsim.files import complete_or_nothing
         from tensorsim.sources import KINDS, kind_of
 
         kind = kind_of(self.source)
@@ -104,7 +97,7 @@ class Simulate(RadarOptions):
             source, networks = self._source(kind, device)
             length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
             stage = self.pose_to_doppler(scene, length_s).to(device).eval()
-            with run.complete_or_nothing(self.out) as folder:
+            with complete_or_nothing(self.out) as folder:
                 pose, maps = run.simulate(source, stage, folder, self.seed, device, self.quiet)
                 run.write_maps(folder, maps, run.axes_of(stage, maps))
                 label = run.label_of(recognizer, maps)
@@ -149,8 +142,6 @@ class Simulate(RadarOptions):
 
         cut = sources.Cut(self.start, self.end, self.stride)
         if kind == "motion":
-            if not self.source.exists():
-                raise TensorsimError(f"{self.source}: no such file, expected motion capture")
             if self.initial_distance is not None and len(self.initial_distance) > 1:
                 raise TensorsimError(
                     f"--initial-distance: got {self.initial_distance} for motion capture, expected that of the "

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
+from tensorsim.errors import TensorsimError
 
 
 @dataclass(frozen=True)
@@ -28,14 +30,19 @@ class TrainDenoiser(TrainOptions):
 
     def run(self) -> None:
         """Do it."""
-        from tensorsim.training.denoiser import DenoiserRecipe, build_pairs
+        from tensorsim.training.denoiser import DenoiserRecipe, build_pairs, untrained
 
+        check_seed(self.maps_seed, "--maps-seed")
+        if self.clips < 10:
+            raise TensorsimError(f"--clips: got {self.clips}, expected at least 10, of which one is held out")
         loop = self.loop(
             steps=self.steps,
             batch=self.batch,
             checkpoint_every=min(100, self.steps),
             validate_every=min(200, self.steps),
         )
+        net = untrained(self.depth, self.seed)
+        self.begin(net)
         build_pairs(self.maps, self.clips, self.maps_seed, quiet=self.quiet)
-        recipe = DenoiserRecipe(self.maps, self.depth, self.seed, self.init)
+        recipe = DenoiserRecipe(net, self.maps, self.seed)
         self.train(recipe, loop)

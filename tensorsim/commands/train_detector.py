@@ -1,21 +1,20 @@
 """``tensorsim train detector``: train the small person detector on labelled and rendered people."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tensorsim.commands.training import TrainOptions
+from tensorsim.commands.training import PeopleOptions
+from tensorsim.errors import check_positive
 
 
 @dataclass(frozen=True)
-class TrainDetector(TrainOptions):
+class TrainDetector(PeopleOptions):
     """Train RTMDet, small, on tar shards of people; run again with the same arguments, it goes on where it stopped.
 
     OUT/detector.safetensors has the best weights with calibrated scores.
 
     Attributes:
         data: folder of coco_small-*.tar, lspet-*.tar, pedestrian-*.tar and backgrounds-*.tar.
-        cutouts: folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given.
-        rendered: number of rendered people.
         variant: of RTMDet.
         steps: optimiser steps.
         batch: pictures per step.
@@ -24,8 +23,6 @@ class TrainDetector(TrainOptions):
     """
 
     data: Path
-    cutouts: Path | None = None
-    rendered: int = 3000
     variant: str = "small-person"
     steps: int = 4000
     batch: int = 16
@@ -36,12 +33,12 @@ class TrainDetector(TrainOptions):
         """Do it."""
         import torch
 
-        from tensorsim.training.cutouts import Cutouts, render_cutouts
         from tensorsim.training.detector import DetectorRecipe, TrainedRTMDet, read_sources
         from tensorsim.training.detector_metrics import calibrate
         from tensorsim.vision.rtmdet import RTMDet
-        from tensorsim.weights import load_state_dict, load_strict, save_weights
+        from tensorsim.weights import save_weights
 
+        check_positive(self.learning_rate, "--learning-rate")
         loop = self.loop(
             steps=self.steps,
             batch=self.batch,
@@ -50,11 +47,9 @@ class TrainDetector(TrainOptions):
         )
         torch.manual_seed(self.seed)
         net = TrainedRTMDet(self.variant)
-        if self.init is not None:
-            load_strict(net, load_state_dict(self.init), self.init)
-        folder = self.out / "cutouts" if self.cutouts is None else self.cutouts
-        cutouts = Cutouts(render_cutouts(self.rendered, self.seed, folder, self.quiet))
-        sources, held_out = read_sources(self.data, cutouts)
+        self.begin(net)
+        sources, held_out = read_sources(self.data)
+        sources = replace(sources, cutouts=self.rendered_people())
         recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate)
         detector = RTMDet.from_pretrained(self.train(recipe, loop))
         calibrate(detector, held_out)

@@ -3,17 +3,16 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tensorsim.commands.training import TrainOptions
+from tensorsim.commands.training import PeopleOptions
+from tensorsim.errors import check_positive
 
 
 @dataclass(frozen=True)
-class TrainPose(TrainOptions):
+class TrainPose(PeopleOptions):
     """Train HRNet, small, on tar shards of people; run again with the same arguments, it goes on where it stopped.
 
     Attributes:
         data: folder of lspet-*.tar, coco_small-*.tar and backgrounds-*.tar.
-        cutouts: folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given.
-        rendered: number of rendered people.
         size: height and width of the crops.
         first_size: height and width of smaller crops to begin with.
         first_steps: steps with those.
@@ -24,8 +23,6 @@ class TrainPose(TrainOptions):
     """
 
     data: Path
-    cutouts: Path | None = None
-    rendered: int = 3000
     size: tuple[int, int] = (128, 96)
     first_size: tuple[int, int] = (96, 64)
     first_steps: int = 6000
@@ -38,36 +35,27 @@ class TrainPose(TrainOptions):
         """Do it."""
         import torch
 
-        from tensorsim.training.cutouts import Cutouts, render_cutouts
         from tensorsim.training.pose import HELD_OUT_PERCENT, PoseRecipe
         from tensorsim.training.pose_data import RenderedPeople, people, split, upright
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.hrnet import HRNet, HRNetConfig
-        from tensorsim.weights import load_state_dict, load_strict
 
-        loop = self.loop(
-            steps=self.steps,
-            batch=self.batch,
-            validate_every=500,
-        )
+        check_positive(self.learning_rate, "--learning-rate")
+        loop = self.loop(steps=self.steps, batch=self.batch, validate_every=500)
+        torch.manual_seed(self.seed)
+        net = HRNet(HRNetConfig(self.width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)
+        self.begin(net)
         coco, coco_held_out = split(
             Shards(find_shards(self.data, "coco_small")), HELD_OUT_PERCENT["coco_small"]
         )
         lspet, lspet_held_out = split(Shards(find_shards(self.data, "lspet")), HELD_OUT_PERCENT["lspet"])
         places = Shards(find_shards(self.data, "backgrounds"))
-        folder = self.out / "cutouts" if self.cutouts is None else self.cutouts
-        cutouts = Cutouts(render_cutouts(self.rendered, self.seed, folder, self.quiet))
-
-        torch.manual_seed(self.seed)
-        net = HRNet(HRNetConfig(self.width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)
-        if self.init is not None:
-            load_strict(net, load_state_dict(self.init), self.init)
         recipe = PoseRecipe(
             net,
             sided=people(coco, least=4, least_px=32),
             unsided=people(lspet),
             validation={"coco": people(coco_held_out), "lspet": upright(people(lspet_held_out))},
-            rendered=RenderedPeople(cutouts, places),
+            rendered=RenderedPeople(self.rendered_people(), places),
             seed=self.seed,
             learning_rate=self.learning_rate,
             first_size=self.first_size,

@@ -1,10 +1,16 @@
 """Options that all training commands share, and the run that they describe."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tensorsim.commands.options import check_seed
+
 if TYPE_CHECKING:
+    from torch import nn
+
+    from tensorsim.training.cutouts import Cutouts
     from tensorsim.training.loop import LoopConfig, Recipe
 
 
@@ -27,8 +33,11 @@ class TrainOptions:
 
     def loop(self, **settings: Any) -> "LoopConfig":
         """The loop with these options; refuses what cannot work before anything is read or made."""
+        from tensorsim.device import usable_device
         from tensorsim.training.loop import LoopConfig
 
+        check_seed(self.seed)
+        usable_device(self.device)
         return LoopConfig(
             out=self.out,
             seed=self.seed,
@@ -38,11 +47,36 @@ class TrainOptions:
             **settings,
         )
 
+    def begin(self, net: "nn.Module") -> None:
+        """Give a network the weights to start from, if there are any."""
+        from tensorsim.weights import load_state_dict, load_strict
+
+        if self.init is not None:
+            load_strict(net, load_state_dict(self.init), self.init)
+
     def train(self, recipe: "Recipe", loop: "LoopConfig") -> Path:
-        """Train, or go on; prints the figures of the best weights and returns their file."""
+        """Train, or go on; the first process prints the figures of the best weights. Returns their file."""
         from tensorsim.training.loop import fit
 
         figures = fit(recipe, loop)
         best = self.out / "best.safetensors"
-        print(f"{best}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
+        if int(os.environ.get("RANK", 0)) == 0:  # the others do not validate
+            print(f"{best}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
         return best
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeopleOptions(TrainOptions):
+    """How a network is trained on labelled and rendered people."""
+
+    cutouts: Path | None = None
+    """Folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given."""
+    rendered: int = 3000
+    """Number of rendered people."""
+
+    def rendered_people(self) -> "Cutouts":
+        """Rendered people, rendered first where they are missing, which takes hours."""
+        from tensorsim.training.cutouts import Cutouts, render_cutouts
+
+        folder = self.out / "cutouts" if self.cutouts is None else self.cutouts
+        return Cutouts(render_cutouts(self.rendered, self.seed, folder, self.quiet))

@@ -10,6 +10,8 @@ import os
 import pickle
 import re
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,6 +83,42 @@ class Keypoints2D(NamedTuple):
     size: tuple[int, int] | None = None
 
 
+@contextmanager
+def _reading(path: Path, kind: str) -> Iterator[None]:
+    """Whatever a reader stumbles over in a file that is damaged or another is one error that names the file."""
+    try:
+        yield
+    except TensorsimError:
+        raise
+    except Exception as error:  # such exceptions share no base class
+        raise TensorsimError(f"{path}: got a file that cannot be read as {kind} ({error})") from error
+
+
+@contextmanager
+def _npz(path: Path) -> Iterator[Any]:
+    """The arrays of an npz."""
+    with _reading(path, "npz"):
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is no archive of arrays")
+        with np.load(path, allow_pickle=False) as arrays:
+            yield arrays
+
+
+def motion_keys(path: str | os.PathLike[str]) -> list[str | None]:
+    """The ``key`` of each motion of a file for :func:`load_motion`; [None] where there is nothing to choose.
+
+    Raises:
+        TensorsimError: an npz that cannot be read.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npz" or not path.is_file():
+        return [None]
+    with _npz(path) as arrays:
+        if "positions_3d" in arrays.files:
+            return [None]
+        return [None] if _preferred(arrays) is not None else [*_motions(arrays)] or [None]
+
+
 def load_motion(
     path: str | os.PathLike[str],
     key: str | None = None,
@@ -110,7 +148,7 @@ def load_motion(
     """
     path = Path(path)
     if not path.is_file():
-        raise TensorsimError(f"{path}: got no such file, expected motion capture (.bvh or .npz)")
+        raise TensorsimError(f"{path}: no such file, expected motion capture (.bvh or .npz)")
     if fps is not None:
         check_positive(fps, "fps")
     if unit_m is not None:
@@ -119,15 +157,10 @@ def load_motion(
         return _read_bvh(path, fps, unit_m)
     if path.suffix.lower() != ".npz":
         raise TensorsimError(f"{path}: got a {path.suffix or 'nameless'} file, expected .bvh or .npz")
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            if "positions_3d" in arrays.files:
-                return _read_h36m(path, key, fps)
-            return _read_npz(path, arrays, key, fps, joint_names, unit_m)
-    except (OSError, ValueError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
-        if isinstance(error, TensorsimError):
-            raise
-        raise TensorsimError(f"{path}: got a file that cannot be read as npz ({error})") from error
+    with _npz(path) as arrays:
+        if "positions_3d" in arrays.files:
+            return _read_h36m(path, key, fps)
+        return _read_npz(path, arrays, key, fps, joint_names, unit_m)
 
 
 def place(motion: Motion, range_m: float | None = None, heading_rad: float = 0.0, x_m: float = 0.0) -> Motion:
@@ -215,40 +248,51 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     there is one, else they stand in their order. ``keypoints`` are 51 numbers (x, y, visibility or score).
 
     Raises:
-        TensorsimError: files that are missing or not JSON, no people, other than 17 keypoints.
+        TensorsimError: files that are missing or not such JSON, no people, other than 17 keypoints, a ``track_id``
+            of some people only.
     """
     path = Path(path)
+    if not path.exists():
+        raise TensorsimError(f"{path}: no such file, expected COCO keypoints (.json)")
     files = sorted(path.glob("*.json")) if path.is_dir() else [path]
     people: dict[Any, list[dict[str, Any]]] = {}
     size = None
     for number, file in enumerate(files):
-        try:
-            content = json.loads(file.read_text())
-        except (OSError, ValueError) as error:
-            raise TensorsimError(f"{file}: got a file that cannot be read as JSON ({error})") from error
-        whole = isinstance(content, dict)
-        for image in content.get("images", []) if whole else []:
-            people.setdefault(number if path.is_dir() else image["id"], [])
-            if "height" in image and "width" in image:
-                size = (int(image["height"]), int(image["width"]))
-        people.setdefault(number, []) if path.is_dir() else None
-        for person in content.get("annotations", []) if whole else content:
-            if not isinstance(person, dict) or len(person.get("keypoints", [])) != 51:
-                raise TensorsimError(f"{file}: got an entry without 17 keypoints, expected 51 numbers each")
-            people.setdefault(number if path.is_dir() else person.get("image_id", 0), []).append(person)
-    if not any(people.values()):
+        with _reading(file, "JSON of COCO keypoints"):
+            content = json.loads(file.read_text(encoding="utf-8"))
+            whole = isinstance(content, dict)
+            for image in content.get("images", []) if whole else []:
+                people.setdefault(number if path.is_dir() else image["id"], [])
+                if "height" in image and "width" in image:
+                    size = (int(image["height"]), int(image["width"]))
+            people.setdefault(number, []) if path.is_dir() else None
+            for person in content.get("annotations", []) if whole else content:
+                numbers = person.get("keypoints") if isinstance(person, dict) else None
+                if not isinstance(numbers, list) or len(numbers) != 51:
+                    raise TensorsimError(
+                        f"{file}: got an entry without 17 keypoints, expected 51 numbers each"
+                    )
+                people.setdefault(number if path.is_dir() else person.get("image_id", 0), []).append(person)
+    everybody = [person for frame in people.values() for person in frame]
+    if not everybody:
         raise TensorsimError(f"{path}: got no keypoints, expected COCO annotations or results")
+    tracked = sum("track_id" in person for person in everybody)
+    if 0 < tracked < len(everybody):
+        raise TensorsimError(
+            f"{path}: got a track_id for {tracked} of {len(everybody)} people, expected one for all or for none"
+        )
 
-    frames = [people[frame] for frame in sorted(people)]
-    tracks = sorted({person["track_id"] for frame in frames for person in frame if "track_id" in person})
-    count = len(tracks) or max(len(frame) for frame in frames)
-    data = torch.zeros(len(frames), count, 17, 3)
-    valid = torch.zeros(len(frames), count, dtype=torch.bool)
-    for t, frame in enumerate(frames):
-        for p, person in enumerate(frame):
-            place = tracks.index(person["track_id"]) if "track_id" in person else p
-            data[t, place] = torch.tensor(person["keypoints"], dtype=torch.float32).view(17, 3)
-            valid[t, place] = True
+    with _reading(path, "JSON of COCO keypoints"):
+        frames = [people[frame] for frame in sorted(people)]
+        tracks = sorted({person["track_id"] for person in everybody if tracked})
+        count = len(tracks) or max(len(frame) for frame in frames)
+        data = torch.zeros(len(frames), count, 17, 3)
+        valid = torch.zeros(len(frames), count, dtype=torch.bool)
+        for t, frame in enumerate(frames):
+            for p, person in enumerate(frame):
+                place = tracks.index(person["track_id"]) if tracked else p
+                data[t, place] = torch.tensor(person["keypoints"], dtype=torch.float32).view(17, 3)
+                valid[t, place] = True
     check_finite(data, str(path))
     # Annotations flag visibility by 0, 1 or 2; networks write scores.
     scores = data[..., 2]
@@ -295,7 +339,7 @@ def _read_bvh(path: Path, fps: float | None, unit_m: float | None) -> Motion:
         import pybvh
     except ImportError as error:
         raise TensorsimError(f"{path}: got no BVH reader; install it with `pip install pybvh`") from error
-    try:
+    with _reading(path, "BVH"):
         clip = pybvh.read_bvh_file(path)
         nodes = torch.from_numpy(np.ascontiguousarray(clip.node_positions(), dtype=np.float64))
         # "+y" and the like; the other two axes keep their handedness and y-up files face the radar.
@@ -303,8 +347,6 @@ def _read_bvh(path: Path, fps: float | None, unit_m: float | None) -> Motion:
         head = next((n for n in clip.joint_names if _plain(n) == "head"), None)
         end = None if head is None else clip.joint_tips.get(head)
         index = [clip.node_index[name] for name in clip.joint_names]
-    except Exception as error:  # a reader's exceptions share no base class
-        raise TensorsimError(f"{path}: got a file that cannot be read as BVH ({error})") from error
     nodes = _upright(nodes, vertical)
     top = None if end is None else nodes[:, end]
     names = tuple(clip.joint_names)
@@ -338,16 +380,24 @@ def _size(joints: Tensor) -> float:
     )
 
 
+def _motions(arrays: Any) -> list[str]:
+    """Names of the arrays (T, J, 3) and (P, T, J, 3)."""
+    return [name for name in arrays.files if arrays[name].ndim in (3, 4) and arrays[name].shape[-1] == 3]
+
+
+def _preferred(arrays: Any) -> str | None:
+    """The array that is taken where there are several, by its usual name."""
+    motions = _motions(arrays)
+    return next((name for name in ("joints_m", "joints", "Jtr") if name in motions), None)
+
+
 def _read_npz(
     path: Path, arrays: Any, key: str | None, fps: float | None, names: tuple[str, ...] | None,
     unit_m: float | None,
 ) -> Motion:  # fmt: skip
-    candidates = [
-        name for name in arrays.files if arrays[name].ndim in (3, 4) and arrays[name].shape[-1] == 3
-    ]
+    candidates = _motions(arrays)
     if key is None:
-        preferred = [name for name in ("joints_m", "joints", "Jtr") if name in candidates]
-        key = preferred[0] if preferred else candidates[0] if len(candidates) == 1 else None
+        key = candidates[0] if len(candidates) == 1 else _preferred(arrays)
     if key not in candidates:
         shown = ", ".join(candidates) or "arrays (T, J, 3), but there are none"
         raise TensorsimError(f"{path}: got key {key!r}, expected one of {shown}")
@@ -398,13 +448,13 @@ def _read_h36m(path: Path, key: str | None, fps: float | None) -> Motion:
         header(file)
         try:
             subjects = _ArraysOnly(file, encoding="latin1").load().item()
-        except (AttributeError, EOFError, ImportError) as error:
+            clips = {
+                f"{subject}/{action}": clip
+                for subject in subjects
+                for action, clip in subjects[subject].items()
+            }
+        except (AttributeError, EOFError, ImportError, TypeError) as error:
             raise TensorsimError(f"{path}: got positions_3d that hold no dictionary ({error})") from error
-    clips = {
-        f"{subject}/{action}": clip
-        for subject, actions in subjects.items()
-        for action, clip in actions.items()
-    }
     if key is None and len(clips) == 1:
         key = next(iter(clips))
     if key not in clips:

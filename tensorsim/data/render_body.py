@@ -207,7 +207,7 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
         "neck",
         head,
         center,
-        neck + s * (0.0 * chest[:, 1] - 0.01 * chest[:, 2]),
+        neck - s * (0.01 * chest[:, 2]),
         on_head(0, -0.02, -0.06),
         (0.060, 0.054),
         s,

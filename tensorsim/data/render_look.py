@@ -126,7 +126,6 @@ def paint(look: Look, surface: Surface) -> Paint:
     is_part = {name: surface.part == i for i, name in enumerate(PARTS)}
     like = surface.point
     albedo = look.skin.to(like).expand(like.shape[0], 3)
-    cloth = torch.zeros_like(surface.part, dtype=torch.bool)
 
     def put(where: Tensor, colour: Tensor) -> None:
         nonlocal albedo

@@ -221,7 +221,10 @@ def _open_writer(writer: Any, path: Path, fps: float, size: tuple[int, int]) -> 
     with _quiet_opencv():
         opened = writer.open(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     if not opened:
-        raise TensorsimError(f"{path.name}: OpenCV cannot write this file, expected a name ending in .mp4")
+        raise TensorsimError(
+            f"{path.name}: OpenCV cannot write this file at {fps:g} frames per second, expected a name ending in .mp4 "
+            "and a usual rate"
+        )
 
 
 def _planes(frames: np.ndarray) -> Tensor:

@@ -1,16 +1,14 @@
 """Clips whose motion is known at every moment: of the generator, or of motion capture."""
 
-import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.data.motion_files import Motion, load_motion, place
+from tensorsim.data.motion_files import Motion, load_motion, motion_keys, place
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator, activity_index
 from tensorsim.motion.resample import PoseResampler
@@ -111,22 +109,15 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
     The first frame of a capture is left out: it is often a calibration pose.
 
     Args:
-        path: ``.bvh``, or an ``.npz`` in which every array with three dimensions is a motion.
+        path: ``.bvh`` or ``.npz``; of an ``.npz`` with several motions the first person of each.
         count: at most so many.
         fps: frames per second; overrides the file, needed where it says nothing.
 
     Raises:
         TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; nothing long enough.
     """
-    keys: list[str | None] = [None]
-    if path.suffix.lower() == ".npz" and path.is_file():
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                keys = [name for name in arrays.files if arrays[name].ndim == 3]
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise TensorsimError(f"{path}: got a file that cannot be read as npz ({error})") from error
     clips: list[Clip] = []
-    for key in keys:
+    for key in motion_keys(path):
         motion = load_motion(path, key, fps)
         stop = 1 + int(CLIP_S * motion.fps)
         motion = Motion(motion.joints[:1, 1:stop], motion.valid[:1, 1:stop], motion.fps)

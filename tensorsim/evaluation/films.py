@@ -1,7 +1,5 @@
 """What a camera gives of a clip: the true keypoints in its picture, or what networks find in the rendered film."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,9 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
+from tensorsim.data.camera import keypoint_boxes
 from tensorsim.data.render import PersonRenderer
 from tensorsim.data.render_cast import View
 from tensorsim.evaluation.clips import Clip
+from tensorsim.files import complete_file
 from tensorsim.motion.body import body_to_coco
 from tensorsim.pipeline import VideoToPose
 from tensorsim.types import Tracks
@@ -66,19 +66,8 @@ def true_keypoints(clip: Clip) -> Observed:
             torch.zeros(0, frames, 17, 2), torch.zeros(0, frames, 17),
         )  # fmt: skip
     pixels, inside, _ = project(joints)
-    shown = torch.where(inside[..., None], pixels, torch.nan)
-    low = torch.where(inside[..., None], pixels, torch.inf).amin(dim=-2)
-    high = torch.where(inside[..., None], pixels, -torch.inf).amax(dim=-2)
-    margin = 0.06 * (high - low).amax(dim=-1, keepdim=True)
-    boxes = torch.cat([low - margin, high + margin], dim=-1)
-    valid = inside.any(dim=-1)
-    boxes = torch.where(valid[:, None], boxes, 0.0)
-    return Observed(
-        boxes.float()[None],
-        valid[None],
-        torch.where(shown.isnan(), pixels, shown).float()[None],
-        inside.float()[None],
-    )
+    boxes = keypoint_boxes(pixels, inside, margin=0.06)
+    return Observed(boxes.float()[None], inside.any(dim=-1)[None], pixels.float()[None], inside.float()[None])
 
 
 class Filmed(NamedTuple):
@@ -127,8 +116,6 @@ def filmed(path: Path, clip: Clip, detector: nn.Module, pose: nn.Module) -> Film
         for part, people in zip(Filmed._fields, result, strict=True)
         for name, tensor in zip(Observed._fields, people, strict=True)
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as scratch:
-        np.savez(scratch, **arrays)
-    os.replace(scratch.name, path)
+    with complete_file(path) as scratch, scratch.open("wb") as file:
+        np.savez(file, **arrays)
     return result

@@ -63,15 +63,12 @@ def _table(heads: list[str], lines: list[list[str]]) -> list[str]:
 
 
 def markdown(cells: Cells) -> str:
-    """Both tables, and those of the pose errors, as Markdown."""
+    """Tables of the maps of whole pipelines, of those with one true stage, and of the errors of joints."""
     rows = list(dict.fromkeys(c["row"] for c in cells))
     names = list(dict.fromkeys(c["setting"] for c in cells))
     scenes = list(dict.fromkeys(scene for c in cells for scene in c["scores"]))
-    whole = [n for n in names if "+" not in n]
-    # Guesses last.
-    whole = [n for n in whole if n[0:1] in SOURCES and n.split("-")[0] in SOURCES] + [
-        n for n in whole if n.split("-")[0] not in SOURCES
-    ]
+    # Whole pipelines, then guesses.
+    whole = sorted((n for n in names if "+" not in n), key=lambda n: n.split("-")[0] not in SOURCES)
 
     def chosen(setting: str, row: str | None = None) -> Cells:
         return [c for c in cells if c["setting"] == setting and (row is None or c["row"] == row)]

@@ -26,7 +26,7 @@ from tensorsim.vision.metric_pose import MetricPose, mid_hips
 DISPLAY_RATE_HZ = 256.0
 #: Variance in m^2 of joints from exact keypoints.
 EXACT_NOISE = 1e-6
-#: Stages in their order; the first two have a say from a film on only, the next two from keypoints on.
+#: Stages in their order; the first two have a say from a film on only, the next three from keypoints on.
 STAGES = ("detector", "pose", "lifting", "position", "smoothing", "interpolation")
 SOURCES = {
     "a": "true 3D joints at video rate",
@@ -164,7 +164,11 @@ class Pipelines:
         return pose.joints[0], pose.valid[0]
 
     def maps(self, setting: Setting, scene: str, clip: Clip, joints: Tensor, valid: Tensor) -> Maps:
-        """The maps of joints at the frame rate; without any where the radar cannot follow them."""
+        """The maps of joints at the frame rate; of an empty scene where there are none.
+
+        Raises:
+            TensorsimError: motion that the radar of the scene cannot follow.
+        """
         stage = self.radars[scene, setting.paper]
         pulses = stage.resampler.pulses(valid.shape[-1], FPS)
         positions = stage.pulse_smoother(stage.resampler(joints, FPS)) if len(joints) else joints.double()

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import os
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -18,10 +16,11 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.evaluation.clips import Clip, activity_clips, captured_clips
+from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captured_clips
 from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
+from tensorsim.files import complete_file
 from tensorsim.radar.presets import PRESETS
 from tensorsim.vision.metric_pose import mid_hips
 
@@ -78,6 +77,10 @@ class TruthLoop:
                 () if self.activities == ("all",) else self.activities, self.clips, self.seed
             )
         for path in self.motions:
+            if path.stem in listed:
+                raise TensorsimError(
+                    f"motion: got {path} after another {path.stem}, expected files of different names"
+                )
             listed[path.stem] = captured_clips(path, self.clips, self.motion_fps)
         return listed
 
@@ -119,7 +122,13 @@ class TruthLoop:
             for one in chosen:
                 if one not in known:
                     raise TensorsimError(f"{name}: got {one!r}, expected one of {', '.join(known)}")
-        for name, count in (("clips", self.clips), ("jobs", self.jobs), ("settings", len(self.sources))):
+        counts = {
+            "scenes": len(self.scenes),
+            "settings": len(self.sources),
+            "clips": self.clips,
+            "jobs": self.jobs,
+        }
+        for name, count in counts.items():
             if count < 1:
                 raise TensorsimError(f"{name}: got {count}, expected at least 1")
         if "c" in self.sources and (self.detector is None or self.pose is None):
@@ -131,15 +140,31 @@ class TruthLoop:
 
     def cell(self, row: str, clip: Clip, setting: str) -> Path:
         """File of a cell; its name tells the options apart that its figures depend on."""
-        options = {"scenes": self.scenes, "clips": self.clips if setting in GUESSES else 0, "fps": FPS}
+        options: dict[str, Any] = {"scenes": self.scenes, "clips": 0, "fps": FPS}
+        if setting in GUESSES:  # made of the other clips
+            options |= {"clips": self.clips, "seed": self.seed}
+        if isinstance(clip, CapturedClip):
+            options |= {"motion_fps": self.motion_fps}
         if setting.startswith("c"):
-            options |= {"networks": (str(self.detector), str(self.pose))}
-        key = hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:8]
-        return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{key}.json"
+            options |= {"networks": self._networks()}
+        return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{_key(options)}.json"
+
+    def film(self, clip: Clip) -> Path:
+        """File of what the networks saw of a clip."""
+        return self.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{_key(self._networks())}.npz"
+
+    def _networks(self) -> list[tuple[str, int]]:
+        """Tells networks apart, also those that were trained further: their files and when these were written."""
+        files = [path.resolve() for path in (self.detector, self.pose) if path is not None]
+        return [(str(file), file.stat().st_mtime_ns if file.is_file() else 0) for file in files]
 
     def read_cells(self) -> list[dict[str, Any]]:
         """All cells that are there, each a dictionary of row, clip, setting, scores by scene, pose errors."""
         return [json.loads(path.read_text("utf-8")) for path in self._cell_paths() if path.is_file()]
+
+
+def _key(options: Any) -> str:
+    return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _plain(name: str) -> str:
@@ -147,10 +172,8 @@ def _plain(name: str) -> str:
 
 
 def _write(path: Path, cell: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False) as scratch:
-        json.dump(cell, scratch)
-    os.replace(scratch.name, path)
+    with complete_file(path) as scratch:
+        scratch.write_text(json.dumps(cell), encoding="utf-8")
 
 
 def _one_thread_row(loop: TruthLoop, row: str) -> None:
@@ -189,11 +212,16 @@ def evaluate_row(loop: TruthLoop, row: str, tick: Callable[[], Any]) -> None:
                 continue
             film = _film(loop, clip, networks) if setting.source == "c" else None
             joints, valid = pipelines.joints(setting, clip, film)
-            scores = {
-                scene: truths.compare(pipelines.maps(setting, scene, clip, joints, valid), scene, k)
-                for scene in loop.scenes
-                if truths.get(scene, k) is not None
-            }
+            scores = {}
+            for scene in loop.scenes:
+                if truths.get(scene, k) is None:
+                    continue
+                try:
+                    scores[scene] = truths.compare(
+                        pipelines.maps(setting, scene, clip, joints, valid), scene, k
+                    )
+                except TensorsimError as error:
+                    _warn_of_what_is_left_out(clip, f"{scene}, {setting.name}", error)
             _write(
                 loop.cell(row, clip, setting.name),
                 _cell(row, clip, setting.name, scores, pose_errors(joints, valid, clip)),
@@ -215,9 +243,11 @@ def _film(loop: TruthLoop, clip: Clip, networks: list[nn.Module]) -> Filmed:
     assert loop.pose is not None
     if not networks:
         networks += [RTMDet.from_pretrained(loop.detector).eval(), pretrained_pose(loop.pose).eval()]
-    key = hashlib.sha256(f"{loop.detector.stem} {loop.pose.stem}".encode()).hexdigest()[:8]
-    path = loop.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{key}.npz"
-    return filmed(path, clip, networks[0], networks[1])
+    return filmed(loop.film(clip), clip, networks[0], networks[1])
+
+
+def _warn_of_what_is_left_out(clip: Clip, what: str, error: TensorsimError) -> None:
+    warnings.warn(f"{clip.row} {clip.name}, {what}: left out, {error}", TensorsimWarning, stacklevel=3)
 
 
 class _Truths:
@@ -228,18 +258,14 @@ class _Truths:
         self.made: dict[tuple[str, int], Maps | None] = {}
 
     def get(self, scene: str, k: int) -> Maps | None:
-        """True maps of clip k, or None where the radar of the scene cannot follow it."""
+        """True maps of clip k, or None, with a warning, where the radar of the scene cannot follow it."""
         if (scene, k) not in self.made:
             if not self.keep:
                 self.made = {key: maps for key, maps in self.made.items() if key[1] == k}
             try:
                 self.made[scene, k] = self.pipelines.truth(scene, self.clips[k])
             except TensorsimError as error:
-                warnings.warn(
-                    f"{self.clips[k].row} {self.clips[k].name}, {scene}: left out, {error}",
-                    TensorsimWarning,
-                    stacklevel=2,
-                )
+                _warn_of_what_is_left_out(self.clips[k], scene, error)
                 self.made[scene, k] = None
         return self.made[scene, k]
 
@@ -283,20 +309,23 @@ def pose_errors(joints: Tensor, valid: Tensor, clip: Clip) -> dict[str, float]:
     }
 
 
-def example_maps(loop: TruthLoop, scene: str) -> dict[str, list[tuple[str, Tensor]]]:
-    """DTMs of the first clip of each row, the truth first and then one per source, for a picture."""
-    pipelines = Pipelines({scene: PRESETS[scene]})
+def example_maps(loop: TruthLoop, pipelines: Pipelines, scene: str) -> dict[str, list[tuple[str, Tensor]]]:
+    """DTMs of the first clip of each row, the truth first and then one per source, for a picture.
+
+    Rows with motion that the radar of the scene cannot follow are left out.
+    """
+    networks: list[nn.Module] = []
     pictures: dict[str, list[tuple[str, Tensor]]] = {}
     for row, clips in loop.rows().items():
         clip = clips[0]
         try:
             shown = [("truth", pipelines.truth(scene, clip).doppler_time)]
-        except TensorsimError:
+            for source in loop.sources:
+                film = _film(loop, clip, networks) if source == "c" else None
+                setting = Setting(source)
+                maps = pipelines.maps(setting, scene, clip, *pipelines.joints(setting, clip, film))
+                shown.append((source, maps.doppler_time))
+        except TensorsimError:  # as the loop has told
             continue
-        for source in loop.sources:
-            film = _film(loop, clip, []) if source == "c" else None
-            setting = Setting(source)
-            maps = pipelines.maps(setting, scene, clip, *pipelines.joints(setting, clip, film))
-            shown.append((source, maps.doppler_time))
         pictures[row] = shown
     return pictures

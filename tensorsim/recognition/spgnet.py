@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.recognition.spnet import check_pictures
+from tensorsim.recognition.spnet import as_pictures, centred
 
 #: Groups of each version; widths are 16 and more times these. (blocks of the stages: 4, 8, 3)
 VERSIONS = {"s2p6": 6, "s2p7": 7, "s2p8": 8, "s2p9": 9}
@@ -114,14 +114,9 @@ class SPGNet(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Pictures (..., C, H, W) to logits (..., num_classes)."""
-        check_pictures(pictures, self.in_channels, "SPGNet")
-        x = pictures.reshape(-1, self.in_channels, pictures.shape[-2], pictures.shape[-1])
-        x = x - self.mean.view(-1, 1, 1)
-        x = self.body(x).mean((-2, -1))
+        x = self.body(centred(pictures, self.mean, "SPGNet")).mean((-2, -1))
         x = self.fc2(self.dropout(torch.relu(self.norm(self.fc1(x)))))
-        shape = list(pictures.shape[:-3])
-        shape.append(self.num_classes)
-        return x.reshape(shape)
+        return as_pictures(x, pictures)
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "SPGNet":

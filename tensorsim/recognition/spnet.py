@@ -14,15 +14,28 @@ from torch.nn import functional as F
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_not_empty
 
 
-def check_pictures(pictures: Tensor, channels: int, name: str) -> None:
-    """Refuse anything but finite real pictures (..., ``channels``, H, W)."""
+def centred(pictures: Tensor, mean: Tensor, name: str) -> Tensor:
+    """Pictures (..., C, H, W) as a batch (B, C, H, W) without the mean (C,) of each channel.
+
+    Raises:
+        TensorsimError: other channels, no pictures, NaN.
+    """
     check_floating(pictures, name)
+    channels = mean.shape[0]
     if pictures.dim() < 3 or pictures.shape[-3] != channels:
         raise TensorsimError(
             f"{name}: got shape {list(pictures.shape)}, expected (..., {channels} channels, height, width)"
         )
     check_not_empty(pictures, name)
     check_finite(pictures, name)
+    return pictures.reshape(-1, channels, pictures.shape[-2], pictures.shape[-1]) - mean.view(-1, 1, 1)
+
+
+def as_pictures(logits: Tensor, pictures: Tensor) -> Tensor:
+    """Logits (B, classes) with the leading dimensions of the pictures (..., C, H, W)."""
+    shape = list(pictures.shape[:-3])
+    shape.append(logits.shape[-1])
+    return logits.reshape(shape)
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
@@ -142,16 +155,11 @@ class SPNet(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Pictures (..., C, H, W) to logits (..., num_classes)."""
-        check_pictures(pictures, self.in_channels, "SPNet")
-        x = pictures.reshape(-1, self.in_channels, pictures.shape[-2], pictures.shape[-1])
-        x = x - self.mean.view(-1, 1, 1)
+        x = centred(pictures, self.mean, "SPNet")
         x = self.conv2(self.act(self.conv1(x)))
         x = self.act(self.block3(self.block2(self.block1(x))))
         x = self.act(self.conv6(x)).mean((-2, -1))
-        x = self.fc2(self.act(self.fc1(x)))
-        shape = list(pictures.shape[:-3])
-        shape.append(self.num_classes)
-        return x.reshape(shape)
+        return as_pictures(self.fc2(self.act(self.fc1(x))), pictures)
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "SPNet":

@@ -22,6 +22,7 @@ from tensorsim.config import CameraConfig
 from tensorsim.data.render import PersonRenderer
 from tensorsim.data.render_cast import camera_axes
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 from tensorsim.motion.body import rest_on_floor, rotation
 from tensorsim.motion.pose_sampler import sample_poses
 
@@ -60,7 +61,7 @@ class Cutouts(Sequence[Cutout]):
                         label = json.loads(files[name.removesuffix("png") + "json"])
                         points = np.array(label["keypoints"], np.float32).reshape(17, 3)
                         self.entries.append((files[name], points))
-            except (OSError, tarfile.TarError, ValueError, KeyError) as error:
+            except (OSError, tarfile.TarError, ValueError, KeyError, TypeError) as error:
                 raise TensorsimError(f"{path}: not a shard of cut-outs ({error})") from error
 
     def __len__(self) -> int:
@@ -152,12 +153,10 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
             shards.append(shard)
             last = min(first + PER_SHARD, count)
             if not shard.exists():
-                partial = shard.with_suffix(".partial")
-                with tarfile.open(partial, "w") as tar:
+                with complete_file(shard) as scratch, tarfile.open(scratch, "w") as tar:
                     for index in range(first, last):
                         _add(tar, f"{index:06d}", render_cutout(poses[index], seed * 1_000_003 + index))
                         progress.update()
-                partial.replace(shard)
             else:
                 progress.update(last - first)
     return shards

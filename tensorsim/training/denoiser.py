@@ -7,7 +7,6 @@ the error of the noisiest maps is all that counts, and a network trained on that
 """
 
 import math
-import os
 import warnings
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES
 from tensorsim.enhance.dncnn import DnCNN, map_floor
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.files import complete_file
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers
@@ -124,26 +124,32 @@ def build_pairs(
         prf_hz = PRESETS[scene].radar.prf_hz
         pairs = zip(views(noisy, prf_hz).values(), views(clean, prf_hz).values(), strict=True)
         patches = [cut_patches(*on_scale(a.float(), b.float()), per_map, generator) for a, b in pairs]
-        scratch = path.with_suffix(f".{os.getpid()}.tmp")
         stored = {"image": torch.cat([p[0] for p in patches]), "noise": torch.cat([p[1] for p in patches])}
-        save_file({name: x.half().contiguous() for name, x in stored.items()}, scratch)
-        os.replace(scratch, path)
+        with complete_file(path) as scratch:
+            save_file({name: x.half().contiguous() for name, x in stored.items()}, scratch)
+
+
+def untrained(depth: int = 20, seed: int = 0) -> DnCNN:
+    """A DnCNN that begins by doing nothing: its last layer is zero. ``seed`` draws the other weights."""
+    torch.manual_seed(seed)
+    net = DnCNN(depth)
+    nn.init.zeros_(net.model[-1].get_parameter("weight"))
+    return net
 
 
 class DenoiserRecipe(Recipe):
     """Residual learning (Zhang et al., 2017): ``1/2 mean (Q(y) - (y - x))^2``, Adam 1e-3 falling to 1e-5 as a cosine.
 
     Args:
+        net: the network.
         folder: made by :func:`build_pairs`; every tenth clip is held out.
-        depth: of the DnCNN.
-        seed: of weights, order and flips.
-        init: weights to start from.
+        seed: of patches and flips.
 
     Raises:
         TensorsimError: fewer than 10 clips in the folder.
     """
 
-    def __init__(self, folder: Path, depth: int = 20, seed: int = 0, init: Path | None = None) -> None:
+    def __init__(self, net: DnCNN, folder: Path, seed: int = 0) -> None:
         from safetensors.torch import load_file
 
         files = sorted(folder.glob("*-?????.safetensors"))
@@ -159,20 +165,8 @@ class DenoiserRecipe(Recipe):
             for part in (parts[False], parts[True])
         )
         self.seed = seed
-        torch.manual_seed(seed)
-        net = DnCNN(depth)
-        nn.init.zeros_(net.model[-1].get_parameter("weight"))  # begin by doing nothing
-        if init is not None:
-            from tensorsim.weights import load_state_dict, load_strict
-
-            load_strict(net, load_state_dict(init), init)
-        settings: dict[str, Any] = {
-            "depth": depth,
-            "seed": seed,
-            "files": len(files),
-            "init": None if init is None else str(init),
-        }
-        super().__init__(net, settings, {"network": "DnCNN", "depth": str(depth), "scale": "floor"})
+        settings = {"depth": net.depth, "seed": seed, "files": len(files)}
+        super().__init__(net, settings, {"network": "DnCNN", "depth": str(net.depth), "scale": "floor"})
 
     def sample(self, index: int) -> dict[str, Any]:
         """A patch and its noise (1, TRAINED, TRAINED), cut and mirrored at random."""

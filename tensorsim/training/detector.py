@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
 from tensorsim.training.assign import detection_losses
-from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.detector_data import PictureMaker, Sources
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.pose_data import lean_deg, split
@@ -39,8 +38,8 @@ class TrainedRTMDet(RTMDet):
         return self.dense(x)
 
 
-def read_sources(data: Path, cutouts: Cutouts) -> tuple[Sources, list[Sample]]:
-    """What to train on, and the held-out pictures, of a folder of shards.
+def read_sources(data: Path) -> tuple[Sources, list[Sample]]:
+    """What to train on but for rendered people, and the held-out pictures, of a folder of shards.
 
     Raises:
         TensorsimError: shards are missing, or held-out pictures with or without people.
@@ -56,13 +55,12 @@ def read_sources(data: Path, cutouts: Cutouts) -> tuple[Sources, list[Sample]]:
     for sample in street:
         sample.boxes[:, 1] -= PEDESTRIAN_HEAD * (sample.boxes[:, 3] - sample.boxes[:, 1])
         np.maximum(sample.boxes, 0, out=sample.boxes)
-    standing = [sample for sample in lspet if abs(lean_deg(sample.keypoints[0])) < 35]
+    standing = [s for s in lspet if len(s.boxes) and abs(lean_deg(s.keypoints[0])) < 35]
     empty = [sample for sample in coco if len(sample.boxes) == 0 and sample.all_labelled]
     return Sources(
         complete=[sample for sample in coco if len(sample.boxes) and sample.all_labelled],
         empty=empty + list(Shards(find_shards(data, "backgrounds"))),
         partial=[lspet, standing, street],
-        cutouts=cutouts,
         outlined=standing,
     ), held_out
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tensorsim.training.cutouts import Cutouts
+from tensorsim.training.cutouts import Cutout
 from tensorsim.training.detector_people import outline
 from tensorsim.training.shards import Floats, Sample
 
@@ -54,7 +54,7 @@ class Sources:
         complete: pictures with people, all labelled.
         empty: pictures without people.
         partial: lists of pictures where only some people are labelled, each list as likely as the next.
-        cutouts: rendered people.
+        cutouts: rendered people, who are pasted.
         outlined: pictures whose first person is cut out of them, as often as a rendered one is taken; none is fine.
         shares: how often a picture, or a part of a mosaic, is of which kind; in pasted ones, cut-outs are put on
             pictures without people.
@@ -63,7 +63,7 @@ class Sources:
     complete: Sequence[Sample]
     empty: Sequence[Sample]
     partial: Sequence[Sequence[Sample]]
-    cutouts: Cutouts
+    cutouts: Sequence[Cutout] = ()
     outlined: Sequence[Sample] = ()
     shares: dict[str, float] = field(
         default_factory=lambda: {"complete": 0.25, "partial": 0.35, "pasted": 0.3, "empty": 0.1}

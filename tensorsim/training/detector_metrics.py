@@ -189,9 +189,8 @@ def tracks_of_film(detector: RTMDet, path: str | os.PathLike[str], interval: int
             observed[-1] = True
     whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
     mask = torch.tensor(observed, device=device)
-    place = (
-        mask.cumsum(0) - 1
-    )  # the detections of the last observed frame fill those between: they do not count
+    # The detections of the last observed frame fill those between: there they do not count.
+    place = mask.cumsum(0) - 1
     spread = Detections(*(part[place].unsqueeze(0) for part in whole))
     return GNNTracker()(spread, mask)
 

@@ -1,7 +1,6 @@
 """Pools of poses for nearest-match lifting, from recorded or generated motion, without near-duplicates."""
 
 import math
-import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -73,20 +72,10 @@ def recorded_poses(file: Path) -> Tensor:
     Raises:
         TensorsimError: a file that cannot be read, or without people.
     """
-    import numpy as np
+    from tensorsim.data.motion_files import load_motion, motion_keys
 
-    from tensorsim.data.motion_files import load_motion
-
-    keys: list[str | None] = [None]
-    if file.suffix.lower() == ".npz" and file.is_file():
-        try:
-            with np.load(file, allow_pickle=False) as arrays:
-                if not {"joints_m", "joints", "Jtr", "positions_3d"} & set(arrays.files):
-                    keys = [k for k in arrays.files if arrays[k].ndim in (3, 4)] or [None]
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise TensorsimError(f"{file}: got a file that cannot be read as npz ({error})") from error
     poses = []
-    for key in keys:
+    for key in motion_keys(file):
         motion = load_motion(file, key=key, fps=30.0)  # a pool of poses knows no time
         poses.append(motion.joints[motion.valid].double())
     if sum(len(p) for p in poses) == 0:

@@ -119,7 +119,7 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
     """
     path, folder = Path(annotations), Path(images)
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         people = {c["id"] for c in content["categories"] if c["name"] == "person"}
         persons: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in content["images"]}
         crowded = set()

@@ -146,7 +146,8 @@ class BoneFit(nn.Module):
     Shape:
         joints (..., P, T, 14, 3) in world metres, seen (..., P, T, 14) bool and frames per second -> joints, moved
         along their lines of sight; the neck comes out in the middle of the shoulders. Frames in which nothing is
-        seen and clips of fewer than 4 frames stay. Computed in float64. Differentiable by joints, but for the choice of branches.
+        seen and clips of fewer than 4 frames stay. Computed in float64. Differentiable by joints, but for the
+        choice of branches.
 
     Raises:
         TensorsimError: settings that are not positive, wrong shapes, NaN.

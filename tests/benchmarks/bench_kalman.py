@@ -3,28 +3,15 @@
 python -m tests.benchmarks.bench_kalman
 """
 
-import statistics
-import time
-from collections.abc import Callable
-
 import numpy as np
 import torch
 
 from tensorsim.vision.kalman import KalmanSmoother
+from tests.benchmarks.timing import medians, seconds
 from tests.vision.test_kalman import by_filterpy
 
 CLIPS, FRAMES, JOINTS, FPS = 64, 120, 14, 30.0
 NOISE = {"process_noise": 0.001, "measurement_noise": 0.01}
-
-
-def median_s(run: Callable[[], object], repeats: int) -> float:
-    """Median wall time."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def main() -> None:
@@ -42,15 +29,15 @@ def main() -> None:
             for j in range(JOINTS):
                 peer_out[b, :, j] = by_filterpy(z[b, :, j], seen[b, :, j], FPS, **NOISE)[1]
 
-    peer_s = median_s(peer, 1) * CLIPS / peer_clips
+    peer_s = seconds(peer) * CLIPS / peer_clips
     print(f"{torch.get_num_threads()} threads; {CLIPS} clips x {FRAMES} frames x {JOINTS} joints")
     print(f"filterpy             {peer_s * 1e3:10.1f} ms (from {peer_clips} clips)")
     for name, module in (("eager", smoother), ("scripted", torch.jit.script(smoother))):
         for dtype in (torch.float64, torch.float32):
             x = joints.to(dtype)
-            for _ in range(3):
+            for _ in range(3):  # the scripted one compiles
                 out = module(x, valid, FPS)
-            own_s = median_s(lambda module=module, x=x: module(x, valid, FPS), 15)
+            (own_s,) = medians([lambda: module(x, valid, FPS)], 15)  # noqa: B023
             difference = np.abs(out[:peer_clips].numpy() - peer_out).max()
             label, ratio = f"{name} {str(dtype)[6:]}", peer_s / own_s
             print(

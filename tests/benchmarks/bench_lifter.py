@@ -9,7 +9,6 @@ which no search can leave anything out.
 
 import argparse
 import resource
-import statistics
 import time
 from collections.abc import Callable
 
@@ -21,6 +20,7 @@ from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.vision.pose_library import all_headings, standardise_poses
 from tensorsim.vision.pose_search import PoseSearch, seen_along_depth
+from tests.benchmarks.timing import medians, seconds
 
 try:
     import faiss
@@ -28,17 +28,6 @@ except ImportError:
     faiss = None  # type: ignore[assignment]
 
 YAWS = 24
-
-
-def seconds(functions: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median time of each, taken in turn so that a busy machine hits all alike."""
-    times: list[list[float]] = [[] for _ in functions]
-    for _ in range(repeats):
-        for function, spent in zip(functions, times, strict=True):
-            start = time.perf_counter()
-            function()
-            spent.append(time.perf_counter() - start)
-    return [statistics.median(spent) for spent in times]
 
 
 def numpy_search(keypoints: np.ndarray, library: np.ndarray, block: int = 65536) -> np.ndarray:
@@ -87,8 +76,8 @@ def compare(name: str, library: Tensor, seen: Tensor, neighbours: int) -> None:
         flat = faiss.IndexFlatL2(28)
         flat.add(points)
         peers["faiss"] = lambda: flat.search(queries, neighbours)[1]
-    took = seconds([lambda: search(keypoints, equal), *peers.values()], 5)
-    (weighted,) = seconds([lambda: search(keypoints, varied)], 1)
+    took = medians([lambda: search(keypoints, equal), *peers.values()], 5)
+    weighted = seconds(lambda: search(keypoints, varied))
     print(
         f"{name}, {neighbours} nearest: {took[0]:.3f} s; pool sorted once in {built:.1f} s; +{extra:.0f} MiB peak"
     )

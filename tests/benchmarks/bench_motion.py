@@ -3,8 +3,6 @@
 ``OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_motion [--cpu]``
 """
 
-import sys
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -15,15 +13,14 @@ from scipy.signal import savgol_filter
 
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
-from tests.benchmarks.timing import host, medians
+from tests.benchmarks.timing import chosen_clock, host, medians
 
 ROUNDS = 15
 
 
 def compare(name: str, ours: Callable[[], object], peer: Callable[[], object]) -> None:
     """Median of each, taken in turn, and how many times faster ours is."""
-    clock = time.process_time if "--cpu" in sys.argv else time.perf_counter
-    own, other = medians([ours, peer], ROUNDS, clock)
+    own, other = medians([ours, peer], ROUNDS, chosen_clock())
     print(f"{name:<58} {own * 1e3:9.3f} ms   SciPy {other * 1e3:9.3f} ms   ratio {other / own:6.2f}")
 
 

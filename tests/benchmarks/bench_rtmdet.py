@@ -5,8 +5,6 @@ Without a video the frames are noise. Candidates take turns; medians are per fra
 """
 
 import argparse
-import statistics
-import time
 import warnings
 from collections.abc import Callable
 
@@ -17,6 +15,7 @@ import torch
 
 from tensorsim.vision.detection import letterbox_size, non_maximum_suppression
 from tensorsim.vision.rtmdet import RTMDet
+from tests.benchmarks.timing import medians
 
 
 def read_frames(path: str | None, count: int) -> np.ndarray:
@@ -82,19 +81,11 @@ def main() -> None:
             lambda: non_maximum_suppression(boxes, scores, labels, valid, 0.6, 100),
         ),
     }
-    times: dict[str, list[float]] = {name: [] for name in candidates}
     with torch.no_grad():
-        for round_ in range(options.rounds + 3):
-            for name, (count, run) in candidates.items():
-                start = time.perf_counter()
-                run()
-                if round_ >= 3:
-                    times[name].append((time.perf_counter() - start) / count * 1e3)
-    reference = statistics.median(times["ONNX Runtime, 1 frame"])
-    for name, values in times.items():
-        median = statistics.median(values)
-        ratio = reference / median
-        print(f"{name:42s} {median:8.2f} ms (min {min(values):7.2f})  {ratio:5.2f} x ONNX Runtime")
+        took = medians([run for _, run in candidates.values()], options.rounds)
+    reference = took[0]
+    for (name, (count, _)), time_s in zip(candidates.items(), took, strict=True):
+        print(f"{name:42s} {time_s / count * 1e3:8.2f} ms  {reference * count / time_s:5.2f} x ONNX Runtime")
 
 
 if __name__ == "__main__":

@@ -5,9 +5,6 @@ and the precision that it likes best, and its batches clip by clip: its own zero
 ``OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_stft [--cpu]``
 """
 
-import sys
-import time
-
 import numpy as np
 import torch
 from scipy.signal import ShortTimeFFT
@@ -15,7 +12,7 @@ from scipy.signal.windows import hann
 
 from tensorsim.config import RadarConfig
 from tensorsim.radar.doppler import DopplerTimeMap
-from tests.benchmarks.timing import host, medians
+from tests.benchmarks.timing import chosen_clock, host, medians
 
 ROUNDS = 7
 
@@ -28,7 +25,7 @@ def scipy_map(stft: ShortTimeFFT, clip: np.ndarray, first: int, last: int) -> np
 
 def main() -> None:
     torch.set_grad_enabled(False)
-    clock = time.process_time if "--cpu" in sys.argv else time.perf_counter
+    clock = chosen_clock()
     print(f"{host()}, {clock.__name__}, complex64")
     scenes = (("free space", RadarConfig.free_space()), ("through-wall", RadarConfig.through_wall()))
     for name, radar in scenes:

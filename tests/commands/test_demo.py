@@ -80,6 +80,7 @@ def test_nobody_is_filmed_for_empty(
         ({"detector": "none.onnx"}, "--detector: none.onnx is not a file"),
         ({"radar": "nothing"}, "--radar"),
         ({"device": "abacus"}, "--device"),
+        ({"seed": -1}, "--seed: got -1"),
     ],
 )
 def test_bad_options_are_refused(

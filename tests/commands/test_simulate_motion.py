@@ -110,7 +110,7 @@ def test_keypoints_give_what_a_video_gives(
         ("walk.npz", ["--clip", "nothing"], "got key 'nothing', expected one of joints"),
         ("walk.npz", ["--stride", "40"], "got 1 of its 30 frames"),
         ("nothing.bvh", [], "nothing.bvh: no such file"),
-        ("nothing.json", ["--fps", "30"], "nothing.json: got a file that cannot be read"),
+        ("nothing.json", ["--fps", "30"], "nothing.json: no such file"),
         ("walk.json", [], "walk.json: got keypoints without a frame rate, expected --fps"),
         ("walk.json", ["--fps", "30"], "walk.json: got a file that cannot be read as JSON"),
     ],

@@ -16,6 +16,7 @@ from tensorsim.data.motion_files import (
     body_joints,
     load_coco_keypoints,
     load_motion,
+    motion_keys,
     place,
 )
 from tensorsim.errors import TensorsimError
@@ -271,7 +272,23 @@ def test_coco_folder_of_frames(tmp_path: Path) -> None:
     assert float(people.keypoints[2, 0, 0, 0]) == 2.0
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '[{"keypoints": [1, 2, 3]}]', '{"annotations": []}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        "5",
+        "null",
+        '[{"keypoints": [1, 2, 3]}]',
+        '[{"keypoints": null}]',
+        json.dumps([{"keypoints": ["a"] * 51}]),
+        json.dumps([entry(1, image_id=1), entry(1) | {"image_id": "b"}]),
+        json.dumps([entry(1, image_id=1, track_id=4), entry(1, image_id=1), entry(2, image_id=1)]),
+        '{"annotations": []}',
+        '{"annotations": null}',
+        '{"images": [{"file_name": "a.jpg"}], "annotations": []}',
+    ],
+)
 def test_bad_coco_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.json"
     path.write_text(text)
@@ -300,13 +317,20 @@ def test_placement_turns_about_the_start_and_stands_on_the_floor() -> None:
 def test_files_that_are_not_motion_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no such file"):
         load_motion(tmp_path / "none.bvh")
-    for name, content in (("a.txt", b"x"), ("b.npz", b"not a zip")):
+    np.save(tmp_path / "c.npy", walker())
+    for name, content in (
+        ("a.txt", b"x"),
+        ("b.npz", b"not a zip"),
+        ("c.npz", (tmp_path / "c.npy").read_bytes()),
+    ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(TensorsimError, match=name):
             load_motion(tmp_path / name)
     bad = {
         "no frame rate": {"joints_m": walker()},
         "without names": {"joints_m": walker()[:, :9], "fps": 30.0},
+        "cannot be read as npz": {"joints_m": walker(), "fps": np.array([30.0, 31.0])},
+        "hold no dictionary": {"positions_3d": np.array({"S1": 5}, dtype=object)},
         "NaN": {"joints_m": np.full((2, 14, 3), np.nan), "fps": 30.0},
         "no frames": {"joints_m": np.zeros((0, 14, 3)), "fps": 30.0},
         "there are none": {"other": np.zeros(3)},
@@ -320,3 +344,17 @@ def test_files_that_are_not_motion_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "bad.npz", joints_m=walker())
     with pytest.raises(TensorsimError, match="fps"):
         load_motion(tmp_path / "bad.npz", fps=-1.0)
+
+
+def test_keys_name_the_motions_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "some.npz"
+    np.savez(path, walk=walker(), run=walker()[None], other=np.zeros((4, 2)), fps=30.0)
+    assert motion_keys(path) == ["walk", "run"]
+    assert all(load_motion(path, key=key).joints.shape == (1, 5, 14, 3) for key in motion_keys(path))
+    np.savez(path, walk=walker(), joints_m=walker(), fps=30.0)
+    assert motion_keys(path) == [None]
+    assert motion_keys(h36m(tmp_path)[0]) == [None]
+    assert motion_keys(tmp_path / "none.bvh") == [None]
+    (tmp_path / "text.npz").write_text("no archive")
+    with pytest.raises(TensorsimError, match=r"text\.npz: got a file that cannot be read as npz"):
+        motion_keys(tmp_path / "text.npz")

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -303,21 +304,28 @@ def test_the_picture_shows_truth_and_guess_side_by_side(
     import cv2
 
     loop = done[0]
-    pictures = truth.example_maps(loop, SCENE)
+    pipelines = Pipelines({SCENE: PRESETS[SCENE]})
+    pictures = truth.example_maps(loop, pipelines, SCENE)
     assert [name for name, _ in pictures["S4 Grabbing"]] == ["truth", "a", "b"]
-    speed = Pipelines({SCENE: PRESETS[SCENE]}).speed_m_s(SCENE)
-    report.save_pictures(tmp_path / "maps.png", pictures, speed)
+    report.save_pictures(tmp_path / "maps.png", pictures, pipelines.speed_m_s(SCENE))
     picture = cv2.imread(str(tmp_path / "maps.png"))
     assert picture is not None
     assert picture.std() > 10
 
 
-def test_bad_requests_are_refused(tmp_path: Path) -> None:
+def test_bad_requests_are_refused(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    def walks(folder: str) -> Path:
+        path = tmp_path_factory.mktemp(folder) / "walk.npz"
+        np.savez(path, joints_m=walk().joints(30.0).numpy(), fps=30.0)
+        return path
+
     for options, message in (
         ({"scenes": ("cave",)}, "scene: got 'cave'"),
         ({"sources": ("d",)}, "setting: got 'd'"),
         ({"sources": ("c",)}, "setting c: got no networks"),
         ({"clips": 0}, "clips: got 0"),
+        ({"scenes": ()}, "scenes: got 0"),
+        ({"motions": (walks("a"), walks("b"))}, "after another walk, expected files of different names"),
     ):
         with pytest.raises(TensorsimError, match=message):
             truth.TruthLoop(tmp_path, **options).run(quiet=True)
@@ -353,3 +361,79 @@ def test_names_of_settings_are_those_of_the_tables() -> None:
     assert Setting("b", paper=True).name == "b-paper"
     assert Setting("c", true_stage="pose").name == "c+pose"
     assert settings.SOURCES.keys() == {"a", "b", "c"}
+
+
+def test_files_of_cells_and_films_tell_networks_and_frame_rates_apart(tmp_path: Path) -> None:
+    def best(folder: str) -> Path:
+        (tmp_path / folder).mkdir(exist_ok=True)
+        path = tmp_path / folder / "best.safetensors"
+        path.write_bytes(b"")
+        return path
+
+    def loop(**options: object) -> truth.TruthLoop:
+        networks = {"detector": best("a"), "pose": best("b")}
+        return truth.TruthLoop(tmp_path, **(networks | options))  # type: ignore[arg-type]
+
+    one, other = loop(), loop(pose=best("c"))
+    clip = walk()
+    assert one.film(clip) == one.film(clip) != other.film(clip)
+    assert one.cell("row", clip, "c") != other.cell("row", clip, "c")
+    assert one.cell("row", clip, "b") == other.cell("row", clip, "b")
+    before = one.film(clip)
+    os.utime(best("b"), (0, 0))
+    assert one.film(clip) != before, "the network was trained further"
+    assert one.cell("row", clip, "mean") != loop(seed=3).cell("row", clip, "mean"), "of other clips"
+    np.savez(tmp_path / "walk.npz", joints_m=clip.joints(30.0).numpy(), fps=30.0)
+    (captured,) = captured_clips(tmp_path / "walk.npz", 1)
+    slow = loop(motion_fps=20.0)
+    assert one.cell("walk", captured, "a") != slow.cell("walk", captured, "a")
+
+
+def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tensorsim.commands.evaluate_truth import EvaluateTruth
+
+    monkeypatch.setitem(PRESETS, SCENE, RadarScene(RadarConfig.through_wall(prf_hz=16.0)))
+    EvaluateTruth(
+        tmp_path / "out", 1, ("walking",), scenes=("through-wall",), settings=("a",), stages=False, quiet=True
+    ).run()
+    assert "left out" in capsys.readouterr().err
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"cells", "truth.md", "truth.csv"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"detector": "x.onnx"}, "without setting c"),
+        ({"motion_fps": 30.0}, "--motion-fps: got it without --motion"),
+        ({"seed": -1}, "--seed: got -1"),
+    ],
+)
+def test_the_command_refuses_options_without_effect(
+    options: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    from tensorsim.commands.evaluate_truth import EvaluateTruth
+
+    with pytest.raises(TensorsimError, match=message):
+        EvaluateTruth(tmp_path / "out", **options).run()  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_guess_that_a_radar_cannot_follow_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = Pipelines.maps
+
+    def too_fast(self: Pipelines, setting: Setting, *rest: object) -> Maps:
+        if setting.source == "b" and not setting.paper:
+            raise TensorsimError("a scene moving at 20 m/s")
+        return maps(self, setting, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Pipelines, "maps", too_fast)
+    loop = truth.TruthLoop(tmp_path, 1, ("grabbing",), scenes=(SCENE,), stages=False)
+    with pytest.warns(UserWarning, match="S4 Grabbing 0, through-wall, b: left out, a scene moving"):
+        cells = loop.run(quiet=True)
+    scored = {cell["setting"] for cell in cells if cell["scores"].get(SCENE)}
+    assert scored == {"a", "a-paper", "b-paper", "empty"}
+    assert truth.example_maps(loop, Pipelines({SCENE: PRESETS[SCENE]}), SCENE) == {}

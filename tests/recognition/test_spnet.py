@@ -10,21 +10,14 @@ from torch.nn import functional as F
 from tensorsim.errors import TensorsimError
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import ParallelBlock, SameConv, SPNet
+from tests.networks import settled
 from tests.stage import StageTester, assert_same
 
 
 def lively(network: nn.Module) -> nn.Module:
-    """Normalisation that does something, in evaluation."""
-    generator = torch.Generator().manual_seed(5)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
-            for name, spread in (("running_mean", 0.1), ("bias", 0.1), ("weight", 0.2)):
-                getattr(module, name).data.add_(
-                    spread * torch.randn(module.num_features, generator=generator)
-                )
-            module.running_var.data.copy_(torch.rand(module.num_features, generator=generator) + 0.5)  # type: ignore[union-attr, operator]
+    """Normalisation and a mean that do something, in evaluation."""
     network.get_buffer("mean").fill_(0.3)
-    return network.eval()
+    return settled(network)
 
 
 def make(kind: type[nn.Module], **arguments: Any) -> nn.Module:

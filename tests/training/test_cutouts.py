@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tensorsim.errors import TensorsimError
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.training import cutouts as module
 from tensorsim.training.cutouts import Cutouts, render_cutout, render_cutouts
+from tests.training.tars import write_tar
 
 
 @pytest.mark.parametrize("index", [0, 20, 45, 60])
@@ -41,6 +43,12 @@ def test_shards_are_repeatable_and_go_on(tmp_path: Path, monkeypatch: pytest.Mon
     paths[1].unlink()
     render_cutouts(13, 3, tmp_path, quiet=True)
     assert [p.read_bytes() for p in paths] == data
-    assert not list(tmp_path.glob("*.partial"))
+    assert sorted(tmp_path.iterdir()) == paths
     other = render_cutouts(13, 4, tmp_path / "other", quiet=True)
     assert other[0].read_bytes() != data[0]
+
+
+def test_another_tar_is_refused(tmp_path: Path) -> None:
+    path = write_tar(tmp_path / "cutouts-000.tar", {"0.png": b"", "0.json": b"[]"})
+    with pytest.raises(TensorsimError, match=r"cutouts-000\.tar: not a shard of cut-outs"):
+        Cutouts([path])

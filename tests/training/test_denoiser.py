@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
 from tensorsim.errors import TensorsimError
 from tensorsim.training.denoiser import (
@@ -14,6 +15,7 @@ from tensorsim.training.denoiser import (
     cut_patches,
     on_scale,
     simulate_pair,
+    untrained,
     views,
 )
 from tensorsim.training.denoiser_scores import COLUMNS, compare, ridge_error, scores
@@ -92,7 +94,7 @@ def test_patches_lie_at_one_place_in_both_maps(shape: tuple[int, int]) -> None:
 
 
 def test_learns_to_predict_the_noise(folder: Path, tmp_path: Path) -> None:
-    recipe = DenoiserRecipe(folder, depth=3)
+    recipe = DenoiserRecipe(untrained(3), folder)
     assert (len(recipe.training["image"]), len(recipe.held_out["image"])) == (9 * 12, 12)
     config = LoopConfig(
         tmp_path, 60, 8, workers=0, validate_every=60, ema_decay=0.0, quiet=True, log_every=10
@@ -110,7 +112,7 @@ def test_learns_to_predict_the_noise(folder: Path, tmp_path: Path) -> None:
 
 
 def test_begins_by_doing_nothing(folder: Path) -> None:
-    recipe = DenoiserRecipe(folder, depth=3)
+    recipe = DenoiserRecipe(untrained(3), folder)
     image = torch.rand(1, 1, 9, 9)
     assert torch.equal(recipe.net(image), image)
     with torch.no_grad():
@@ -118,7 +120,7 @@ def test_begins_by_doing_nothing(folder: Path) -> None:
 
 
 def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
-    one, other = DenoiserRecipe(folder, depth=2), DenoiserRecipe(folder, depth=2)
+    one, other = DenoiserRecipe(untrained(2), folder), DenoiserRecipe(untrained(2), folder)
     other.sample(3)
     for name, patch in one.sample(99).items():
         assert patch.shape == (1, TRAINED, TRAINED)
@@ -126,7 +128,7 @@ def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
 
 
 def test_loss_is_half_the_error_of_the_residual(folder: Path) -> None:
-    recipe = DenoiserRecipe(folder, depth=2)
+    recipe = DenoiserRecipe(untrained(2), folder)
     nn.init.normal_(recipe.net.model[-1].weight)  # type: ignore[index,union-attr]
     sample = {name: patch[None] for name, patch in recipe.sample(0).items()}
     residual = recipe.net.noise(sample["image"]) - sample["noise"]  # type: ignore[operator]
@@ -145,7 +147,24 @@ def test_goes_on_and_refuses(folder: Path, tmp_path: Path) -> None:
     build_pairs(folder, 10, per_map=6, scenes=("through-wall",), quiet=True)
     assert path.read_bytes() == content
     with pytest.raises(TensorsimError, match="got 0 files of patches, expected at least 10"):
-        DenoiserRecipe(tmp_path)
+        DenoiserRecipe(untrained(2), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"clips": 9}, "--clips: got 9, expected at least 10"),
+        ({"depth": 1}, "got depth 1"),
+        ({"init": Path("none.safetensors")}, "none.safetensors: no such file"),
+        ({"maps_seed": -1}, "--maps-seed: got -1"),
+    ],
+)
+def test_bad_options_are_refused_before_maps_are_made(
+    options: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        TrainDenoiser(tmp_path / "maps", out=tmp_path / "out", quiet=True, **options).run()  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
 
 
 # ---- scores ----------------------------------------------------------------------------------------------

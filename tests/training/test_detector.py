@@ -27,8 +27,8 @@ from tensorsim.types import Detections, Tracks
 from tensorsim.vision.rtmdet import RTMDet
 from tensorsim.vision.rtmdet_layers import RTMDET_SIZES, RTMDetSize
 from tensorsim.weights import save_weights
-
-from .test_detector_data import cutouts, encoded, shard, write_tar
+from tests.training.tars import write_tar
+from tests.training.test_detector_data import cutouts, encoded, shard
 
 
 @pytest.fixture
@@ -133,9 +133,9 @@ def test_command_trains_and_goes_on_from_weights(
     def train(out: str, **options: Path) -> dict[str, Tensor]:
         TrainDetector(
             tmp_path,
-            tmp_path,
-            20,
-            "test",
+            variant="test",
+            cutouts=tmp_path,
+            rendered=20,
             steps=1,
             batch=2,
             out=tmp_path / out,
@@ -160,10 +160,21 @@ def test_command_trains_and_goes_on_from_weights(
             torch.testing.assert_close(value, first[name], rtol=2e-3, atol=1e-6, msg=name)
 
 
+def test_bad_options_are_refused_before_people_are_rendered(tmp_path: Path) -> None:
+    for options, message in (
+        ({}, "no coco_small"),
+        ({"init": tmp_path / "none.safetensors"}, "no such file"),
+        ({"learning_rate": 0.0}, "--learning-rate: got 0"),
+    ):
+        with pytest.raises(TensorsimError, match=message):
+            TrainDetector(tmp_path, out=tmp_path / "out", quiet=True, **options).run()  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
 def test_held_out_pictures_must_be_of_both_kinds(tmp_path: Path) -> None:
     shard(tmp_path / "coco_small-00.tar", True)
     with pytest.raises(TensorsimError, match="held-out"):
-        read_sources(tmp_path, cutouts(tmp_path / "c.tar"))
+        read_sources(tmp_path)
 
 
 def test_weights_of_the_small_network_load_by_path(tmp_path: Path) -> None:
@@ -298,6 +309,7 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
     write("coco_small", [f"c{i}" for i in range(40)], [person({})], True)
     write_tar(tmp_path / "coco_small-01.tar", {f"n{i}.jpg": encoded(picture, ".jpg") for i in range(40)})
     write("lspet", ["standing"], [person(shoulders | hips)], False)
+    write("lspet-nobody", ["nobody"], [], False)
     write_tar(tmp_path / "lspet-01.tar", {
         "lying.jpg": encoded(picture, ".jpg"),
         "lying.json": json.dumps({"all_persons_labelled": False, "persons": [person(lying)]}).encode(),
@@ -305,13 +317,13 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
     write("pedestrian", ["street"], [person({})], False)
     write_tar(tmp_path / "backgrounds-00.tar", {"room.jpg": encoded(picture, ".jpg")})
 
-    sources, held_out = read_sources(tmp_path, cutouts(tmp_path / "people.tar"))
+    sources, held_out = read_sources(tmp_path)
     keys = {sample.key for sample in sources.complete}
     assert keys | {sample.key for sample in held_out} >= {f"c{i}" for i in range(40)}
     assert not keys & {sample.key for sample in held_out}
     assert 0 < len(held_out) < 40
     everybody, standing, street = sources.partial
-    assert {s.key for s in everybody} == {"standing", "lying"}
+    assert {s.key for s in everybody} == {"standing", "lying", "nobody"}
     assert [s.key for s in standing] == ["standing"]
     empty = {s.key for s in sources.empty}
     assert "room" in empty
@@ -346,3 +358,5 @@ def test_evaluation_prints_a_line_per_detector(
     assert len(lines) == 1
     assert "ap50" in lines[0]
     assert "people 1" in lines[0]
+    EvaluateDetector(weights=path, against=path, coco=tmp_path).run()
+    assert len(capsys.readouterr().out.splitlines()) == 2, "also beside itself"

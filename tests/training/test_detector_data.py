@@ -1,8 +1,6 @@
 """Pictures to train a detector on: boxes stay on the people, and what is not known is marked."""
 
-import io
 import json
-import tarfile
 from pathlib import Path
 
 import cv2
@@ -14,6 +12,7 @@ from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.detector_data import KNOWN_CELLS, Canvas, Labelled, PictureMaker, Sources
 from tensorsim.training.detector_people import outline
 from tensorsim.training.shards import POINTS, Sample, Shards
+from tests.training.tars import write_tar
 
 RED, GREEN = (230, 20, 20), (20, 200, 20)
 
@@ -29,15 +28,6 @@ def encoded(image: np.ndarray, suffix: str) -> bytes:
     order = [2, 1, 0, 3][: image.shape[-1]]
     quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if suffix == ".jpg" else []
     return cv2.imencode(suffix, np.ascontiguousarray(image[..., order]), quality)[1].tobytes()
-
-
-def write_tar(path: Path, files: dict[str, bytes]) -> Path:
-    with tarfile.open(path, "w") as tar:
-        for name, data in files.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
-    return path
 
 
 PERSON = {

@@ -78,10 +78,11 @@ def test_classifier_on_films(weights: Path, tmp_path: Path, capsys: pytest.Captu
     poses = labelled_poses(films)
     assert sorted(pose.activity for pose in poses) == [7, 8]
     assert poses[0].joints.shape == (1, 45, 14, 3)
-    right = classify_poses(weights, poses, "through-wall", 50.0, quiet=True)
-    assert right == [pose.activity == 8 for pose in poses]
+    assert classify_poses(weights, poses, "through-wall", 50.0, quiet=True) == [8, 8]
     EvaluateClassifier(weights, scenes=("through-wall",), poses=films, quiet=True).run()
-    assert "50.0 % of 2" in capsys.readouterr().out
+    printed = capsys.readouterr().out.splitlines()
+    assert "50.0 % of 2" in printed[0]
+    assert printed[1:] == ["  1 S8 as S9"]
 
 
 def test_refuses_films_without_a_class(weights: Path, tmp_path: Path) -> None:
@@ -102,8 +103,36 @@ def test_denoiser(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ).run()
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {row["denoiser"] for row in rows} == {"none", "own", "Perona-Malik"}
+    assert {row["denoiser"] for row in rows} == {"none", str(path), "Perona-Malik"}
     assert {row["map"] for row in rows} == {"doppler_time", "range_time_mti"}
     assert len(rows) == 6
     assert all(row[COLUMNS[0]] for row in rows)
     assert len(capsys.readouterr().out.splitlines()) == 7
+
+
+def test_denoisers_of_one_name_are_two_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [tmp_path / folder / "best.safetensors" for folder in "ab"]
+    for path in paths:
+        save_weights(DnCNN(depth=2, channels=4), path, {})
+    EvaluateDenoiser(paths[0], (paths[1],), clips=1, scenes=("through-wall",), ksvd=False, quiet=True).run()
+    printed = capsys.readouterr().out
+    assert all(printed.count(str(path)) == 2 for path in paths)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"clips": 0}, "--clips: got 0"),
+        ({"snr": ()}, "--snr: got 0"),
+        ({"scenes": ()}, "--scenes: got 0"),
+        ({"seed": -1}, "--seed: got -1"),
+        ({"out": Path("nowhere/table.csv")}, "--out: got nowhere/table.csv"),
+        ({"out": Path(".")}, "--out: got ., expected the name of a file"),
+    ],
+)
+def test_bad_options_of_denoisers_are_refused_before_work_starts(
+    options: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(TensorsimError, match=message):
+        EvaluateDenoiser(tmp_path / "none.safetensors", **options).run()  # type: ignore[arg-type]

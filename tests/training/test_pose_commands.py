@@ -10,8 +10,9 @@ from tensorsim.errors import TensorsimError
 from tensorsim.training.pose import HELD_OUT_PERCENT
 from tensorsim.training.pose_data import split
 from tensorsim.training.shards import Shards
+from tests.training.tars import write_tar
 from tests.training.test_pose_data import BOX, standing, write_cutouts
-from tests.training.test_shards import jpg, label, write_shard
+from tests.training.test_shards import jpg, label
 
 
 @pytest.fixture
@@ -21,8 +22,8 @@ def data(tmp_path: Path) -> Path:
     pictures = {f"im{n}.jpg": jpg(n, 280, 200) for n in range(40)}
     labels = {f"im{n}.json": label([person]) for n in range(40)}
     for name in ("coco_small-00", "lspet-00"):
-        write_shard(tmp_path / f"{name}.tar", pictures | labels)
-    write_shard(tmp_path / "backgrounds-00.tar", {"place.jpg": jpg(0, 80, 60)})
+        write_tar(tmp_path / f"{name}.tar", pictures | labels)
+    write_tar(tmp_path / "backgrounds-00.tar", {"place.jpg": jpg(0, 80, 60)})
     write_cutouts(tmp_path / "cutouts-000.tar")
     return tmp_path
 
@@ -60,6 +61,25 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
     )  # type: ignore[arg-type]
     more.run()
     assert (data / "more" / "best.safetensors").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"init": Path("none.safetensors")}, "none.safetensors: no such file"),
+        ({"device": "abacus"}, "--device: 'abacus'"),
+        ({"seed": -1}, "--seed: got -1"),
+        ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
+        ({"width": 0}, "HRNetConfig"),
+    ],
+)
+def test_bad_options_are_refused_before_people_are_rendered(
+    data: Path, options: dict[str, object], message: str
+) -> None:
+    out = data / "out"
+    with pytest.raises(TensorsimError, match=message):
+        TrainPose(data, out=out, rendered=13, steps=1, quiet=True, **options).run()  # type: ignore[arg-type]
+    assert not out.exists()
 
 
 def test_missing_data_is_told(tmp_path: Path) -> None:

@@ -1,10 +1,6 @@
 """Crops to train on: what is drawn at a keypoint is still there after every augmentation."""
 
-import io
-import json
-import tarfile
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +24,7 @@ from tensorsim.training.pose_data import (
 )
 from tensorsim.training.shards import Sample
 from tensorsim.vision.crops import BoxCrop, crop_to_image
+from tests.training.tars import write_tar
 from tests.training.test_shards import jpg
 
 SIZE = (128, 96)
@@ -240,15 +237,10 @@ def write_cutouts(path: Path, count: int = 2) -> Path:
     cv2.ellipse(rgba, (20, 30), (18, 28), 0, 0, 360, (0, 0, 255, 255), -1)
     angles = np.linspace(0, 2 * np.pi, 17, endpoint=False)
     points = np.stack([20 + 12 * np.cos(angles), 30 + 20 * np.sin(angles), np.full(17, 2)], -1)
-    with tarfile.open(path, "w") as tar:
-        for number in range(count):
-            png = cv2.imencode(".png", rgba)[1].tobytes()
-            label: Any = json.dumps({"keypoints": points.tolist()}).encode()
-            for name, data in ((f"{number:06d}.png", png), (f"{number:06d}.json", label)):
-                info = tarfile.TarInfo(name)
-                info.size = len(data)
-                tar.addfile(info, io.BytesIO(data))
-    return path
+    png = cv2.imencode(".png", rgba)[1].tobytes()
+    pictures = {f"{number:06d}.png": png for number in range(count)}
+    labels = {f"{number:06d}.json": {"keypoints": points.tolist()} for number in range(count)}
+    return write_tar(path, pictures | labels)
 
 
 def test_rendered_people_cover_the_place_and_nothing_else(tmp_path: Path) -> None:

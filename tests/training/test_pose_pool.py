@@ -9,6 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from tensorsim import cli
 from tensorsim.commands.library import BuildLibrary
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
@@ -108,10 +109,20 @@ def test_command_builds_from_folders_patterns_and_the_generator(
     NearestPoseLifter(load_pose_library(out), yaws=4)
 
 
+def test_the_command_goes_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clip = standardise_poses(sample_poses(20))
+    np.savez(tmp_path / "a.npz", joints_m=clip.numpy(), fps=30.0)
+    out = tmp_path / "pool.safetensors"
+    cli.main(["library", "build", str(tmp_path / "a.npz"), "--out", str(out), "--quiet"])
+    assert "of 40" in capsys.readouterr().out
+    assert out.is_file()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({}, "nothing to build from"),
+        ({"generate": 400, "seed": -1}, "--seed: got -1"),
         ({"generate": -5}, "--generate: got -5"),
         ({"generate": 400, "most": 0}, "--most: got 0"),
         ({"generate": 400, "out": Path("pool.npz")}, r"--out: got pool\.npz"),

@@ -1,6 +1,5 @@
 """Shards and COCO files against tarfile, json and OpenCV used by hand."""
 
-import io
 import json
 import pickle
 import tarfile
@@ -13,22 +12,13 @@ import pytest
 
 from tensorsim.errors import TensorsimError
 from tensorsim.training.shards import AREA_OF_BOX, POINTS, Shards, find_shards, read_coco
+from tests.training.tars import write_tar
 
 
 def jpg(seed: int, height: int = 20, width: int = 30) -> bytes:
     colour = np.random.default_rng(seed).integers(0, 256, 3)
     picture = np.full((height, width, 3), colour, np.uint8)
     return cv2.imencode(".jpg", picture)[1].tobytes()
-
-
-def write_shard(path: Path, files: dict[str, Any]) -> Path:
-    with tarfile.open(path, "w") as tar:
-        for name, content in files.items():
-            data = content if isinstance(content, bytes) else json.dumps(content).encode()
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
-    return path
 
 
 def label(persons: list[dict[str, Any]], everyone: bool = True) -> dict[str, Any]:
@@ -42,7 +32,7 @@ def shard(tmp_path: Path) -> Path:
         {"bbox": [2, 3, 10, 12], "keypoints": points},
         {"bbox": [0, 0, 5, 5], "keypoints": None},
     ]
-    return write_shard(
+    return write_tar(
         tmp_path / "some-00.tar",
         {
             "b.jpg": jpg(1),
@@ -83,7 +73,7 @@ def test_a_copy_in_another_process_reads_too(shard: Path) -> None:
 
 def test_shards_come_in_the_order_given(tmp_path: Path) -> None:
     for name in ("x-01", "x-00", "y-00"):
-        write_shard(tmp_path / f"{name}.tar", {f"{name}.jpg": jpg(0)})
+        write_tar(tmp_path / f"{name}.tar", {f"{name}.jpg": jpg(0)})
     assert [sample.key for sample in Shards(find_shards(tmp_path, "x"))] == ["x-00", "x-01"]
     with pytest.raises(TensorsimError, match=r"no z-\*\.tar"):
         find_shards(tmp_path, "z")
@@ -92,7 +82,7 @@ def test_shards_come_in_the_order_given(tmp_path: Path) -> None:
 @pytest.mark.parametrize("files", [{}, {"a.json": label([])}, {"a.jpg": b"", "a.json": {"persons": 3}}])
 def test_other_tars_are_refused(tmp_path: Path, files: dict[str, Any]) -> None:
     with pytest.raises(TensorsimError, match="shard of"):
-        Shards([write_shard(tmp_path / "bad.tar", files)])
+        Shards([write_tar(tmp_path / "bad.tar", files)])
 
 
 def test_what_is_no_tar_or_no_picture_is_refused(tmp_path: Path) -> None:
@@ -101,9 +91,9 @@ def test_what_is_no_tar_or_no_picture_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="not a shard"):
         Shards([path])
     with pytest.raises(TensorsimError, match="not a picture"):
-        Shards([write_shard(path, {"a.jpg": b"not a jpg"})])[0].image()
+        Shards([write_tar(path, {"a.jpg": b"not a jpg"})])[0].image()
     with pytest.raises(TensorsimError, match="not a picture"):
-        Shards([write_shard(path, {"a.jpg": b""})])[0].image()
+        Shards([write_tar(path, {"a.jpg": b""})])[0].image()
 
 
 def test_coco_file(tmp_path: Path) -> None:
