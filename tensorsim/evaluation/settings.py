@@ -150,7 +150,11 @@ class Pipelines:
             valid = torch.ones(joints.shape[:2], dtype=torch.bool)
             # Exact joints need no smoothing and get none, as those of motion files.
             return _smoother(setting, truth)(joints, None, FPS) if setting.paper else joints, valid
-        observed = self._observed(setting, clip, film)
+        return self.lifted(setting, clip, self._observed(setting, clip, film))
+
+    def lifted(self, setting: Setting, clip: Clip, observed: Observed) -> tuple[Tensor, Tensor]:
+        """Joints and who is there, as :meth:`joints`, of people that were observed in the picture."""
+        truth = clip.joints(FPS)
         if observed.valid.shape[0] == 0:
             return torch.zeros(0, len(truth), 14, 3), observed.valid
         if setting.true_stage in ("lifting", "position", "smoothing"):  # about the one person that is there
