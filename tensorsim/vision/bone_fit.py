@@ -139,7 +139,7 @@ class BoneFit(nn.Module):
         depth_m: deviation of the given depths about the hips.
         range_m: the same of the hips.
         trust: weight of what is given; below 1, as it is off in the same way for several frames.
-        floor_m: deviation of the lowest joint from its height over the floor.
+        floor_m: deviation of the lowest joint from its height over the floor, of ankles see ``standing_m``.
         steps: of Levenberg-Marquardt while bones still may stretch much, to find the way, and when they no longer do.
         rounds: at most so many times the branches are chosen anew.
 
