@@ -1,10 +1,15 @@
 """``tensorsim evaluate classifier``: accuracy on generated people, against noise, and on poses from films."""
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+from tensorsim.commands.options import check_seed
 from tensorsim.errors import TensorsimError
+
+if TYPE_CHECKING:
+    from tensorsim.training.film_maps import LabelledPose
 
 
 @dataclass(frozen=True)
@@ -17,10 +22,9 @@ class EvaluateClassifier:
         scenes: what to evaluate on.
         people: people per scene, each doing all 12 activities.
         held_out: only every fifth of them: for a folder that the network was trained on.
-        filmed: the maps are of motion as the pipeline finds it in films, imitated without rendering; see ``train
-            classifier --film-maps``.
         maps_seed: of people, motion and noise; one that the network was not trained on makes a test set.
-        snr: signal-to-noise ratios in dB.
+        snr: signal-to-noise ratios in dB; films are judged at the highest.
+        films: folder of films that networks watched, as ``evaluate truth --settings c`` keeps them in ``films/``.
         poses: folder with a pose.npz of ``tensorsim simulate`` per film, in folders whose names begin with S1 to S12.
         out: folder for the confusion matrices as CSV and PNG.
         quiet: no progress bar.
@@ -31,36 +35,40 @@ class EvaluateClassifier:
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     people: int = 40
     held_out: bool = False
-    filmed: bool = False
     maps_seed: int = 1
     snr: tuple[float, ...] = (50.0, 40.0, 30.0, 20.0, 10.0)
+    films: Path | None = None
     poses: Path | None = None
     out: Path | None = None
     quiet: bool = False
 
     def run(self) -> None:
         """Do it."""
-        if self.maps is None and self.poses is None:
-            raise TensorsimError("evaluate classifier: got nothing to classify, expected --maps or --poses")
+        if self.maps is None and self.films is None and self.poses is None:
+            raise TensorsimError(
+                "evaluate classifier: got nothing to classify, expected --maps, --films or --poses"
+            )
         if len(self.snr) == 0:
             raise TensorsimError("--snr: got no ratios, expected at least one")
+        check_seed(self.maps_seed, "--maps-seed")
+        from tensorsim.training.film_maps import film_poses, labelled_poses
+
         if self.maps is not None:
             self._on_maps()
+        if self.films is not None:
+            self._on_films(film_poses(self.films))
         if self.poses is not None:
-            self._on_poses()
+            self._on_films(labelled_poses(self.poses))
 
     def _on_maps(self) -> None:
         from tensorsim import plot
         from tensorsim.config import ACTIVITIES
-        from tensorsim.evaluation.films import FPS
         from tensorsim.training.classifier import clips_of, confusion, load_classifier, logits_of
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         assert self.maps is not None
         network, size = load_classifier(self.weights)
         settings = MapSettings(seed=self.maps_seed)
-        if self.filmed:
-            settings = MapSettings(seed=self.maps_seed, motion_hz=FPS, filmed=True)
         build_maps(self.maps, self.people, self.scenes, settings, quiet=self.quiet)
         store = MapStore(self.maps)
         print(f"{'scene':14s}" + "".join(f"{ratio:8.0f} dB" for ratio in self.snr) + "   clips")
@@ -91,11 +99,14 @@ class EvaluateClassifier:
                 figure = plot.confusion_figure(matrix, names, f"{scene}, {ratio:.0f} dB")
                 plot.save_figure(figure, stem.with_suffix(".png"))
 
-    def _on_poses(self) -> None:
-        from tensorsim.training.film_maps import classify_poses, labelled_poses
+    def _on_films(self, poses: "list[LabelledPose]") -> None:
+        from tensorsim.training.film_maps import classify_poses
 
-        assert self.poses is not None
-        poses = labelled_poses(self.poses)
+        true = [pose.activity for pose in poses]
         for scene in self.scenes:
-            right = classify_poses(self.weights, poses, scene, max(self.snr), self.quiet)
-            print(f"{scene:14s} films: {100 * sum(right) / len(right):.1f} % of {len(right)}")
+            found = classify_poses(self.weights, poses, scene, max(self.snr), self.quiet)
+            wrong = Counter(f"S{a + 1} as S{b + 1}" for a, b in zip(true, found, strict=True) if a != b)
+            right = len(poses) - wrong.total()
+            print(f"{scene:14s} films: {100 * right / len(poses):.1f} % of {len(poses)}")
+            if wrong:
+                print("  " + ", ".join(f"{count} {which}" for which, count in wrong.items()), flush=True)

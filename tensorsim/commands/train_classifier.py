@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
+from tensorsim.errors import TensorsimError
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,8 @@ class TrainClassifier(TrainOptions):
         people: people per scene; each does all 12 activities, and every fifth is held out.
         snr: lowest and highest signal-to-noise ratio in dB; 50 50 is the paper's.
         size: height and width of the pictures, a divisor of 224; the network's own if not given.
+        films: folder of films that networks watched, as ``evaluate truth --settings c`` keeps them in ``films/``: their
+            errors are given to the motion of ``film_maps``.
         film_maps: folder of more maps to train on, of motion as the pipeline finds it in films; those that are missing
             are made first, without rendering.
         film_people: people per scene in it.
@@ -34,6 +38,7 @@ class TrainClassifier(TrainOptions):
     people: int = 300
     snr: tuple[float, float] = (10.0, 50.0)
     size: int | None = None
+    films: Path | None = None
     film_maps: Path | None = None
     film_people: int = 40
     learning_rate: float = 1.47e-3
@@ -44,16 +49,34 @@ class TrainClassifier(TrainOptions):
 
     def run(self) -> None:
         """Do it."""
-        from tensorsim.evaluation.films import FPS
-        from tensorsim.training.classifier import ClassifierRecipe
+        from tensorsim.config import ACTIVITIES
+        from tensorsim.training.classifier import ClassifierRecipe, held_out
+        from tensorsim.training.film_errors import FilmErrors, watched_films
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
-        build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
+        check_seed(self.maps_seed, "--maps-seed")
+        check_seed(self.film_seed, "--film-seed")
+        if (self.films is None) != (self.film_maps is None):
+            raise TensorsimError("--films, --film-maps: got one of them, expected both or none")
+        people = [self.people] if self.films is None else [self.people, self.film_people]
+        trained = sum(not held_out(person) for count in people for person in range(count))
+        epoch = max(1, trained * len(ACTIVITIES) * len(self.scenes) // max(1, self.batch))
+        loop = self.loop(
+            steps=self.epochs * epoch,
+            batch=self.batch,
+            checkpoint_every=min(50, epoch),
+            validate_every=epoch,
+            ema_decay=0.0,
+        )
         filmed = None
-        if self.film_maps is not None:
-            settings = MapSettings(seed=self.film_seed, motion_hz=FPS, filmed=True)
-            build_maps(self.film_maps, self.film_people, self.scenes, settings, quiet=self.quiet)
+        if self.films is not None and self.film_maps is not None:
+            errors = FilmErrors(watched_films(self.films))
+            settings = MapSettings.of_films(self.film_seed, errors)
+            build_maps(
+                self.film_maps, self.film_people, self.scenes, settings, quiet=self.quiet, errors=errors
+            )
             filmed = MapStore(self.film_maps)
+        build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
         recipe = ClassifierRecipe(
             self.network,
             MapStore(self.maps),
@@ -66,13 +89,5 @@ class TrainClassifier(TrainOptions):
             filmed,
             self.film_people,
             self.learning_rate,
-        )
-        epoch = max(1, len(recipe.training) // self.batch)
-        loop = self.loop(
-            steps=self.epochs * epoch,
-            batch=self.batch,
-            checkpoint_every=min(50, epoch),
-            validate_every=epoch,
-            ema_decay=0.0,
         )
         self.train(recipe, loop)

@@ -13,10 +13,10 @@ did in one scene, so that people can be held out whole and an interrupted run go
 """
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +24,8 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.films import FPS
+from tensorsim.files import complete_file
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import PoseResampler
@@ -36,6 +38,7 @@ from tensorsim.radar.noise import mean_power
 from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.range_profile import RangeProfile
 from tensorsim.recognition.map_image import MapToImage
+from tensorsim.training.film_errors import FilmErrors
 from tensorsim.training.film_maps import FilmLoss
 
 SCENES = ("free-space", "through-wall")
@@ -59,8 +62,8 @@ class MapSettings:
         duration_s: length of a clip.
         motion_hz: joints are sampled at this rate before the spline to the pulses: 240 is the true motion, 30 what
             a camera leaves of it.
-        filmed: joints are those that the pipeline finds on a film of that rate, see
-            :class:`~tensorsim.training.film_maps.FilmLoss`.
+        films: tells the films apart whose errors the motion has, see
+            :class:`~tensorsim.training.film_errors.FilmErrors`; none for true motion.
 
     Raises:
         TensorsimError: a size below 1, or a span or rate that is not positive.
@@ -71,11 +74,16 @@ class MapSettings:
     speed_m_s: float = 3.8
     duration_s: float = 4.0
     motion_hz: float = _MOTION_HZ
-    filmed: bool = False
+    films: str = ""
 
     def __post_init__(self) -> None:
         if self.size < 1 or not (self.speed_m_s > 0 and self.duration_s > 0 and self.motion_hz > 0):
             raise TensorsimError(f"MapSettings: got {self}, expected positive numbers")
+
+    @classmethod
+    def of_films(cls, seed: int, errors: FilmErrors) -> "MapSettings":
+        """Motion as the pipeline finds it in films where networks make these errors."""
+        return cls(seed=seed, motion_hz=FPS, films=errors.digest)
 
 
 def one_person_many_ways(
@@ -105,6 +113,54 @@ def from_bytes(level: Tensor) -> Tensor:
     return torch.where(level > 0, power, 0.0)
 
 
+class Moves(NamedTuple):
+    """What one person does, as the radar is to see it.
+
+    Attributes:
+        joints: (12, T, 14, 3) m, by activity.
+        valid: (12, T) bool, whether there.
+        noise: state of the generator of the receiver's noise.
+    """
+
+    joints: Tensor
+    valid: Tensor
+    noise: Tensor
+
+
+class MotionMaker:
+    """Makes what the people of a store do.
+
+    Args:
+        settings: of the store.
+        errors: of films, if the settings name some.
+
+    Raises:
+        TensorsimError: errors of other films.
+    """
+
+    def __init__(self, settings: MapSettings, errors: FilmErrors | None = None) -> None:
+        if settings.films != ("" if errors is None else errors.digest):
+            raise TensorsimError(f"MotionMaker: got errors of other films than those of {settings}")
+        self.settings = settings
+        self.film = None if errors is None else FilmLoss(errors)
+
+    def __call__(self, index: int) -> Moves:
+        """What person ``index`` does."""
+        generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + index)
+        people = one_person_many_ways(len(ACTIVITIES), generator)
+        motion = ActivityGenerator().generate(
+            torch.arange(len(ACTIVITIES)),
+            people=people,
+            duration_s=self.settings.duration_s,
+            rate_hz=self.settings.motion_hz,
+        )
+        joints, valid = motion.joints.clone(), motion.valid.clone()
+        if self.film is not None:
+            for k in torch.nonzero(valid.any(-1)).flatten().tolist():
+                joints[k], valid[k] = self.film(joints[k], float(people.height_m[k]), generator)
+        return Moves(joints, valid, generator.get_state())
+
+
 class MapMaker:
     """Makes the pictures of one scene.
 
@@ -124,7 +180,6 @@ class MapMaker:
         self.mti = MovingTargetIndicator()
         self.scatterers = JointScatterers()
         self.resampler = PoseResampler(self.radar.prf_hz)
-        self.film = FilmLoss() if settings.filmed else None
         pulses = round(settings.duration_s * self.radar.prf_hz)
         # A frame per column is enough: what lies between is averaged in a pixel anyway.
         usual = DopplerFrames(self.radar)
@@ -165,23 +220,39 @@ class MapMaker:
         last = float(self.profile.range_m[-1])
         return RangeProfile(self.radar, gate_m=(max(0.0, near), min(far, last)))
 
+    def echo_pictures(self, joints: Tensor, valid: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """The pictures A and B of somebody, joints (T, 14, 3) and whether there (T,), in noise of the same time.
+
+        The mean power of the echo is 1 per IF sample.
+        """
+        rate_hz = self.settings.motion_hz
+        pulses = self.resampler.pulses(len(joints), rate_hz)
+        presence = visibility_fade(valid[None], rate_hz, self.radar.prf_hz, 0, pulses)
+        points, rcs = self.scatterers(self.resampler(joints[None], rate_hz), presence)
+        every = max(1, pulses // 512)
+        power = mean_power(self.echo.target_echo(points[::every], rcs[::every]))
+        gate = self.gate(points)
+        bins = RangeBinSynthesizer(self.echo, gate, near_bins=_MARGIN_BINS - 1)
+        power_sum, cross_sum, first = torch.zeros(()), torch.zeros(()), gate.first_bin
+        for spectra in self.spectra(bins(points, rcs) / power.sqrt()):
+            echo, beside = (
+                torch.view_as_real(spectra),
+                torch.view_as_real(noise[first : first + len(spectra)]),
+            )
+            power_sum = power_sum + echo.square().sum(0).sum(-1)
+            cross_sum = cross_sum + (echo * beside).sum(0).sum(-1)
+            first += len(spectra)
+        return self.picture(power_sum), self.picture(cross_sum)
+
     @torch.no_grad()
-    def person(self, index: int) -> dict[str, Tensor]:
-        """What person ``index`` does, as stored: bytes ``signal`` and ``cross`` (12, H, W) and ``noise`` (H, W).
+    def pictures(self, moves: Moves) -> dict[str, Tensor]:
+        """What a person does, as stored: bytes ``signal`` and ``cross`` (12, H, W) and ``noise`` (H, W).
 
         ``gain_db`` (12,) is the noise's peak against the signal's at a ratio of 0 dB.
         """
-        generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + index)
-        count = len(ACTIVITIES)
-        people = one_person_many_ways(count, generator)
-        motion = ActivityGenerator().generate(
-            torch.arange(count),
-            people=people,
-            duration_s=self.settings.duration_s,
-            rate_hz=self.settings.motion_hz,
-        )
-        pulses = self.resampler.pulses(motion.joints.shape[1], self.settings.motion_hz)
-        noise = self.noise(pulses, generator)
+        count, frames = moves.valid.shape
+        pulses = self.resampler.pulses(frames, self.settings.motion_hz)
+        noise = self.noise(pulses, torch.Generator().set_state(moves.noise))
         noise_picture = self.picture(torch.view_as_real(noise).square().sum(0).sum(-1))
         noise_peak = noise_picture.max()
         size = self.settings.size
@@ -189,35 +260,11 @@ class MapMaker:
         cross = torch.zeros(count, size, size, dtype=torch.int8)
         gain_db = torch.zeros(count)
         for k in range(count):
-            if not bool(motion.valid[k].any()):
-                continue
-            joints, presence = motion.joints[k], torch.ones(1, 1, pulses)
-            if self.film is not None:
-                rate = self.settings.motion_hz
-                joints, seen = self.film(joints, float(people.height_m[k]), rate, generator)
-                if not bool(seen.any()):
-                    continue
-                presence = visibility_fade(seen[None, None], rate, self.radar.prf_hz, 0, pulses)
-            positions = self.resampler(joints[None], self.settings.motion_hz)
-            points, rcs = self.scatterers(positions.unsqueeze(0), presence)
-            points, rcs = points[0], rcs[0]
-            every = max(1, pulses // 512)
-            power = mean_power(self.echo.target_echo(points[::every], rcs[::every]))
-            gate = self.gate(points)
-            bins = RangeBinSynthesizer(self.echo, gate, near_bins=_MARGIN_BINS - 1)
-            power_sum, cross_sum, first = torch.zeros(()), torch.zeros(()), gate.first_bin
-            for spectra in self.spectra(bins(points, rcs) / power.sqrt()):
-                echo, beside = (
-                    torch.view_as_real(spectra),
-                    torch.view_as_real(noise[first : first + len(spectra)]),
-                )
-                power_sum = power_sum + echo.square().sum(0).sum(-1)
-                cross_sum = cross_sum + (echo * beside).sum(0).sum(-1)
-                first += len(spectra)
-            a, b = self.picture(power_sum), self.picture(cross_sum)
-            signal[k] = to_bytes(a / a.max())
-            cross[k] = (127 * b / (a * noise_picture).sqrt().clamp_min(1e-30)).round().clamp(-127, 127)
-            gain_db[k] = 10 * (noise_peak / a.max()).log10()
+            if bool(moves.valid[k].any()):
+                a, b = self.echo_pictures(moves.joints[k], moves.valid[k], noise)
+                signal[k] = to_bytes(a / a.max())
+                cross[k] = (127 * b / (a * noise_picture).sqrt().clamp_min(1e-30)).round().clamp(-127, 127)
+                gain_db[k] = 10 * (noise_peak / a.max()).log10()
         return {
             "signal": signal,
             "cross": cross,
@@ -233,37 +280,39 @@ def build_maps(
     settings: MapSettings | None = None,
     first: int = 0,
     quiet: bool = False,
+    errors: FilmErrors | None = None,
 ) -> None:
     """Fill a store: people ``first`` to ``first + people`` in each scene; what is there already stays.
 
+    ``errors`` are those of the films that the settings name.
+
     Raises:
-        TensorsimError: the folder holds a store of other settings.
+        TensorsimError: the folder holds a store of other settings, or the errors are of other films than these.
     """
     from safetensors.torch import save_file
 
     settings = MapSettings() if settings is None else settings
-    folder.mkdir(parents=True, exist_ok=True)
     described = folder / "settings.json"
     if described.is_file():
         there = json.loads(described.read_text(encoding="utf-8"))
         if MapSettings(**there) != settings:
             raise TensorsimError(f"{folder}: it holds maps of {there}, expected {asdict(settings)}")
     else:
-        _write(described, json.dumps(asdict(settings), indent=2).encode())
-    for scene in scenes:
-        maker = MapMaker(scene, settings)
-        for index in tqdm(range(first, first + people), desc=scene, unit="person", disable=quiet):
+        with complete_file(described) as scratch:
+            scratch.write_text(json.dumps(asdict(settings), indent=2), encoding="utf-8")
+    motion = MotionMaker(settings, errors)
+    makers = {scene: MapMaker(scene, settings) for scene in scenes}
+    for index in tqdm(range(first, first + people), desc=folder.name, unit="person", disable=quiet):
+        missing = {}
+        for scene in scenes:
             path = folder / f"{scene}-{index:05d}.safetensors"
             if not path.is_file():
-                scratch = path.with_suffix(f".{os.getpid()}.tmp")
-                save_file(maker.person(index), scratch)
-                os.replace(scratch, path)
-
-
-def _write(path: Path, data: bytes) -> None:
-    scratch = path.with_suffix(f".{os.getpid()}.tmp")
-    scratch.write_bytes(data)
-    os.replace(scratch, path)
+                missing[path] = makers[scene]
+        moves = motion(index) if missing else None
+        for path, maker in missing.items():
+            assert moves is not None
+            with complete_file(path) as scratch:
+                save_file(maker.pictures(moves), scratch)
 
 
 class MapStore:

@@ -8,14 +8,18 @@ from torch import Tensor
 
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.clips import ActivityClip
+from tensorsim.evaluation.films import true_keypoints
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.presets import PRESETS
 from tensorsim.recognition.map_image import MapToImage, scaled
+from tensorsim.training.film_errors import FilmErrors, Watched
 from tensorsim.training.maps import (
     MapMaker,
     MapSettings,
     MapStore,
+    MotionMaker,
     build_maps,
     from_bytes,
     one_person_many_ways,
@@ -132,20 +136,42 @@ def test_free_space_pictures_are_those_of_the_simulator(tmp_path: Path) -> None:
     assert float(difference.abs().median()) < 1.0
 
 
-def test_motion_that_a_camera_saw() -> None:
+@pytest.fixture(scope="module")
+def errors() -> FilmErrors:
+    """Of networks that see somebody walk as it is."""
+    clip = ActivityClip("S8 Walking", "0", 7, 1.0)
+    return FilmErrors({"film": Watched.of(clip, true_keypoints(clip))})
+
+
+def test_motion_that_a_camera_saw(errors: FilmErrors) -> None:
     """Empty stays empty; somebody walking is found in the same place within the store's span of speeds."""
-    settings = MapSettings(size=28, duration_s=1.0, motion_hz=30.0, filmed=True)
-    seen, true = (MapMaker("through-wall", s).person(0) for s in (settings, replace(settings, filmed=False)))
+    settings = replace(MapSettings.of_films(0, errors), size=28, duration_s=1.0)
+    assert settings.motion_hz == 30.0
+    maker = MapMaker("through-wall", settings)
+    movers = (MotionMaker(settings, errors), MotionMaker(replace(settings, films="")))
+    seen, true = (maker.pictures(mover(0)) for mover in movers)
     assert int(seen["signal"][0].max()) == 0
     assert bool((seen["signal"][1:].flatten(1).amax(1) == 255).all())
     assert not torch.equal(seen["signal"][7], true["signal"][7])
     fastest = [(from_bytes(x["signal"][7]) > 1e-2).any(1).nonzero().flatten() for x in (seen, true)]
     assert abs(float(fastest[0].double().mean() - fastest[1].double().mean())) < 3
+    for other, given in ((settings, None), (replace(settings, films="0123"), errors), (SMALL, errors)):
+        with pytest.raises(TensorsimError, match="errors of other films"):
+            MotionMaker(other, given)
+
+
+def test_nobody_adds_nothing() -> None:
+    """Somebody who is there for half of the time has an echo then only."""
+    maker = MapMaker("through-wall", replace(SMALL, motion_hz=30.0))
+    noise = maker.noise(128, torch.Generator().manual_seed(0))
+    walk = ActivityClip("S8 Walking", "0", 7, 1.0).joints(30.0)
+    echo, _ = maker.echo_pictures(walk, torch.arange(30) < 15, noise)
+    assert float(echo[:, 17:].sum()) < 1e-3 * float(echo[:, :11].sum())
 
 
 def test_stores_of_before_are_read(tmp_path: Path) -> None:
     stated = asdict(SMALL)
-    del stated["filmed"]
+    del stated["films"]
     (tmp_path / "settings.json").write_text(json.dumps(stated))
     build_maps(tmp_path, 0, ("through-wall",), SMALL, quiet=True)
     assert MapStore(tmp_path).settings == SMALL
