@@ -12,6 +12,7 @@ from tensorsim.config import (
     JOINT_RCS_M2,
     JOINTS,
     CameraConfig,
+    FloorConfig,
     RadarConfig,
     WallConfig,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "JOINT_RCS_M2",
     "CameraConfig",
     "Detections",
+    "FloorConfig",
     "Pose",
     "PoseToDoppler",
     "RadarConfig",

@@ -73,10 +73,14 @@ ACTIVITIES = (
 Vector = tuple[float, float, float]
 
 
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
+
+
 def _require_positive(owner: str, **values: float) -> None:
     for name, value in values.items():
-        if not (math.isfinite(value) and value > 0):
-            raise TensorsimError(f"{owner}.{name}: got {value}, expected a positive finite number")
+        if not (_is_finite(value) and value > 0):
+            raise TensorsimError(f"{owner}.{name}: got {value!r}, expected a positive finite number")
 
 
 def _as_positions(value: Any) -> Any:
@@ -87,16 +91,15 @@ def _as_positions(value: Any) -> Any:
 
 def _listed(positions: Any) -> tuple[Vector, ...]:
     """One position, or several, as several."""
-    several = len(positions) > 0 and isinstance(positions[0], tuple)
+    several = isinstance(positions, tuple) and len(positions) > 0 and isinstance(positions[0], tuple)
     return positions if several else (positions,)
 
 
 def _require_vector(owner: str, **values: Vector) -> None:
     for name, value in values.items():
-        numbers = all(isinstance(v, Real) and math.isfinite(v) for v in value)
-        if len(value) != 3 or not numbers:
+        if not (isinstance(value, tuple) and len(value) == 3 and all(_is_finite(v) for v in value)):
             raise TensorsimError(
-                f"{owner}.{name}: got {value}, expected three finite numbers (x, y, z) in metres"
+                f"{owner}.{name}: got {value!r}, expected three finite numbers (x, y, z) in metres"
             )
 
 
@@ -142,9 +145,9 @@ class RadarConfig:
         for rx in self.rx_positions_m:
             _require_vector("RadarConfig", rx_m=rx)
         for name in ("antenna_gain_dbi", "isolation_db"):
-            if not math.isfinite(getattr(self, name)):
+            if not _is_finite(getattr(self, name)):
                 raise TensorsimError(
-                    f"RadarConfig.{name}: got {getattr(self, name)}, expected a finite number of dB"
+                    f"RadarConfig.{name}: got {getattr(self, name)!r}, expected a finite number of dB"
                 )
         if self.samples_per_chirp < 2:
             raise TensorsimError(
@@ -235,16 +238,18 @@ class WallConfig:
     loss_tangent: float = 0.03
 
     def __post_init__(self) -> None:
+        for name in ("center_m", "size_m"):
+            object.__setattr__(self, name, _as_positions(getattr(self, name)))
         _require_vector("WallConfig", center_m=self.center_m, size_m=self.size_m)
         if self.size_m[0] <= 0 or self.size_m[1] < 0 or self.size_m[2] <= 0:
             raise TensorsimError(
                 f"WallConfig.size_m: got {self.size_m}, expected positive width and height and thickness >= 0"
             )
-        if not (math.isfinite(self.relative_permittivity) and self.relative_permittivity >= 1):
+        if not (_is_finite(self.relative_permittivity) and self.relative_permittivity >= 1):
             raise TensorsimError(
                 f"WallConfig.relative_permittivity: got {self.relative_permittivity}, expected a finite number >= 1"
             )
-        if not (math.isfinite(self.loss_tangent) and self.loss_tangent >= 0):
+        if not (_is_finite(self.loss_tangent) and self.loss_tangent >= 0):
             raise TensorsimError(
                 f"WallConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0"
             )
@@ -273,15 +278,15 @@ class FloorConfig:
     reflection: float | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.relative_permittivity) and self.relative_permittivity >= 1):
+        if not (_is_finite(self.relative_permittivity) and self.relative_permittivity >= 1):
             raise TensorsimError(
                 f"FloorConfig.relative_permittivity: got {self.relative_permittivity}, expected a finite number >= 1"
             )
-        if not (math.isfinite(self.loss_tangent) and self.loss_tangent >= 0):
+        if not (_is_finite(self.loss_tangent) and self.loss_tangent >= 0):
             raise TensorsimError(
                 f"FloorConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0"
             )
-        if self.reflection is not None and not -1 <= self.reflection <= 1:
+        if self.reflection is not None and not (_is_finite(self.reflection) and -1 <= self.reflection <= 1):
             raise TensorsimError(f"FloorConfig.reflection: got {self.reflection}, expected between -1 and 1")
 
 
@@ -298,7 +303,8 @@ class CameraConfig:
         yaw_rad: turn of the optical axis from +y towards +x.
 
     Raises:
-        TensorsimError: a focal length or field of view that is not physical.
+        TensorsimError: a focal length or field of view that is not physical, a position, principal point or angle
+            that is not finite.
     """
 
     focal_px: float | None = None
@@ -311,13 +317,22 @@ class CameraConfig:
     def __post_init__(self) -> None:
         if self.focal_px is not None:
             _require_positive("CameraConfig", focal_px=self.focal_px)
-        if not 0 < self.horizontal_fov_rad < math.pi:
+        if not (_is_finite(self.horizontal_fov_rad) and 0 < self.horizontal_fov_rad < math.pi):
             raise TensorsimError(
                 f"CameraConfig.horizontal_fov_rad: got {self.horizontal_fov_rad}, expected between 0 and pi"
             )
+        for name in ("position_m", "center_px"):
+            object.__setattr__(self, name, _as_positions(getattr(self, name)))
         _require_vector("CameraConfig", position_m=self.position_m)
+        center = self.center_px
+        if center is not None and not (
+            isinstance(center, tuple) and len(center) == 2 and all(_is_finite(v) for v in center)
+        ):
+            raise TensorsimError(
+                f"CameraConfig.center_px: got {center!r}, expected two finite numbers (u, v) or None"
+            )
         for name in ("pitch_rad", "yaw_rad"):
-            if not math.isfinite(getattr(self, name)):
+            if not _is_finite(getattr(self, name)):
                 raise TensorsimError(
                     f"CameraConfig.{name}: got {getattr(self, name)}, expected finite radians"
                 )

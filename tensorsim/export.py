@@ -6,6 +6,7 @@ import warnings
 import torch
 from torch import nn
 
+from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 
 
@@ -16,19 +17,23 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
     lengths and people counts than any it has seen.
 
     Args:
-        module: the module; its training mode is left as it was.
+        module: the module; its training mode, and that of every module in it, is left as it was.
         path: file to write; it appears only when complete.
 
     Raises:
-        TensorsimError: the module holds an edge that is no graph node, such as ``OnnxHeatmaps``.
+        TensorsimError: the path is a folder, or the module holds an edge that is no graph node, such as
+            ``OnnxHeatmaps``.
     """
-    training = module.training
+    if os.path.isdir(path):
+        raise TensorsimError(f"{os.fspath(path)}: is a folder, expected a file to write")
+    training = [part for part in module.modules() if part.training]
     with warnings.catch_warnings():
         # TorchScript is deprecated upstream; whoever calls this function asks for it nevertheless.
         warnings.filterwarnings("ignore", message=r".*torch\.jit.*deprecated")
         try:
             scripted = torch.jit.script(module.eval())
         finally:
-            module.train(training)
+            for part in training:
+                part.training = True
         with complete_file(path) as scratch:
             torch.jit.save(scripted, str(scratch))

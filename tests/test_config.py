@@ -3,9 +3,11 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 import tensorsim as ts
+from tensorsim.config import FloorConfig
 
 
 def test_presets_are_the_panels() -> None:
@@ -67,8 +69,25 @@ def test_names() -> None:
         (lambda: ts.CameraConfig(horizontal_fov_rad=60.0), "horizontal_fov_rad: got 60.0"),
         (lambda: ts.CameraConfig(position_m=(math.nan, 0, 0)), "position_m"),
         (lambda: ts.CameraConfig(pitch_rad=math.inf), "pitch_rad"),
+        (lambda: ts.CameraConfig(center_px=(math.nan, 1.0)), "center_px: got .* two finite numbers"),
+        (lambda: ts.CameraConfig(center_px=(1.0, 2.0, 3.0)), "center_px"),  # type: ignore[arg-type]
+        (lambda: ts.RadarConfig(tx_m=5.0), "tx_m: got 5.0, expected three finite numbers"),  # type: ignore[arg-type]
+        (lambda: ts.RadarConfig(rx_m=None), "rx_m: got None"),  # type: ignore[arg-type]
+        (lambda: ts.RadarConfig(tx_m=((0.0, 0.0, 1.0), 5.0)), "tx_m: got 5.0"),  # type: ignore[arg-type]
+        (lambda: ts.RadarConfig(carrier_hz="77e9"), "carrier_hz: got '77e9'"),  # type: ignore[arg-type]
+        (lambda: ts.RadarConfig(isolation_db=None), "isolation_db: got None"),  # type: ignore[arg-type]
+        (lambda: ts.WallConfig(center_m=3.0), "center_m: got 3.0"),  # type: ignore[arg-type]
+        (lambda: ts.WallConfig(loss_tangent="no"), "loss_tangent: got no"),  # type: ignore[arg-type]
+        (lambda: FloorConfig(reflection="no"), "reflection: got no"),  # type: ignore[arg-type]
     ],
 )
 def test_refuses(make: object, message: str) -> None:
     with pytest.raises(ts.TensorsimError, match=message):
         make()  # type: ignore[operator]
+
+
+def test_lists_and_arrays_of_positions_are_tuples() -> None:
+    wall = ts.WallConfig(center_m=[0.0, 1.0, 1.5], size_m=np.array([5.0, 0.2, 2.5]))  # type: ignore[arg-type]
+    assert hash(wall) == hash(ts.WallConfig((0.0, 1.0, 1.5), (5.0, 0.2, 2.5)))
+    camera = ts.CameraConfig(position_m=[0, 0, 1.5], center_px=[2, 3])  # type: ignore[arg-type]
+    assert hash(camera) == hash(ts.CameraConfig(position_m=(0, 0, 1.5), center_px=(2, 3)))

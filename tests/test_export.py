@@ -23,6 +23,19 @@ def test_writes_a_file_that_loads_and_keeps_the_mode(tmp_path: Path) -> None:
     assert torch.equal(loaded(x), module.eval()(x)), "exported in evaluation mode"
 
 
+def test_frozen_parts_stay_frozen(tmp_path: Path) -> None:
+    module = nn.Sequential(nn.BatchNorm1d(3), nn.Dropout(), nn.Linear(3, 3)).train()
+    module[0].eval()
+    modes = [part.training for part in module.modules()]
+    ts.export.to_torchscript(module, tmp_path / "m.pt")
+    assert [part.training for part in module.modules()] == modes
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ts.TensorsimError, match="is a folder, expected a file"):
+        ts.export.to_torchscript(nn.Linear(1, 1), tmp_path)
+
+
 def test_leaves_nothing_behind_when_scripting_fails(tmp_path: Path) -> None:
     (tmp_path / "m.pt").write_bytes(b"old")
     with pytest.raises(Exception, match="globals"):

@@ -23,7 +23,7 @@ class TrainOptions:
     init: Path | None = None
     """Weights to start from (.safetensors)."""
     seed: int = 0
-    """Of everything random but the maps of a folder."""
+    """Of everything random but the maps or rendered people of a folder."""
     device: str = "auto"
     """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
     workers: int = 1
@@ -73,10 +73,17 @@ class PeopleOptions(TrainOptions):
     """Folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given."""
     rendered: int = 3000
     """Number of rendered people."""
+    rendered_seed: int = 0
+    """Of their poses, looks and cameras."""
+
+    def loop(self, **settings: Any) -> "LoopConfig":
+        """As of all training commands."""
+        check_seed(self.rendered_seed, "--rendered-seed")
+        return super().loop(**settings)
 
     def rendered_people(self) -> "Cutouts":
         """Rendered people, rendered first where they are missing, which takes hours."""
         from tensorsim.training.cutouts import Cutouts, render_cutouts
 
         folder = self.out / "cutouts" if self.cutouts is None else self.cutouts
-        return Cutouts(render_cutouts(self.rendered, self.seed, folder, self.quiet))
+        return Cutouts(render_cutouts(self.rendered, self.rendered_seed, folder, self.quiet))

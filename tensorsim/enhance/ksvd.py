@@ -59,8 +59,8 @@ def ksvd_denoise(
         seed: of that draw and of learning.
 
     Raises:
-        TensorsimError: another rank, an image smaller than a patch, NaN, atoms that are no square number, or
-            scikit-learn missing.
+        TensorsimError: another rank, an image smaller than a patch, NaN, a negative deviation, counts below one, atoms
+            that are no square number, or scikit-learn missing.
     """
     try:
         from sklearn.decomposition import MiniBatchDictionaryLearning, sparse_encode
@@ -73,13 +73,18 @@ def ksvd_denoise(
     check_floating(image, "ksvd_denoise")
     check_rank(image, 2, "ksvd_denoise", "(H, W)")
     check_finite(image, "ksvd_denoise")
+    for name, number in (("side", side), ("iterations", iterations), ("training_patches", training_patches)):
+        if number < 1:
+            raise TensorsimError(f"ksvd_denoise: got {name} {number}, expected at least 1")
+    if sigma is not None and not 0 <= sigma < math.inf:
+        raise TensorsimError(f"ksvd_denoise: got sigma {sigma}, expected a finite number >= 0 or None")
     if min(image.shape) < side:
         raise TensorsimError(f"ksvd_denoise: got shape {list(image.shape)}, expected at least {side}x{side}")
     if math.isqrt(atoms) ** 2 != atoms or atoms < 4:
         raise TensorsimError(f"ksvd_denoise: got {atoms} atoms, expected a square number from 4")
     noisy = image.detach().cpu().double()
     sigma = noise_deviation(noisy) if sigma is None else sigma
-    if sigma <= 0:
+    if sigma == 0:
         return image.clone()
     patches = unfold(noisy[None, None], side)[0].T  # (patches, side^2)
     means = patches.mean(1, keepdim=True)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
+from tensorsim.errors import check_floating, check_min_rank, check_size
 
 ANKLE_HEIGHT = 0.039
 SHANK = 0.246
@@ -180,7 +181,14 @@ def body_to_coco(joints: Tensor) -> Tensor:
 
     Returns:
         (..., 17, 3) in the order of ``tensorsim.COCO_KEYPOINTS``; body joints and nose are kept as they are.
+
+    Raises:
+        TensorsimError: joints of another shape, or integers.
     """
+    check_floating(joints, "joints")
+    check_min_rank(joints, 2, "joints", "(..., 14, 3)")
+    check_size(joints, -2, len(JOINTS), "joints", "(..., 14, 3)")
+    check_size(joints, -1, 3, "joints", "(..., 14, 3)")
     nose, neck = joints[..., 0, :], joints[..., 1, :]
     reach = nose - neck
     height = reach.norm(dim=-1, keepdim=True) / math.hypot(NOSE_FORWARD, NOSE_UP)

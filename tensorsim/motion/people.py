@@ -13,6 +13,9 @@ from tensorsim.motion.body import Proportions
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
 VARIED_NUMBERS = 24
 
+#: Nobody starts or is kept farther away than this.
+FARTHEST_M = 1e6
+
 Range = tuple[float, float]
 
 
@@ -36,8 +39,8 @@ class PeopleConfig:
         variation: largest relative deviation of each angle and moment of a movement.
 
     Raises:
-        TensorsimError: a range that is not ascending and finite, a share outside of [0, 1], or sizes that no body
-            has.
+        TensorsimError: a range that is not ascending and finite, a share outside of [0, 1], a number that is not
+            finite, or sizes that no body has.
     """
 
     height_m: Range = (1.55, 1.90)
@@ -57,8 +60,8 @@ class PeopleConfig:
         for name, least, most in (
             ("height_m", 0.5, 2.5),
             ("speed_m_s", 0.2, 2.0),
-            ("start_range_m", 0.0, math.inf),
-            ("keep_range_m", 0.0, math.inf),
+            ("start_range_m", 0.0, FARTHEST_M),
+            ("keep_range_m", 0.0, FARTHEST_M),
         ):
             low, high = getattr(self, name)
             if not least <= low <= high <= most:
@@ -77,7 +80,7 @@ class PeopleConfig:
             ("limb_deviation", 0.1),
             ("variation", 0.2),
             ("heading_rad", math.pi),
-            ("start_side_m", math.inf),
+            ("start_side_m", FARTHEST_M),
         ):
             if not 0 <= getattr(self, name) <= most:
                 raise TensorsimError(

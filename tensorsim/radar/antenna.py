@@ -11,7 +11,21 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+    check_size,
+)
+
+
+def check_directions(direction: Tensor) -> None:
+    """Refuse anything but real (..., 3)."""
+    check_floating(direction, "direction")
+    check_min_rank(direction, 1, "direction", "(..., 3)")
+    check_size(direction, -1, 3, "direction", "(..., 3)")
 
 
 def angles(direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -30,7 +44,7 @@ class CosineAntenna(nn.Module):
     Shapes: directions (..., 3) of any length -> amplitude (...). Differentiable.
 
     Raises:
-        TensorsimError: not exactly one of the two, or a number out of its range.
+        TensorsimError: not exactly one of the two, or a number out of its range; directions of another shape.
     """
 
     def __init__(self, exponent: float | None = None, beamwidth_rad: float | None = None) -> None:
@@ -50,6 +64,7 @@ class CosineAntenna(nn.Module):
 
     def forward(self, direction: Tensor) -> Tensor:
         """(..., 3) to (...)."""
+        check_directions(direction)
         length = direction.square().sum(-1).clamp_min(1e-30).sqrt()
         cosine = direction[..., 1] / length
         ahead = cosine > 0
@@ -67,7 +82,7 @@ class TabulatedAntenna(nn.Module):
     Shapes: directions (..., 3) of any length -> amplitude (...). Differentiable between the nodes.
 
     Raises:
-        TensorsimError: angles that do not ascend, a table of another shape, NaN.
+        TensorsimError: angles that do not ascend, a table of another shape, NaN; directions of another shape.
     """
 
     azimuth_rad: Tensor
@@ -79,6 +94,7 @@ class TabulatedAntenna(nn.Module):
         azimuth, elevation = torch.as_tensor(azimuth_rad).double(), torch.as_tensor(elevation_rad).double()
         table = torch.as_tensor(gain_db).double()
         for name, axis in (("azimuth_rad", azimuth), ("elevation_rad", elevation)):
+            check_finite(axis, name)
             if axis.dim() != 1 or axis.numel() < 2 or not bool((axis.diff() > 0).all()):
                 raise TensorsimError(f"{name}: got {axis.tolist()}, expected at least two ascending angles")
         if list(table.shape) != [elevation.numel(), azimuth.numel()]:
@@ -86,8 +102,7 @@ class TabulatedAntenna(nn.Module):
                 f"gain_db: got shape {list(table.shape)}, expected {[elevation.numel(), azimuth.numel()]} "
                 "(elevation, azimuth)"
             )
-        if not bool(torch.isfinite(table).all()):
-            raise TensorsimError("gain_db: got NaN or infinite values, expected finite dB")
+        check_finite(table, "gain_db")
         self.register_buffer("azimuth_rad", azimuth, persistent=False)
         self.register_buffer("elevation_rad", elevation, persistent=False)
         self.register_buffer("gain_db", table, persistent=False)
@@ -100,6 +115,7 @@ class TabulatedAntenna(nn.Module):
 
     def forward(self, direction: Tensor) -> Tensor:
         """(..., 3) to (...)."""
+        check_directions(direction)
         azimuth, elevation = angles(direction)
         table = self.gain_db.to(direction.dtype)
         column, right = self._cell(self.azimuth_rad.to(direction.dtype), azimuth.contiguous())

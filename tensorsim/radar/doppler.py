@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.paths import safe_sqrt
-from tensorsim.radar.range_profile import check_complex_map, flatten_batch, unflatten_batch
+from tensorsim.radar.range_profile import check_complex_map, flatten_batch, gate_bins, unflatten_batch
 
 
 def coherent_sum(profiles: Tensor, samples: int) -> Tensor:
@@ -142,16 +142,9 @@ class DopplerTimeMap(DopplerFrames):
             )
         self.integration = integration
         self.samples = radar.samples_per_chirp
-        first, last = 0, self.samples - 1
+        self.first_bin, self.last_bin = 0, self.samples - 1
         if gate_m is not None:
-            first = max(first, math.ceil(gate_m[0] / radar.range_resolution_m - 1e-9))
-            last = min(last, math.floor(gate_m[1] / radar.range_resolution_m + 1e-9))
-            if first > last:
-                raise TensorsimError(
-                    f"gate_m: got {gate_m}, expected a near and a far range with a bin between, bins being "
-                    f"{radar.range_resolution_m:.4g} m apart"
-                )
-        self.first_bin, self.last_bin = first, last
+            self.first_bin, self.last_bin = gate_bins(gate_m, radar.range_resolution_m, self.samples)
 
     def forward(self, profiles: Tensor) -> Tensor:
         """Profiles (..., M, R) complex to the map (..., F, K)."""

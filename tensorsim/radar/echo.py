@@ -50,8 +50,8 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
     shape = list(positions.shape)
     if shape[-1] != 3:
         raise TensorsimError(f"positions: got shape {shape}, expected {layout}")
-    if shape[-3] == 0:
-        raise TensorsimError(f"positions: got shape {shape}, expected at least one pulse")
+    if 0 in shape[:-2]:
+        raise TensorsimError(f"positions: got shape {shape}, expected at least one pulse of one clip")
     per_pulse = shape[:-1]
     per_clip = shape[:-3] + shape[-2:-1]
     got = list(rcs.shape)
@@ -342,6 +342,8 @@ class EchoSynthesizer(nn.Module):
             raise TensorsimError(
                 "contributions: got a scene without scatterers or ways, expected some of each"
             )
+        if bool((groups < 0).any()):
+            raise TensorsimError(f"groups: got {int(groups.min())}, expected numbers from 0")
         step = self._step(positions)
         if step is not None:
             step = step.reshape(positions.shape)

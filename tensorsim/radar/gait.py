@@ -6,7 +6,14 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_positive,
+)
 from tensorsim.radar.range_profile import check_complex_map
 
 
@@ -92,7 +99,7 @@ class CadenceVelocityDiagram(nn.Module):
     Differentiable where it is not 0.
 
     Raises:
-        TensorsimError: a frame rate that is not positive, fewer than 2 frames, NaN.
+        TensorsimError: a frame rate that is not positive, an empty map, fewer than 2 frames, NaN.
     """
 
     def __init__(self, frame_rate_hz: float) -> None:
@@ -112,6 +119,7 @@ class CadenceVelocityDiagram(nn.Module):
         frames = doppler_time.shape[-1]
         if frames < 2:
             raise TensorsimError(f"map: got shape {list(doppler_time.shape)}, expected at least 2 frames")
+        check_not_empty(doppler_time, "map")
         check_finite(doppler_time, "map")
         window = torch.hann_window(
             frames, periodic=True, dtype=doppler_time.dtype, device=doppler_time.device

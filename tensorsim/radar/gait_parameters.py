@@ -13,7 +13,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive, check_size
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_positive,
+    check_size,
+)
 
 #: Cells this far below the strongest of their frame do not count.
 DYNAMIC_RANGE_DB = 25.0
@@ -40,11 +48,12 @@ class GaitParameters(NamedTuple):
     """What a Doppler-time map says of a gait.
 
     Attributes:
-        torso_m_s: (...) median over steady frames of the torso's radial speed.
-        limb_m_s: (...) 90th percentile over steady frames of the limbs' radial speed: the peaks of the swings.
-        step_hz: (...) steps per second, two to a stride.
-        torso_track_m_s: (..., K) per frame.
-        limb_track_m_s: (..., K) per frame.
+        torso_m_s: (...) median over steady frames of the torso's radial speed; 0 without any.
+        limb_m_s: (...) 90th percentile over steady frames of the limbs' radial speed: the peaks of the swings;
+            likewise.
+        step_hz: (...) steps per second, two to a stride; likewise.
+        torso_track_m_s: (..., K) per frame; 0 where nothing stands out of the noise.
+        limb_track_m_s: (..., K) likewise.
     """
 
     torso_m_s: Tensor
@@ -68,8 +77,8 @@ class GaitEstimator(nn.Module):
     Shapes: magnitude (..., F, K) -> :class:`GaitParameters`.
 
     Raises:
-        TensorsimError: a map that does not fit the axis or lasts less than a second, rates that are not
-            positive or too low to see steps.
+        TensorsimError: a map that does not fit the axis, lasts less than a second, is empty or has NaN; rates that
+            are not positive or too low to see steps.
     """
 
     speed_m_s: Tensor
@@ -107,15 +116,20 @@ class GaitEstimator(nn.Module):
         check_size(doppler_time, -2, self.bins, "doppler_time", layout)
         if doppler_time.shape[-1] < self.second:
             raise TensorsimError(f"doppler_time: got shape {list(doppler_time.shape)}, expected {layout}")
+        check_not_empty(doppler_time, "doppler_time")
+        check_finite(doppler_time, "doppler_time")
         power = doppler_time.double().index_select(-2, self.order).square()
         noise = power[..., -(power.shape[-2] // 4) :, :].flatten(-2).median(-1)[0]
         least = torch.maximum(self.quietest * power.amax(-2), self.above_noise * noise.unsqueeze(-1))
         power = torch.where(power < least.unsqueeze(-2), 0.0, power)
         share = power.sqrt().cumsum(-2)
+        something = share[..., -1, :] > 0
         share = share / share[..., -1:, :].clamp_min(1e-300)
-        torso = self.speed_m_s[(share < 0.5).sum(-2).clamp(max=self.speed_m_s.shape[0] - 1)]
-        limb = self.speed_m_s[(share < 0.95).sum(-2).clamp(max=self.speed_m_s.shape[0] - 1)]
+        fastest = self.speed_m_s.shape[0] - 1
+        torso = torch.where(something, self.speed_m_s[(share < 0.5).sum(-2).clamp(max=fastest)], 0.0)
+        limb = torch.where(something, self.speed_m_s[(share < 0.95).sum(-2).clamp(max=fastest)], 0.0)
         steady = torso > self.steady * torso.quantile(0.9, -1, keepdim=True)
+        walks = steady.any(-1)
 
         whole = power.sum(-2).clamp_min(1e-300)
         swings: list[Tensor] = []
@@ -124,9 +138,9 @@ class GaitEstimator(nn.Module):
             swings.append(torch.where(fast, power, 0.0).sum(-2) / whole)
         dtype = doppler_time.dtype
         return GaitParameters(
-            torch.where(steady, torso, math.nan).nanmedian(-1)[0].to(dtype),
-            torch.where(steady, limb, math.nan).nanquantile(0.9, -1).to(dtype),
-            self._step_rate(torch.stack(swings), steady).to(dtype),
+            torch.where(walks, torch.where(steady, torso, math.nan).nanmedian(-1)[0], 0.0).to(dtype),
+            torch.where(walks, torch.where(steady, limb, math.nan).nanquantile(0.9, -1), 0.0).to(dtype),
+            torch.where(walks, self._step_rate(torch.stack(swings), steady), 0.0).to(dtype),
             torso.to(dtype),
             limb.to(dtype),
         )

@@ -24,11 +24,6 @@ def n_pulse_canceller(profiles: Tensor, pulses: int) -> Tensor:
     return profiles
 
 
-def two_pulse_canceller(profiles: Tensor) -> Tensor:
-    """``x[m + 1] - x[m]`` along pulses: (..., M, R) -> (..., M - 1, R); response ``|2 sin(pi fd / PRF)|``."""
-    return n_pulse_canceller(profiles, 2)
-
-
 def remove_mean(profiles: Tensor) -> Tensor:
     """Subtract each range bin's mean over pulses: (..., M, R) -> (..., M, R)."""
     return profiles - profiles.mean(-2, keepdim=True)

@@ -88,8 +88,8 @@ class ReceiverNoise(nn.Module):
         transmit_power_w: Pt for ``"absolute"``.
 
     Shapes: IF (..., M, N) complex, optionally the target echo in it, likewise -> IF with noise. Without the
-        target echo
-    the whole IF counts as echo. One noise power per clip. Differentiable: noise scales with its reference.
+        target echo the whole IF counts as echo. One noise power per clip. Differentiable: noise scales with its
+        reference.
 
     Raises:
         TensorsimError: unknown reference, numbers that are not finite or positive, a real IF, shapes that
@@ -139,8 +139,7 @@ class ReceiverNoise(nn.Module):
 
     @torch.jit.export
     def realised_snr_db(self, clean: Tensor, noisy: Tensor, target_echo: Tensor | None = None) -> Tensor:
-        """Ratio (...) in dB of the reference signal to the noise that was really drawn; +inf without
-        noise."""
+        """Ratio (...) in dB of the reference signal to the noise that was really drawn; +inf without noise."""
         signal = clean if target_echo is None or self.reference == "total" else target_echo
         return decibels(mean_power(signal), mean_power(noisy - clean))
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_min_rank, check_positive
+from tensorsim.errors import TensorsimError, check_min_rank, check_positive, check_size
 
 _WINDOWS = {
     "hamming": torch.hamming_window,
@@ -16,11 +16,11 @@ _WINDOWS = {
 
 
 def check_complex_map(x: Tensor, name: str, layout: str) -> None:
-    """Refuse anything but complex (..., M, columns) with at least one column."""
+    """Refuse anything but complex (..., M, columns) with something in it."""
     check_min_rank(x, 2, name, layout)
     if not x.is_complex():
         raise TensorsimError(f"{name}: got dtype {x.dtype}, expected a complex tensor")
-    if x.shape[-1] == 0:
+    if x.numel() == 0:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout} without empty dimensions")
 
 
@@ -130,7 +130,7 @@ class FollowingGate(nn.Module):
     Differentiable by the profiles; the choice of bins is not.
 
     Raises:
-        TensorsimError: a width that is not positive.
+        TensorsimError: a width that is not positive; real profiles, shapes that do not go together.
     """
 
     range_m: Tensor
@@ -148,6 +148,18 @@ class FollowingGate(nn.Module):
 
     def forward(self, profiles: Tensor, positions: Tensor, rcs: Tensor) -> Tensor:
         """Profiles (..., M, R) of positions (..., M, S, 3) and RCS (..., M, S)."""
+        layout = f"(..., pulses, {self.range_m.shape[0]} range bins)"
+        check_complex_map(profiles, "profiles", layout)
+        check_size(profiles, -1, self.range_m.shape[0], "profiles", layout)
+        check_min_rank(positions, 3, "positions", "(..., pulses, scatterers, 3) metres")
+        if positions.shape[:-2] != profiles.shape[:-1] or positions.shape[-1] != 3:
+            raise TensorsimError(
+                f"positions: got shape {list(positions.shape)}, expected {list(profiles.shape[:-1])} and scatterers, 3"
+            )
+        if rcs.shape != positions.shape[:-1]:
+            raise TensorsimError(
+                f"rcs: got shape {list(rcs.shape)}, expected {list(positions.shape[:-1])} (per pulse) m^2"
+            )
         points = positions.detach().double().unsqueeze(-2)
         range_m = torch.linalg.vector_norm(points - self.tx_m, dim=-1).mean(-1)
         range_m = 0.5 * (range_m + torch.linalg.vector_norm(points - self.rx_m, dim=-1).mean(-1))

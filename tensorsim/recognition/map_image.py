@@ -68,8 +68,8 @@ class MapToImage(nn.Module):
         >>> torch.cat([MapToImage.range(radar)(maps.range_time_mti), doppler_image], dim=-3)  # merged, 2 channels
 
     Raises:
-        TensorsimError: an axis that does not ascend, a span without width, a size below 1, an unknown scale; a map
-            without F rows, with negative values, or NaN.
+        TensorsimError: an axis that does not ascend in equal steps, a span without width, a size below 1, an unknown
+            scale; a map without F rows, with negative values, or NaN.
     """
 
     rows: Tensor
@@ -86,6 +86,12 @@ class MapToImage(nn.Module):
         if axis.dim() != 1 or axis.shape[0] < 2 or not bool((axis.diff() > 0).all()):
             raise TensorsimError(
                 f"MapToImage.axis: got shape {list(axis.shape)}, expected (F,) ascending, F at least 2"
+            )
+        steps = axis.double().diff()
+        least, most = float(steps.min()), float(steps.max())
+        if not most < 1.01 * least:
+            raise TensorsimError(
+                f"MapToImage.axis: got steps from {least:.4g} to {most:.4g}, expected equal ones"
             )
         low, high = span
         if not (math.isfinite(low) and math.isfinite(high) and low < high):

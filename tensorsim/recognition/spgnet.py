@@ -1,7 +1,7 @@
 """SPGNet: grouped 3x3 convolutions in two levels, the small sibling of SPNet.
 
-Source: the author's Python variant of RadHARSimulator V2 (arXiv 2511.09022), after X. Wang, S. X. Yu, "Tied block
-convolution" style grouping as in SPGNet (IEEE Transactions on Multimedia 2021), in its version for 32x32 pictures.
+Source: X. Wang, S. Lai, Z. Chai, X. Zhang, X. Qian, "SPGNet: Serial and Parallel Group Network", IEEE Transactions on
+Multimedia 24 (2022), as the Python variant of RadHARSimulator V2 (arXiv 2511.09022) has it for 32x32 pictures.
 """
 
 import os
@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.recognition.spnet import as_pictures, centred
 
-#: Groups of each version; widths are 16 and more times these. (blocks of the stages: 4, 8, 3)
+#: Groups of each version; widths are 16 and more times these.
 VERSIONS = {"s2p6": 6, "s2p7": 7, "s2p8": 8, "s2p9": 9}
+#: Layers of each stage.
 _BLOCKS = (4, 8, 3)
 
 

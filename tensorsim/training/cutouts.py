@@ -131,6 +131,8 @@ def _shrink(picture: Tensor) -> Tensor:
 def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bool = False) -> list[Path]:
     """Render people in sampled poses into shards ``cutouts-NNN.tar``; shards that are there are kept.
 
+    ``cutouts.json`` beside them tells number and seed. A folder of shards without one is taken as it is.
+
     Args:
         count: number of people, at least 13.
         seed: the same seed gives the same people.
@@ -139,13 +141,27 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
 
     Returns:
         The shards.
+
+    Raises:
+        TensorsimError: too few people, or the folder holds those of another number or seed.
     """
     from tqdm import tqdm
 
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
     poses = sample_poses(count, seed)
     poses = poses[torch.randperm(count, generator=torch.Generator().manual_seed(seed))]
+    folder = Path(out)
+    settings = {"people": count, "seed": seed}
+    described = folder / "cutouts.json"
+    if described.is_file():
+        try:
+            there = json.loads(described.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise TensorsimError(f"{described}: damaged ({error}), expected {settings}") from error
+        if there != settings:
+            raise TensorsimError(f"{folder}: it holds rendered people of {there}, expected {settings}")
+    elif not any(folder.glob("cutouts-*.tar")):
+        with complete_file(described) as scratch:
+            scratch.write_text(json.dumps(settings), encoding="utf-8")
     shards = []
     with tqdm(total=count, desc="people", disable=quiet) as progress:
         for first in range(0, count, PER_SHARD):

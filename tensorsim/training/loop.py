@@ -9,6 +9,7 @@ that was interrupted goes on to the same result. Several GPUs: ``torchrun --npro
 import csv
 import math
 import os
+import pickle
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -182,7 +183,8 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
         The figures of the best weights, with their ``step``.
 
     Raises:
-        TensorsimError: the checkpoint belongs to another run, a loss that is not finite, TensorBoard missing.
+        TensorsimError: the checkpoint is damaged or belongs to another run, a loss that is not finite, TensorBoard
+            missing.
     """
     rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     device = usable_device(config.device)
@@ -322,6 +324,24 @@ def _save(
     os.replace(scratch, path)
 
 
+def _read(path: Path) -> dict[str, Any]:
+    """What :func:`_save` wrote."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    # A cut or overwritten file fails in the archive, in the pickle or in the tensors, each with its own exception.
+    except (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        told = (str(error).splitlines() or [type(error).__name__])[0][:100]
+        raise TensorsimError(
+            f"{path}: damaged, training cannot go on from it ({told}); remove it to start anew"
+        ) from error
+    parts = {"step", "best", "loop", "recipe", "net", "averaged", "optimiser"}
+    if not isinstance(state, dict) or not parts <= state.keys():
+        raise TensorsimError(
+            f"{path}: not a checkpoint of training, expected {', '.join(sorted(parts))} in it"
+        )
+    return state
+
+
 def _resume(
     path: Path,
     recipe: Recipe,
@@ -329,7 +349,7 @@ def _resume(
     averaged: AveragedModel,
     optimiser: torch.optim.Optimizer,
 ) -> tuple[int, dict[str, float]]:
-    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = _read(path)
     for part, mine in (("loop", config.fingerprint()), ("recipe", recipe.settings)):
         differ = [key for key in {**state[part], **mine} if state[part].get(key) != mine.get(key)]
         if differ:

@@ -130,7 +130,7 @@ class CPM(nn.Module):
         check_floating(crops, "CPM crops")
         check_rank(crops, 4, "CPM crops", layout)
         check_size(crops, 1, 3, "CPM crops", layout)
-        if crops.shape[2] % 8 != 0 or crops.shape[3] % 8 != 0:
+        if crops.shape[2] % 8 != 0 or crops.shape[3] % 8 != 0 or crops.shape[2] * crops.shape[3] == 0:
             raise TensorsimError(f"CPM crops: got shape {list(crops.shape)}, expected {layout}")
         return self.backbone(normalise(crops, self.mean, self.std))
 

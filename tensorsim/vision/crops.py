@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from tensorsim.errors import (
     TensorsimError,
     check_finite,
+    check_floating,
     check_min_rank,
     check_positive,
     check_rank,
@@ -92,7 +93,7 @@ class BoxCrop(nn.Module):
 
     Raises:
         TensorsimError: a size or padding that is not positive; ranks that do not fit, images of
-            another integer type or without pixels, boxes that are not finite or have no area.
+            another integer type or without pixels, boxes that are integers, not finite or have no area.
     """
 
     def __init__(self, size: tuple[int, int] = (256, 192), padding: float = 1.25) -> None:
@@ -122,9 +123,10 @@ class BoxCrop(nn.Module):
             raise TensorsimError(f"BoxCrop images: got dtype {images.dtype}, expected floats or uint8")
         check_boxes(boxes, "BoxCrop boxes")
         check_rank(boxes, 2, "BoxCrop boxes", "(N, 4)")
-        if index.dim() != 1 or index.shape[0] != boxes.shape[0]:
+        if index.dim() != 1 or index.shape[0] != boxes.shape[0] or index.is_floating_point():
             raise TensorsimError(
-                f"BoxCrop index: got shape {list(index.shape)}, expected ({boxes.shape[0]},), one per box"
+                f"BoxCrop index: got {index.dtype} of shape {list(index.shape)}, expected integers of shape "
+                f"({boxes.shape[0]},), one per box"
             )
         if not is_exporting() and not bool(((index >= 0) & (index < images.shape[0])).all()):
             raise TensorsimError(
@@ -138,7 +140,8 @@ class BoxCrop(nn.Module):
 
 
 def check_boxes(boxes: Tensor, name: str) -> None:
-    """Refuse anything but finite ``xyxy`` boxes (..., 4) with an area."""
+    """Refuse anything but finite floating point ``xyxy`` boxes (..., 4) with an area."""
+    check_floating(boxes, name)
     check_min_rank(boxes, 1, name, "(..., 4) xyxy")
     check_size(boxes, -1, 4, name, "(..., 4) xyxy")
     check_finite(boxes, name)

@@ -127,7 +127,7 @@ class HeatmapDecoder(nn.Module):
                 f"HeatmapDecoder maps: got shape {list(maps.shape)}, expected (..., h, w) with pixels"
             )
         if self.method == "dark":
-            points, scores = decode_dark(maps, self.kernel)
+            points, scores = decode_dark(maps, self.kernel.to(maps.dtype))
         else:
             points, scores = decode_quarter(maps)
         return self.stride * points, scores

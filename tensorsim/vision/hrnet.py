@@ -242,7 +242,7 @@ class HRNet(nn.Module):
         check_floating(crops, "HRNet crops")
         check_rank(crops, 4, "HRNet crops", layout)
         check_size(crops, 1, 3, "HRNet crops", layout)
-        if crops.shape[2] % 32 != 0 or crops.shape[3] % 32 != 0:
+        if crops.shape[2] % 32 != 0 or crops.shape[3] % 32 != 0 or crops.shape[2] * crops.shape[3] == 0:
             raise TensorsimError(f"HRNet crops: got shape {list(crops.shape)}, expected {layout}")
         x = normalise(crops, self.mean, self.std)
         x = F.relu(self.bn1(self.conv1(x)))

@@ -194,6 +194,8 @@ class MetricPose(nn.Module):
         ):
             if list(size) != list(expected):
                 raise TensorsimError(f"{name}: got shape {list(size)}, expected {list(expected)}")
+        if valid.dtype != torch.bool:
+            raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
         if shape[-3] < 1:
             raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
         check_finite(keypoints, "keypoints")

@@ -3,7 +3,14 @@
 import torch
 from torch import Tensor
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_size
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+    check_size,
+)
 
 
 def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> tuple[Tensor, Tensor]:
@@ -22,7 +29,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
         joints (..., 14, 2) in pixels and scores (..., 14). Differentiable.
 
     Raises:
-        TensorsimError: other shapes, or NaN.
+        TensorsimError: other shapes, NaN, or a threshold that is not positive.
     """
     layout = "(..., 17, 2) COCO key points in pixels"
     check_floating(keypoints, "keypoints")
@@ -33,6 +40,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
         raise TensorsimError(f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}")
     check_finite(keypoints, "keypoints")
     check_finite(scores, "scores")
+    check_positive(threshold, "threshold")
 
     nose, nose_score = keypoints[..., :1, :], scores[..., :1]
     face, face_scores = keypoints[..., 1:5, :], scores[..., 1:5].clamp(min=0.0)

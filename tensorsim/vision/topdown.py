@@ -58,8 +58,8 @@ class TopDownPose(nn.Module):
         crops_per_batch: how many crops the network gets at once.
 
     Raises:
-        TensorsimError: arguments out of range; ranks or batch sizes that do not fit; valid boxes that are not
-            finite or have no area; NaN in the images of valid boxes.
+        TensorsimError: arguments out of range; ranks or batch sizes that do not fit; integer boxes; valid boxes that
+            are not finite or have no area; NaN in the images of valid boxes.
     """
 
     def __init__(

@@ -380,6 +380,8 @@ def test_paths_stay_in_sight() -> None:
         ({"height_m": (0.1, 1.5)}, "height_m"),
         ({"speed_m_s": (0.0, 1.0)}, "speed_m_s"),
         ({"speed_m_s": (float("nan"), 1.0)}, "speed_m_s"),
+        ({"start_range_m": (1.0, float("inf"))}, "start_range_m"),
+        ({"start_side_m": float("inf")}, "start_side_m: got inf"),
         ({"body_mass_index": (10.0, 5.0)}, "body_mass_index"),
         ({"female_share": 1.5}, "female_share: got 1.5, expected a number from 0 to 1"),
         ({"variation": 0.5}, "variation: got 0.5"),

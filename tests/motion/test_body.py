@@ -154,6 +154,14 @@ def test_sampler_repeats_by_seed_and_covers_what_people_do() -> None:
     assert float(sides.mean(dim=0).abs().max()) < 0.05
 
 
+@pytest.mark.parametrize(
+    "joints", [torch.zeros(13, 3), torch.zeros(14, 2), torch.zeros(14), torch.zeros(14, 3, dtype=torch.int64)]
+)
+def test_coco_key_points_refuse_other_shapes(joints: Tensor) -> None:
+    with pytest.raises(TensorsimError, match="joints: got"):
+        body.body_to_coco(joints)
+
+
 def test_sampler_refuses_too_few() -> None:
     with pytest.raises(TensorsimError, match="count 3, expected at least 13"):
         sample_poses(3)

@@ -65,6 +65,7 @@ class ProfilesCase(StageTester):
             ((x[0],), "profiles: got shape"),
             ((x[:25],), "got 25 pulses .* at least the 26"),
             ((x[:, :0],), "profiles: got shape"),
+            ((x[None][:0],), "profiles: got shape .* without empty dimensions"),
         ]
 
 
@@ -92,6 +93,7 @@ class SceneCase(StageTester):
         return [
             ((p.long(), rcs), "positions: got dtype"),
             ((p[0], rcs), "positions: got shape"),
+            ((p[None][:0], rcs[None][:0]), "at least one pulse of one clip"),
             ((p[..., :2], rcs), "positions: got shape"),
             ((p[:0], rcs), "at least one pulse"),
             ((p, rcs[:2]), "rcs: got shape"),

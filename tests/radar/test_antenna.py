@@ -44,7 +44,10 @@ class DirectionCase(StageTester):
         return (torch.as_tensor(d, dtype=dtype),)
 
     def bad_inputs(self):
-        return []
+        return [
+            ((torch.ones(4, 2),), r"direction: got shape \[4, 2\], expected \(\.\.\., 3\)"),
+            ((torch.ones(4, 3, dtype=torch.int64),), "direction: got dtype"),
+        ]
 
 
 class TestCosineAntenna(DirectionCase):

@@ -69,6 +69,7 @@ class TestCadenceVelocityDiagram(StageTester):
         return [
             ((x[0],), "map: got shape"),
             ((x[:, :1],), "at least 2 frames"),
+            ((x[:0],), "map: got an empty tensor"),
             ((x + float("nan"),), "map: got NaN"),
             ((x.to(torch.complex64),), "map: got dtype"),
         ]

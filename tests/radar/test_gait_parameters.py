@@ -50,6 +50,8 @@ class TestGaitEstimator(StageTester):
             ((torch.ones(100, 80),), r"\[100, 80\]"),
             ((torch.ones(181, 20),), "at least 40 frames"),
             ((torch.ones(181, 80, dtype=torch.int64),), "floating"),
+            ((torch.ones(0, 181, 80),), "doppler_time: got an empty tensor"),
+            ((torch.full((181, 80), math.nan),), "doppler_time: got NaN"),
         ]
 
 
@@ -108,9 +110,20 @@ def test_two_sides_are_one():
     assert float(a.step_hz) == pytest.approx(float(b.step_hz), rel=0.01)
 
 
-def test_silence_is_finite():
+def test_silence_has_no_gait():
     found = GaitEstimator(SPEED, RATE)(torch.zeros(181, 80))
-    assert all(bool(torch.isfinite(x).all()) for x in found)
+    assert all(bool((x == 0).all()) for x in found)
+
+
+def test_silence_before_and_after_a_walk_changes_nothing():
+    walk = gait()
+    silence = torch.zeros(181, 40, dtype=torch.float64)
+    found = GaitEstimator(SPEED, RATE)(torch.cat((silence, walk, silence), -1))
+    alone = GaitEstimator(SPEED, RATE)(walk)
+    assert float(found.torso_m_s) == pytest.approx(float(alone.torso_m_s))
+    assert float(found.limb_m_s) == pytest.approx(float(alone.limb_m_s))
+    assert float(found.step_hz) == pytest.approx(float(alone.step_hz), rel=0.03)
+    assert not found.torso_track_m_s[:40].any()
 
 
 def test_bad_arguments():

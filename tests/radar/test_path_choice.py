@@ -118,6 +118,8 @@ def test_contributions_add_up_and_are_those_of_people(incidence):
     assert_same(batch[0], parts, atol=1e-9)
     with pytest.raises(TensorsimError, match="groups: got"):
         module.contributions(p, rcs, groups[:2])
+    with pytest.raises(TensorsimError, match="groups: got -1, expected numbers from 0"):
+        module.contributions(p, rcs, groups - 1)
 
 
 def test_side_channels_of_a_target_that_comes_straight_on():

@@ -32,6 +32,7 @@ class TestRangeProfile(StageTester):
             ((x[0],), "IF: got shape"),
             ((x[:, :20],), "24 samples"),
             ((x[:, :0],), "IF: got shape"),
+            ((x[:0],), "IF: got shape .* without empty dimensions"),
         ]
 
 
@@ -47,7 +48,14 @@ class TestFollowingGate(StageTester):
         return complex_noise(*batch, 5, 12, dtype=dtype), targets.to(dtype), rcs
 
     def bad_inputs(self):
-        return []  # it stands behind the stages that have checked
+        x, p, rcs = self.inputs((), torch.float32)
+        return [
+            ((x.real, p, rcs), "profiles: got dtype"),
+            ((x[:, :5], p, rcs), "profiles: got shape"),
+            ((x, p[1:], rcs), "positions: got shape"),
+            ((x, p[..., :2], rcs), "positions: got shape"),
+            ((x, p, rcs[0]), "rcs: got shape"),
+        ]
 
 
 @pytest.mark.parametrize("window", ["hamming", None])

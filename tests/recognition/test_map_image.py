@@ -127,6 +127,7 @@ def test_ridges_as_a_map() -> None:
     ("change", "message"),
     [
         ({"axis": torch.zeros(4)}, "expected .* ascending"),
+        ({"axis": torch.tensor([0.0, 1.0, 5.0])}, "axis: got steps from 1 to 4, expected equal ones"),
         ({"span": (1.0, 1.0)}, "the lower one first"),
         ({"size": 0}, "got 0, expected at least 1"),
         ({"scale": "log"}, "got 'log', expected one of"),

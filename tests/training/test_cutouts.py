@@ -43,7 +43,20 @@ def test_shards_are_repeatable_and_go_on(tmp_path: Path, monkeypatch: pytest.Mon
     paths[1].unlink()
     render_cutouts(13, 3, tmp_path, quiet=True)
     assert [p.read_bytes() for p in paths] == data
-    assert sorted(tmp_path.iterdir()) == paths
+    assert sorted(tmp_path.iterdir()) == [*paths, tmp_path / "cutouts.json"]
+    with pytest.raises(
+        TensorsimError, match=r"it holds rendered people of .*'seed': 3.*, expected .*'seed': 4"
+    ):
+        render_cutouts(13, 4, tmp_path, quiet=True)
+    with pytest.raises(TensorsimError, match=r"'people': 13.*, expected .*'people': 14"):
+        render_cutouts(14, 3, tmp_path, quiet=True)
+    # Shards of which nothing is told are taken as they are.
+    (tmp_path / "cutouts.json").unlink()
+    assert render_cutouts(13, 4, tmp_path, quiet=True) == paths
+    assert [p.read_bytes() for p in paths] == data
+    (tmp_path / "cutouts.json").write_text("{")
+    with pytest.raises(TensorsimError, match=r"cutouts\.json: damaged"):
+        render_cutouts(13, 3, tmp_path, quiet=True)
     other = render_cutouts(13, 4, tmp_path / "other", quiet=True)
     assert other[0].read_bytes() != data[0]
 

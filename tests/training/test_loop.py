@@ -110,6 +110,27 @@ def test_another_run_is_refused(tmp_path: Path) -> None:
         fit(Line(), config(tmp_path, steps=20, seed=1))
 
 
+@pytest.mark.parametrize("damage", ["empty", "cut", "text", "changed", "other"])
+def test_a_damaged_checkpoint_is_told_in_one_line(tmp_path: Path, damage: str) -> None:
+    fit(Line(), config(tmp_path, steps=10))
+    last = tmp_path / "last.pt"
+    data = last.read_bytes()
+    if damage == "other":
+        torch.save({"step": 3}, last)
+    else:
+        middle = len(data) // 2
+        changed = {
+            "empty": b"",
+            "cut": data[:middle],
+            "text": b"not a checkpoint",
+            "changed": bytes(64) + data[64:],
+        }
+        last.write_bytes(changed[damage])
+    with pytest.raises(TensorsimError, match=r"last\.pt: (damaged|not a checkpoint)") as refused:
+        fit(Line(), config(tmp_path, steps=20))
+    assert "\n" not in str(refused.value)
+
+
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
     class Broken(Line):
         def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:

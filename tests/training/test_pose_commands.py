@@ -69,6 +69,7 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
         ({"init": Path("none.safetensors")}, "none.safetensors: no such file"),
         ({"device": "abacus"}, "--device: 'abacus'"),
         ({"seed": -1}, "--seed: got -1"),
+        ({"rendered_seed": -1}, "--rendered-seed: got -1"),
         ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
         ({"width": 0}, "HRNetConfig"),
     ],

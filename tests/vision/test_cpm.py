@@ -34,6 +34,7 @@ class TestCPM(StageTester):
         return [
             ((torch.zeros(3, 64, 32),), r"got shape \[3, 64, 32\], expected \(N, 3, H, W\)"),
             ((torch.zeros(1, 3, 64, 36),), "multiples of 8"),
+            ((torch.zeros(1, 3, 64, 0),), "multiples of 8"),
             ((torch.zeros(1, 3, 64, 32, dtype=torch.uint8),), "floating"),
         ]
 

@@ -43,8 +43,10 @@ class TestBoxCrop(StageTester):
             ((images.int(), boxes, index), "floats or uint8"),
             ((images, boxes[:, :3], index), "xyxy"),
             ((images, boxes[None], index), "expected"),
-            ((images, boxes, index[:2]), r"expected \(3,\), one per box"),
+            ((images, boxes, index[:2]), r"of shape \(3,\), one per box"),
             ((images, boxes, index + 1), "expected 0 to 1"),
+            ((images, boxes, index.float()), "index: got torch.float32"),
+            ((images, boxes.long(), index), "boxes: got dtype torch.int64"),
             ((images, boxes * float("nan"), index), "finite"),
             ((images, boxes[:, [2, 3, 0, 1]], index), "without area"),
         ]

@@ -49,6 +49,15 @@ class TestDark(TestQuarter):
     method = "dark"
 
 
+@pytest.mark.parametrize("method", ["dark", "quarter"])
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-3), (torch.bfloat16, 0.5)])
+def test_maps_of_another_precision_than_the_decoder(method: str, dtype: torch.dtype, atol: float) -> None:
+    decoder, maps = HeatmapDecoder(method), gaussians(torch.tensor([[10.3, 8.4], [5.0, 12.8]]), 20, 16)
+    points, scores = decoder(maps.to(dtype))
+    assert points.dtype == scores.dtype == dtype
+    torch.testing.assert_close(points.float(), decoder(maps)[0], atol=atol, rtol=0)
+
+
 def reference_quarter(heatmap: np.ndarray) -> tuple[float, float]:
     height, width = heatmap.shape
     y, x = np.unravel_index(np.argmax(heatmap), heatmap.shape)

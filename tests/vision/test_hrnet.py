@@ -40,6 +40,7 @@ class TestHRNet(StageTester):
             ((torch.zeros(3, 64, 32),), r"got shape \[3, 64, 32\], expected \(N, 3, H, W\)"),
             ((torch.zeros(1, 4, 64, 32),), "expected"),
             ((torch.zeros(1, 3, 64, 48),), "multiples of 32"),
+            ((torch.zeros(1, 3, 0, 32),), "multiples of 32"),
             ((torch.zeros(1, 3, 64, 32, dtype=torch.uint8),), "floating"),
         ]
 

@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
 
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
+from tensorsim.errors import TensorsimError
 from tensorsim.vision.skeleton import coco_to_body
 from tests.stage import StageTester
 
@@ -89,3 +91,9 @@ def test_nothing_of_the_head_seen_leaves_the_nose() -> None:
     joints, scores = coco_to_body(*named(**hidden))
     torch.testing.assert_close(joints[0], place("nose"))
     assert float(scores[0]) == 0.0
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.3, float("nan")])
+def test_a_threshold_that_is_not_positive_is_refused(threshold: float) -> None:
+    with pytest.raises(TensorsimError, match="threshold: got"):
+        coco_to_body(*named(), threshold=threshold)

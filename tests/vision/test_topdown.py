@@ -80,6 +80,7 @@ class TestTopDownPose(StageTester):
             ((images[:2], boxes, valid), "boxes for 3 images, expected for 2"),
             ((images, boxes * float("inf"), valid), "finite"),
             ((images, boxes * 0, valid), "without area"),
+            ((images, boxes.long(), valid), "boxes: got dtype torch.int64"),
             ((images, boxes, valid.float()), "expected bool of shape"),
             ((images, boxes, valid[:, :2]), r"expected bool of shape \[3, 3\]"),
         ]
