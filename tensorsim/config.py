@@ -83,6 +83,15 @@ def _require_positive(owner: str, **values: float) -> None:
             raise TensorsimError(f"{owner}.{name}: got {value!r}, expected a positive finite number")
 
 
+def _require_dielectric(owner: str, relative_permittivity: float, loss_tangent: float) -> None:
+    for name, value, least in (
+        ("relative_permittivity", relative_permittivity, 1),
+        ("loss_tangent", loss_tangent, 0),
+    ):
+        if not (_is_finite(value) and value >= least):
+            raise TensorsimError(f"{owner}.{name}: got {value}, expected a finite number >= {least}")
+
+
 def _as_positions(value: Any) -> Any:
     """Arrays and lists as tuples, so that a configuration is hashable; a tuple of numbers stays as it is."""
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -245,14 +254,7 @@ class WallConfig:
             raise TensorsimError(
                 f"WallConfig.size_m: got {self.size_m}, expected positive width and height and thickness >= 0"
             )
-        if not (_is_finite(self.relative_permittivity) and self.relative_permittivity >= 1):
-            raise TensorsimError(
-                f"WallConfig.relative_permittivity: got {self.relative_permittivity}, expected a finite number >= 1"
-            )
-        if not (_is_finite(self.loss_tangent) and self.loss_tangent >= 0):
-            raise TensorsimError(
-                f"WallConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0"
-            )
+        _require_dielectric("WallConfig", self.relative_permittivity, self.loss_tangent)
 
     @property
     def refractive_index(self) -> complex:
@@ -278,14 +280,7 @@ class FloorConfig:
     reflection: float | None = None
 
     def __post_init__(self) -> None:
-        if not (_is_finite(self.relative_permittivity) and self.relative_permittivity >= 1):
-            raise TensorsimError(
-                f"FloorConfig.relative_permittivity: got {self.relative_permittivity}, expected a finite number >= 1"
-            )
-        if not (_is_finite(self.loss_tangent) and self.loss_tangent >= 0):
-            raise TensorsimError(
-                f"FloorConfig.loss_tangent: got {self.loss_tangent}, expected a finite number >= 0"
-            )
+        _require_dielectric("FloorConfig", self.relative_permittivity, self.loss_tangent)
         if self.reflection is not None and not (_is_finite(self.reflection) and -1 <= self.reflection <= 1):
             raise TensorsimError(f"FloorConfig.reflection: got {self.reflection}, expected between -1 and 1")
 

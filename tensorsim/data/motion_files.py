@@ -116,7 +116,8 @@ def motion_keys(path: str | os.PathLike[str]) -> list[str | None]:
     with _npz(path) as arrays:
         if "positions_3d" in arrays.files:
             return [None]
-        return [None] if _preferred(arrays) is not None else [*_motions(arrays)] or [None]
+        motions = _motions(arrays)
+        return [None] if _preferred(motions) is not None else [*motions] or [None]
 
 
 def load_motion(
@@ -385,9 +386,8 @@ def _motions(arrays: Any) -> list[str]:
     return [name for name in arrays.files if arrays[name].ndim in (3, 4) and arrays[name].shape[-1] == 3]
 
 
-def _preferred(arrays: Any) -> str | None:
+def _preferred(motions: list[str]) -> str | None:
     """The array that is taken where there are several, by its usual name."""
-    motions = _motions(arrays)
     return next((name for name in ("joints_m", "joints", "Jtr") if name in motions), None)
 
 
@@ -397,7 +397,7 @@ def _read_npz(
 ) -> Motion:  # fmt: skip
     candidates = _motions(arrays)
     if key is None:
-        key = candidates[0] if len(candidates) == 1 else _preferred(arrays)
+        key = candidates[0] if len(candidates) == 1 else _preferred(candidates)
     if key not in candidates:
         shown = ", ".join(candidates) or "arrays (T, J, 3), but there are none"
         raise TensorsimError(f"{path}: got key {key!r}, expected one of {shown}")

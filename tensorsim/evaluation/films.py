@@ -43,6 +43,11 @@ class Observed(NamedTuple):
         """As a tracker gives them, a batch of one clip."""
         return Tracks(self.boxes[None], self.valid[None], self.valid[None])
 
+    def lifted_by(self, stage: VideoToPose) -> tuple[Tensor, Tensor]:
+        """Joints (P, T, 14, 3) m that a stage makes of these key points, and whether people are there (P, T)."""
+        pose = stage.lift(self.tracks(), self.keypoints[None], self.scores[None], HEIGHT, WIDTH, FPS)
+        return pose.joints[0], pose.valid[0]
+
 
 def project(joints: Tensor) -> tuple[Tensor, Tensor, View]:
     """COCO keypoints of joints (T, 14, 3): pixels (T, 17, 2), whether in the picture (T, 17), the camera's view."""

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import Clip
-from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Filmed, Observed, project, true_keypoints
+from tensorsim.evaluation.films import CAMERA, FPS, Filmed, Observed, project, true_keypoints
 from tensorsim.evaluation.scores import Maps
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
@@ -154,18 +154,14 @@ class Pipelines:
 
     def lifted(self, setting: Setting, clip: Clip, observed: Observed) -> tuple[Tensor, Tensor]:
         """Joints and who is there, as :meth:`joints`, of people that were observed in the picture."""
-        truth = clip.joints(FPS)
         if observed.valid.shape[0] == 0:
-            return torch.zeros(0, len(truth), 14, 3), observed.valid
+            return torch.zeros(0, observed.valid.shape[1], 14, 3), observed.valid
         if setting.true_stage in ("lifting", "position", "smoothing"):  # about the one person that is there
             longest = int(observed.valid.sum(dim=-1).argmax())
             observed = Observed(*(field[longest : longest + 1] for field in observed))
-        stage = self._video_to_pose(setting, clip, truth)
+        stage = self._video_to_pose(setting, clip, clip.joints(FPS))
         with torch.inference_mode():
-            pose = stage.lift(
-                observed.tracks(), observed.keypoints[None], observed.scores[None], HEIGHT, WIDTH, FPS
-            )
-        return pose.joints[0], pose.valid[0]
+            return observed.lifted_by(stage)
 
     def maps(self, setting: Setting, scene: str, clip: Clip, joints: Tensor, valid: Tensor) -> Maps:
         """The maps of joints at the frame rate; of an empty scene where there are none.

@@ -106,6 +106,12 @@ class Watched(NamedTuple):
         )
 
 
+def activity_told(path: Path) -> int | None:
+    """Index of the activity whose number, S1 to S12, begins the name of the folder of a file; None without one."""
+    name = re.match(r"S(\d+)(?!\d)", path.parent.name)
+    return int(name[1]) - 1 if name is not None and 1 <= int(name[1]) <= len(ACTIVITIES) else None
+
+
 def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
     """Path, clip and people found of each film that ``tensorsim evaluate truth`` keeps for its setting c.
 
@@ -116,10 +122,10 @@ def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
     if not paths:
         raise TensorsimError(f"{folder}: got no films, expected those of evaluate truth --settings c")
     for path in paths:
-        row, number = re.match(r"S(\d+)_", path.parent.name), re.match(r"(\d+)-", path.name)
-        if row is None or number is None or not 1 <= int(row[1]) <= len(ACTIVITIES):
+        activity, number = activity_told(path), re.match(r"(\d+)-", path.name)
+        if activity is None or number is None:
             raise TensorsimError(f"{path}: got a name that tells no clip, expected one of evaluate truth")
-        name = ACTIVITIES[int(row[1]) - 1]
+        name = ACTIVITIES[activity]
         clip = activity_clips((name,), 1, int(number[1]))[name][0]
         yield str(path.relative_to(folder)), clip, filmed(path, clip, nn.Identity(), nn.Identity()).found
 

@@ -1,6 +1,5 @@
 """Poses from films in place of true motion: to test classifiers on, and imitated cheaply to train them with."""
 
-import re
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Filmed
+from tensorsim.evaluation.films import CAMERA, FPS
 from tensorsim.evaluation.settings import Pipelines, Setting
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
@@ -20,7 +19,7 @@ from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.recognition.recognizer import ActivityRecognizer
-from tensorsim.training.film_errors import FilmErrors, films_of
+from tensorsim.training.film_errors import FilmErrors, activity_told, films_of
 from tensorsim.vision.lifter import NearestPoseLifter
 from tensorsim.vision.metric_pose import MetricPose
 
@@ -51,8 +50,8 @@ class FilmLoss:
         stage = VideoToPose(
             nothing, nothing, lifter=self.lifter, metric_pose=MetricPose(CAMERA, (height_m,))
         ).eval()
-        pose = stage.lift(seen.tracks(), seen.keypoints[None], seen.scores[None], HEIGHT, WIDTH, FPS)
-        return pose.joints[0, 0].double(), pose.valid[0, 0]
+        found, valid = seen.lifted_by(stage)
+        return found[0].double(), valid[0]
 
 
 class LabelledPose(NamedTuple):
@@ -79,12 +78,12 @@ def labelled_poses(folder: Path) -> list[LabelledPose]:
     """
     found = []
     for path in sorted(folder.rglob("pose.npz")):
-        name = re.match(r"S(\d+)(?!\d)", path.parent.name)
-        if name is None or not 1 <= int(name[1]) <= len(ACTIVITIES):
+        activity = activity_told(path)
+        if activity is None:
             raise TensorsimError(f"{path}: its folder's name does not begin with S1 to S{len(ACTIVITIES)}")
         with np.load(path) as file:
             joints, valid = torch.from_numpy(file["joints_m"]), torch.from_numpy(file["valid"])
-            found.append(LabelledPose(joints.double(), valid, float(file["fps"]), int(name[1]) - 1))
+            found.append(LabelledPose(joints.double(), valid, float(file["fps"]), activity))
     if not found:
         raise TensorsimError(f"{folder}: got no pose.npz, expected some")
     return found
@@ -99,7 +98,7 @@ def film_poses(folder: Path) -> list[LabelledPose]:
     pipelines = Pipelines({})
     found = []
     for _, clip, seen in films_of(folder):
-        joints, valid = pipelines.joints(Setting("c"), clip, Filmed(seen, seen))
+        joints, valid = pipelines.lifted(Setting("c"), clip, seen)
         if len(joints) == 0:  # nobody: one body without an echo
             joints, valid = torch.ones(1, valid.shape[-1], 14, 3), valid.new_zeros(1, valid.shape[-1])
         found.append(LabelledPose(joints.double(), valid, FPS, activity_index(clip.row)))

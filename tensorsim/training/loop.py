@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from tensorsim.device import usable_device
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 from tensorsim.weights import save_weights
 
 Batch = dict[str, Any]
@@ -163,10 +164,8 @@ class _Log:
         if self.path.is_file():
             with self.path.open(newline="", encoding="utf-8") as file:
                 rows = [row for row in list(csv.reader(file))[1:] if len(row) == 3 and int(row[0]) <= step]
-        scratch = self.path.with_suffix(".tmp")
-        with scratch.open("w", newline="", encoding="utf-8") as file:
+        with complete_file(self.path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([["step", "name", "value"], *rows])
-        os.replace(scratch, self.path)
         self.events = SummaryWriter(str(out), purge_step=step + 1)
 
     def write(self, step: int, values: dict[str, float]) -> None:
@@ -308,20 +307,17 @@ def _save(
     averaged: AveragedModel,
     optimiser: torch.optim.Optimizer,
 ) -> None:
-    scratch = path.with_suffix(".tmp")
-    torch.save(
-        {
-            "step": step,
-            "best": best,
-            "loop": config.fingerprint(),
-            "recipe": recipe.settings,
-            "net": recipe.net.state_dict(),
-            "averaged": averaged.state_dict(),
-            "optimiser": optimiser.state_dict(),
-        },
-        scratch,
-    )
-    os.replace(scratch, path)
+    state = {
+        "step": step,
+        "best": best,
+        "loop": config.fingerprint(),
+        "recipe": recipe.settings,
+        "net": recipe.net.state_dict(),
+        "averaged": averaged.state_dict(),
+        "optimiser": optimiser.state_dict(),
+    }
+    with complete_file(path) as scratch:
+        torch.save(state, scratch)
 
 
 def _read(path: Path) -> dict[str, Any]:

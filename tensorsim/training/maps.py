@@ -81,6 +81,18 @@ class MapSettings:
             raise TensorsimError(f"MapSettings: got {self}, expected positive numbers")
 
     @classmethod
+    def read(cls, path: Path) -> "MapSettings":
+        """Those that a store states in its ``settings.json``.
+
+        Raises:
+            TensorsimError: a file that is damaged, or of a store of another kind.
+        """
+        try:
+            return cls(**json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise TensorsimError(f"{path}: not the settings of a store of maps ({error})") from error
+
+    @classmethod
     def of_films(cls, seed: int, errors: FilmErrors) -> "MapSettings":
         """Motion as the pipeline finds it in films where networks make these errors."""
         return cls(seed=seed, motion_hz=FPS, films=errors.digest)
@@ -294,25 +306,22 @@ def build_maps(
     settings = MapSettings() if settings is None else settings
     described = folder / "settings.json"
     if described.is_file():
-        there = json.loads(described.read_text(encoding="utf-8"))
-        if MapSettings(**there) != settings:
-            raise TensorsimError(f"{folder}: it holds maps of {there}, expected {asdict(settings)}")
+        there = MapSettings.read(described)
+        if there != settings:
+            raise TensorsimError(f"{folder}: it holds maps of {asdict(there)}, expected {asdict(settings)}")
     else:
         with complete_file(described) as scratch:
             scratch.write_text(json.dumps(asdict(settings), indent=2), encoding="utf-8")
     motion = MotionMaker(settings, errors)
     makers = {scene: MapMaker(scene, settings) for scene in scenes}
     for index in tqdm(range(first, first + people), desc=folder.name, unit="person", disable=quiet):
-        missing = {}
-        for scene in scenes:
-            path = folder / f"{scene}-{index:05d}.safetensors"
-            if not path.is_file():
-                missing[path] = makers[scene]
-        moves = motion(index) if missing else None
-        for path, maker in missing.items():
-            assert moves is not None
-            with complete_file(path) as scratch:
-                save_file(maker.pictures(moves), scratch)
+        files = {scene: folder / f"{scene}-{index:05d}.safetensors" for scene in scenes}
+        missing = {scene: path for scene, path in files.items() if not path.is_file()}
+        if missing:
+            moves = motion(index)
+            for scene, path in missing.items():
+                with complete_file(path) as scratch:
+                    save_file(makers[scene].pictures(moves), scratch)
 
 
 class MapStore:
@@ -334,7 +343,7 @@ class MapStore:
         if not described.is_file():
             raise TensorsimError(f"{folder}: no settings.json, expected a store of maps")
         self.folder = folder
-        self.settings = MapSettings(**json.loads(described.read_text(encoding="utf-8")))
+        self.settings = MapSettings.read(described)
         self.people = {
             scene: sorted(int(p.stem[-5:]) for p in folder.glob(f"{scene}-?????.safetensors"))
             for scene in SCENES

@@ -216,10 +216,12 @@ def cut_picture(
         return image, box, keypoints
     box, keypoints = box.copy(), keypoints.copy()
     keypoints[~kept, 2] = 0
-    part = slice(0, edge) if keep_low else slice(edge, None)
-    box[axis if not keep_low else 2 + axis] = edge - int(keep_low)
-    if not keep_low:
-        box[[axis, 2 + axis]] -= edge
+    if keep_low:
+        part = slice(0, edge)
+        box[2 + axis] = edge - 1
+    else:  # the picture begins at the edge
+        part = slice(edge, None)
+        box[axis], box[2 + axis] = 0, box[2 + axis] - edge
         keypoints[:, axis] -= edge
     return (image[:, part] if axis == 0 else image[part]), box, keypoints
 

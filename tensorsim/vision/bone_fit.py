@@ -112,7 +112,7 @@ class _Clip(NamedTuple):
         shares: (S, 8) expected lengths in metres.
         height: (S, T, 13, 2) of joints over where they rest, at distance 0 and how much more per metre.
         stiff: (S, T + 2, 13) weights of squared second differences that end in a frame; 0 where there is none.
-        rest: (S, T, 13) weights of squared heights of the lowest joint; 0 of joints that are not seen.
+        footing: (S, T, 13) weights of squared heights of the lowest joint; 0 of joints that are not seen.
         hidden: (S, T, 12) variance in m^2 that bones to joints have which are not seen.
     """
 
@@ -121,7 +121,7 @@ class _Clip(NamedTuple):
     shares: Tensor
     height: Tensor
     stiff: Tensor
-    rest: Tensor
+    footing: Tensor
     hidden: Tensor
 
 
@@ -262,10 +262,10 @@ class BoneFit(nn.Module):
         square = (fps / 2) ** 2 * (across[:, 2:] - across[:, :-2]).square().sum(dim=-1)  # of speeds
         square = torch.cat([square[:, :1], square, square[:, -1:]], dim=1)
         ankle_m2 = self.standing_m**2 + self.heel_s**2 * square
-        rest = there / torch.where(self.ankle, ankle_m2, torch.full_like(ankle_m2, self.floor_m**2))
+        footing = there / torch.where(self.ankle, ankle_m2, torch.full_like(ankle_m2, self.floor_m**2))
         ends = torch.matmul((~there).to(lines.dtype), (self.bones != 0).to(lines.dtype).t())
         hidden = self.hidden_m**2 * ends.clamp(max=1.0)
-        clip = _Clip(lines, given, tall[:, None] * self.shares, height, stiff, rest, hidden)
+        clip = _Clip(lines, given, tall[:, None] * self.shares, height, stiff, footing, hidden)
 
         r, stretch, loose_m = given, torch.zeros_like(clip.shares), noise
         for slack in (90.0, 30.0, 9.0):
@@ -319,8 +319,8 @@ class BoneFit(nn.Module):
         over = clip.height[..., 0] + clip.height[..., 1] * r
         square = (over / self.floor_reach_m).square()
         # Geman and McClure's for the lowest joint, as who jumps rests on none; nothing for others unless they sink.
-        lowest = F.one_hot(over.argmin(dim=-1), 13) * clip.rest
-        sunk = ((over < 0) & (clip.rest > 0)).to(r.dtype) / self.floor_m**2
+        lowest = F.one_hot(over.argmin(dim=-1), 13) * clip.footing
+        sunk = ((over < 0) & (clip.footing > 0)).to(r.dtype) / self.floor_m**2
         weight = lowest / (1 + square).square() + sunk
         loss = lowest * self.floor_reach_m**2 * square / (1 + square) + sunk * over.square()
         slope = clip.height[..., 1]

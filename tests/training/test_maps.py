@@ -169,6 +169,14 @@ def test_nobody_adds_nothing() -> None:
     assert float(echo[:, 17:].sum()) < 1e-3 * float(echo[:, :11].sum())
 
 
+@pytest.mark.parametrize("content", ["{", "[]", '{"filmed": false}', '{"size": "large"}'])
+def test_other_settings_are_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "settings.json").write_text(content)
+    for read in (lambda: MapStore(tmp_path), lambda: build_maps(tmp_path, 0, ("through-wall",), SMALL)):
+        with pytest.raises(TensorsimError, match=r"settings\.json: not the settings of a store of maps"):
+            read()
+
+
 def test_stores_of_before_are_read(tmp_path: Path) -> None:
     stated = asdict(SMALL)
     del stated["films"]
