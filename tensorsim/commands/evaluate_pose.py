@@ -10,6 +10,9 @@ from tensorsim.errors import TensorsimError
 class EvaluatePose:
     """Print mean OKS and PCK@0.1 (of the longer side of the box) on held-out people.
 
+    Then, of the same people with the edge of the picture through them, the shares of keypoints that score 0.3 or more:
+    of those in the picture ("seen") and of those beyond ("ghosts").
+
     Attributes:
         weights: HRNet's (.safetensors, .pth) or any heat-map network's (.onnx); the shipped ones if not given.
         data: folder of lspet-*.tar and coco_small-*.tar, whose held-out people are looked for.
@@ -27,7 +30,7 @@ class EvaluatePose:
         from tensorsim.pipeline import pretrained_pose
         from tensorsim.training.pose import HELD_OUT_PERCENT
         from tensorsim.training.pose_data import Person, people, split, upright
-        from tensorsim.training.pose_metrics import evaluate_pose
+        from tensorsim.training.pose_metrics import evaluate_cut, evaluate_pose
         from tensorsim.training.shards import Shards, find_shards, read_coco_folder
 
         groups: dict[str, list[Person]] = {}
@@ -42,8 +45,11 @@ class EvaluatePose:
             raise TensorsimError("evaluate pose: got no pictures, expected --data or --coco")
 
         pose = pretrained_pose(self.weights, self.flip_test).eval()
-        print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s} {'body':>7s}")
+        print(
+            f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s} {'body':>7s} {'seen':>7s} {'ghosts':>7s}"
+        )
         for name, persons in groups.items():
-            figure = evaluate_pose(pose, persons)
+            figure = evaluate_pose(pose, persons) | evaluate_cut(pose, persons)
             row = f"{figure['oks']:7.3f} {figure['pck']:8.3f} {figure['pck_body']:7.3f}"
+            row += f" {figure['seen']:7.3f} {figure['ghosts']:7.3f}"
             print(f"{name:40s} {len(persons):5d} {row}")

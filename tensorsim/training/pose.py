@@ -55,8 +55,13 @@ def heatmap_loss(
     return squares / (1 + foreground) + places * divergence
 
 
-def person_loss(maps: Tensor, points: Tensor, known: Tensor, sided: Tensor, sigma: float) -> Tensor:
-    """Mean loss over the known keypoints of each person (N,), zero where none is known.
+def person_loss(
+    maps: Tensor, points: Tensor, known: Tensor, gone: Tensor, sided: Tensor, sigma: float
+) -> Tensor:
+    """Mean loss over the keypoints of each person that are known or gone (N,), zero where none is.
+
+    The map of a keypoint that is gone should be zero: where the picture ends within a person, low peaks then tell
+    which part of the body is out of sight.
 
     Where ``sided`` is false, left and right may have been confused by who labelled: then the loss against labels
     with sides exchanged is taken instead if it is less than half as large, which a network reaches only once it
@@ -66,18 +71,20 @@ def person_loss(maps: Tensor, points: Tensor, known: Tensor, sided: Tensor, sigm
         maps: (N, 17, h, w).
         points: (N, 17, 2) crop pixels.
         known: (N, 17) bool.
+        gone: (N, 17) bool, none of them known.
         sided: (N,) bool.
         sigma: of the targets, map pixels.
     """
     size = (maps.shape[-2], maps.shape[-1])
 
-    def mean_loss(points: Tensor, known: Tensor) -> Tensor:
-        losses = heatmap_loss(maps, gaussian_maps(points / STRIDE, size, sigma))
-        return (losses * known).sum(-1) / known.sum(-1).clamp_min(1)
+    def mean_loss(points: Tensor, known: Tensor, gone: Tensor) -> Tensor:
+        targets = gaussian_maps(points / STRIDE, size, sigma) * known[..., None, None]
+        told = known | gone
+        return (heatmap_loss(maps, targets) * told).sum(-1) / told.sum(-1).clamp_min(1)
 
     mirrored = list(MIRRORED)
-    straight = mean_loss(points, known)
-    exchanged = mean_loss(points[:, mirrored], known[:, mirrored])
+    straight = mean_loss(points, known, gone)
+    exchanged = mean_loss(points[:, mirrored], known[:, mirrored], gone[:, mirrored])
     return torch.where(~sided & (exchanged < 0.5 * straight), exchanged, straight)
 
 
@@ -145,7 +152,7 @@ class PoseRecipe(Recipe):
         self.colours: nn.Module | None = None
 
     def sample(self, index: int) -> dict[str, Any]:
-        """A crop (3, h, w) uint8 with its points (17, 2), which of them are known (17,) and whether sides hold."""
+        """A crop (3, h, w) uint8, its points (17, 2), which are known and which gone (17,), whether sides hold."""
         generator = np.random.default_rng((self.seed, index))
         size = self.first_size if index < self.first_samples else self.input_size
         source = int(generator.choice(3, p=self.shares))
@@ -169,6 +176,7 @@ class PoseRecipe(Recipe):
             "crops": np.ascontiguousarray(crop.image.transpose(2, 0, 1)),
             "points": crop.points,
             "known": crop.known,
+            "gone": crop.gone,
             "sided": source != 1,
         }
 
@@ -179,7 +187,7 @@ class PoseRecipe(Recipe):
         with torch.no_grad(), torch.autocast(batch["crops"].device.type, enabled=False):
             crops = self.colours(batch["crops"].float() / 255)
         maps = net(crops.contiguous(memory_format=torch.channels_last)).float()
-        losses = person_loss(maps, batch["points"], batch["known"], batch["sided"], self.sigma)
+        losses = person_loss(maps, batch["points"], batch["known"], batch["gone"], batch["sided"], self.sigma)
         return {"loss": losses.mean()}
 
     def optimiser(self) -> torch.optim.Optimizer:

@@ -51,11 +51,13 @@ class Crop(NamedTuple):
         image: (h, w, 3) uint8 RGB.
         points: (17, 2) float32, crop pixels.
         known: (17,) bool, labelled and inside of the crop.
+        gone: (17,) bool, labelled but cut away: nothing of them is to be found in the crop.
     """
 
     image: Picture
     points: Floats
     known: npt.NDArray[np.bool_]
+    gone: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,9 @@ def crop_person(
         body = body[list(MIRRORED)]
     points = body[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     inside = ((points >= -0.5) & (points <= np.array([size[1], size[0]]) - 0.5)).all(1)
-    return Crop(warped.astype(np.uint8, copy=False), points.astype(np.float32), inside & (body[:, 2] > 0))
+    known = inside & (body[:, 2] > 0)
+    gone = ~known & (body[:, 2] != 0)
+    return Crop(warped.astype(np.uint8, copy=False), points.astype(np.float32), known, gone)
 
 
 def cut_picture(
@@ -204,8 +208,8 @@ def cut_picture(
 ) -> tuple[Picture, Floats, Floats]:
     """Picture, box and keypoints of a person as if the edge of the picture went through them.
 
-    Half the time the lower edge does, else one of the others, a quarter to three quarters into the box; points
-    beyond are not labelled any more. With fewer than four labelled points left, all stays as it is.
+    Half the time the lower edge does, else one of the others, a quarter to three quarters into the box; labelled
+    points beyond get v = -1. With fewer than four labelled points left, all stays as it is.
     """
     axis = int(generator.random() < 0.6)  # 0 cuts at a u, 1 at a v
     keep_low = bool(generator.random() < (0.5 if axis == 0 else 0.85))
@@ -215,7 +219,7 @@ def cut_picture(
     if ((keypoints[:, 2] > 0) & kept).sum() < 4:
         return image, box, keypoints
     box, keypoints = box.copy(), keypoints.copy()
-    keypoints[~kept, 2] = 0
+    keypoints[~kept & (keypoints[:, 2] > 0), 2] = -1
     if keep_low:
         part = slice(0, edge)
         box[2 + axis] = edge - 1

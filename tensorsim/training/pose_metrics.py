@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.training.pose_data import Person
+from tensorsim.training.pose_data import Person, Picture, cut_picture
+from tensorsim.training.shards import Floats
 from tensorsim.vision.topdown import TopDownPose
 
 _FACE = (0.026, 0.025, 0.025, 0.035, 0.035)
@@ -71,14 +72,8 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, fl
     """
     if not persons:
         raise TensorsimError("evaluate_pose: got no people, expected some with labelled keypoints")
-    device = next(iter(network.parameters()), torch.zeros(0)).device
-    pose = (network if isinstance(network, TopDownPose) else TopDownPose(network)).to(device)
-    found = []
-    with torch.no_grad():
-        for person in persons:
-            image = torch.from_numpy(person.sample.image()).permute(2, 0, 1)[None].to(device)
-            box = torch.from_numpy(person.box)[None, None].to(device)
-            found.append(pose(image, box, torch.ones(1, 1, dtype=torch.bool, device=device))[0][0, 0].cpu())
+    pose = network if isinstance(network, TopDownPose) else TopDownPose(network)
+    found = [_find(pose, person.sample.image(), person.box)[0] for person in persons]
     labels = torch.from_numpy(np.stack([person.keypoints[:17] for person in persons]))
     points, known = labels[..., :2], labels[..., 2] > 0
     boxes = torch.from_numpy(np.stack([person.box for person in persons]))
@@ -90,3 +85,42 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, fl
         "pck": float(pck(places, points, known, side)),
         "pck_body": float(pck(places[:, 5:], points[:, 5:], known[:, 5:], side)),
     }
+
+
+def evaluate_cut(
+    network: nn.Module, persons: Sequence[Person], threshold: float = 0.3, seed: int = 0
+) -> dict[str, float]:
+    """Let pictures end within the people, and see whether the scores tell what is out of sight.
+
+    Args:
+        network: as in :func:`evaluate_pose`.
+        persons: whom to cut (:func:`~tensorsim.training.pose_data.cut_picture`).
+        threshold: score from which a keypoint counts as seen.
+        seed: of the cuts.
+
+    Returns:
+        Shares of labelled keypoints with such a score: ``seen`` of those in the picture, ``ghosts`` of those beyond
+        its edge. NaN where there are none.
+    """
+    pose = network if isinstance(network, TopDownPose) else TopDownPose(network)
+    inside, beyond = [torch.zeros(0)], [torch.zeros(0)]
+    for index, person in enumerate(persons):
+        generator = np.random.default_rng((seed, index))
+        image, box, keypoints = cut_picture(person.sample.image(), person.box, person.keypoints, generator)
+        v = torch.from_numpy(keypoints[:17, 2])
+        if (v >= 0).all():
+            continue  # too few labels to cut
+        _, scores = _find(pose, np.ascontiguousarray(image), box)
+        inside.append((scores[v > 0] >= threshold).float())
+        beyond.append((scores[v < 0] >= threshold).float())
+    return {"seen": float(torch.cat(inside).mean()), "ghosts": float(torch.cat(beyond).mean())}
+
+
+def _find(pose: TopDownPose, picture: Picture, box: Floats) -> tuple[Tensor, Tensor]:
+    """Keypoints (17, 2) and scores (17,) of the person in a box of a picture, on the CPU."""
+    device = next(iter(pose.parameters()), torch.zeros(0)).device
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None].to(device)
+    boxes = torch.from_numpy(box)[None, None].to(device)
+    with torch.no_grad():
+        points, scores = pose.to(device)(image, boxes, torch.ones(1, 1, dtype=torch.bool, device=device))
+    return points[0, 0].cpu(), scores[0, 0].cpu()

@@ -12,12 +12,12 @@ from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.loop import LoopConfig, fit
 from tensorsim.training.pose import PoseRecipe, gaussian_maps, heatmap_loss, person_loss
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
-from tensorsim.training.pose_metrics import SIGMAS, evaluate_pose, oks, pck
+from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck
 from tensorsim.training.shards import Sample
 from tensorsim.vision.heatmaps import HeatmapDecoder
 from tensorsim.vision.hrnet import HRNet, HRNetConfig
 from tensorsim.vision.topdown import MIRRORED
-from tests.training.test_pose_data import BOX, sample, standing, write_cutouts
+from tests.training.test_pose_data import BOX, drawn, sample, standing, write_cutouts
 from tests.training.test_shards import jpg
 
 TINY = HRNetConfig(4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4)
@@ -48,29 +48,42 @@ def test_loss_is_the_formula_and_zero_at_the_target_alone() -> None:
     assert heatmap_loss(targets, targets).abs().max() < 1e-12
 
 
-def random_people(count: int = 3) -> tuple[Tensor, Tensor]:
+def random_people(count: int = 3) -> tuple[Tensor, Tensor, Tensor]:
+    """Points, and which of them are known and which gone."""
     points = 4 + torch.rand(count, 17, 2) * torch.tensor([40.0, 56.0])
-    return points, torch.rand(count, 17) < 0.7
+    state = torch.rand(count, 17)
+    return points, state < 0.6, state > 0.8
 
 
 def test_unknown_keypoints_cost_nothing() -> None:
-    points, known = random_people()
+    points, known, gone = random_people()
     maps = torch.rand(3, 17, 16, 12, requires_grad=True)
-    person_loss(maps, points, known, torch.tensor([True, False, True]), 1.5).sum().backward()
+    person_loss(maps, points, known, gone, torch.tensor([True, False, True]), 1.5).sum().backward()
     assert maps.grad is not None
     told = maps.grad.abs().amax((-2, -1)) > 0
     # A person whose sides are not sure is compared with straight labels as long as the net knows no better.
-    torch.testing.assert_close(told, known)
-    nobody = person_loss(maps, points, torch.zeros_like(known), torch.ones(3, dtype=torch.bool), 1.5)
+    torch.testing.assert_close(told, known | gone)
+    none = torch.zeros_like(known)
+    nobody = person_loss(maps, points, none, none, torch.ones(3, dtype=torch.bool), 1.5)
     assert (nobody == 0).all()
 
 
+def test_what_is_gone_should_leave_no_peak() -> None:
+    points, known, gone = random_people()
+    sided = torch.ones(3, dtype=torch.bool)
+    truth = gaussian_maps(points / 4, (16, 12), 1.5) * known[..., None, None]
+    assert person_loss(truth, points, known, gone, sided, 1.5).abs().max() < 1e-5
+    ghosts = gaussian_maps(points / 4, (16, 12), 1.5)
+    assert person_loss(ghosts, points, known, gone, sided, 1.5).min() > 0.01
+
+
 def test_exchanged_sides_are_forgiven_only_where_they_may_be() -> None:
-    points, known = random_people()
-    truth = gaussian_maps(points / 4, (16, 12), 1.5)
-    wrong_points, wrong_known = points[:, list(MIRRORED)], known[:, list(MIRRORED)]
-    forgiven = person_loss(truth, wrong_points, wrong_known, torch.zeros(3, dtype=torch.bool), 1.5)
-    blamed = person_loss(truth, wrong_points, wrong_known, torch.ones(3, dtype=torch.bool), 1.5)
+    points, known, gone = random_people()
+    mirrored = list(MIRRORED)
+    truth = gaussian_maps(points / 4, (16, 12), 1.5) * known[..., None, None]
+    wrong = points[:, mirrored], known[:, mirrored], gone[:, mirrored]
+    forgiven = person_loss(truth, *wrong, torch.zeros(3, dtype=torch.bool), 1.5)
+    blamed = person_loss(truth, *wrong, torch.ones(3, dtype=torch.bool), 1.5)
     assert forgiven.abs().max() < 1e-5
     assert blamed.min() > 0.1
 
@@ -124,6 +137,38 @@ def test_evaluation_goes_through_the_pipeline(tmp_path: Path) -> None:
         evaluate_pose(Brightness(), [])
 
 
+class Channels(nn.Module):
+    """Sees the face where the crop is blue, the left arm where it is red and the right one where it is green."""
+
+    def forward(self, crops: Tensor) -> Tensor:
+        return nn.functional.avg_pool2d(crops, 4)[:, [2] * 5 + [0, 1] * 3 + [0] * 6]
+
+
+class Everything(nn.Module):
+    """Sees every keypoint everywhere."""
+
+    def forward(self, crops: Tensor) -> Tensor:
+        return torch.ones(len(crops), 17, crops.shape[-2] // 4, crops.shape[-1] // 4)
+
+
+def test_scores_of_cut_people_tell_what_is_out_of_sight(tmp_path: Path) -> None:
+    import cv2
+
+    keypoints = standing()
+    keypoints[11:, 2] = 0
+    for joints, wrist in (((5, 7), 9), ((6, 8), 10), ((1, 2, 3, 4), 0)):
+        keypoints[list(joints)] = keypoints[wrist]
+    cv2.imwrite(str(tmp_path / "a.png"), drawn(keypoints)[..., ::-1])
+    whole = Sample("a", BOX[None], keypoints[None], np.array([4000.0], np.float32), True, tmp_path / "a.png")
+    persons = [Person(whole, BOX, keypoints, 4000.0)] * 20
+    told = evaluate_cut(Channels(), persons)
+    assert told["seen"] > 0.95
+    assert told["ghosts"] < 0.05
+    assert evaluate_cut(Everything(), persons) == {"seen": 1.0, "ghosts": 1.0}
+    keypoints[3:, 2] = 0  # too few labels to cut
+    assert np.isnan(list(evaluate_cut(Everything(), persons).values())).all()
+
+
 def recipe(folder: Path, **options: object) -> PoseRecipe:
     (folder / "a.jpg").write_bytes(jpg(1, 280, 200))
     (folder / "place.jpg").write_bytes(jpg(3, 80, 60))
@@ -171,7 +216,9 @@ def test_eight_crops_are_learnt(tmp_path: Path) -> None:
     optimiser = torch.optim.Adam(net.parameters(), lr=1e-2)
     losses = []
     for _ in range(80):
-        loss = person_loss(net(crops), batch["points"], batch["known"], batch["sided"], 1.5).mean()
+        loss = person_loss(
+            net(crops), batch["points"], batch["known"], batch["gone"], batch["sided"], 1.5
+        ).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

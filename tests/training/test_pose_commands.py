@@ -45,8 +45,8 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert len(rows) == 5
     for name, count in held_out.items():
         (row,) = (row for row in rows if row.startswith(f"{name}, held out   "))
-        assert int(row.split()[-4]) == count
-        assert all(0 <= float(figure) <= 1 for figure in row.split()[-3:])
+        assert int(row.split()[-6]) == count
+        assert all(0 <= float(figure) <= 1 for figure in row.split()[-5:])
     # Training goes on from those weights.
     more = TrainPose(
         data,

@@ -24,6 +24,7 @@ from tensorsim.training.pose_data import (
 )
 from tensorsim.training.shards import Sample
 from tensorsim.vision.crops import BoxCrop, crop_to_image
+from tensorsim.vision.topdown import MIRRORED
 from tests.training.tars import write_tar
 from tests.training.test_shards import jpg
 
@@ -118,6 +119,28 @@ def test_points_outside_or_not_labelled_are_not_known() -> None:
     inside = ((crop.points > -0.5) & (crop.points < 63.5)).all(1)
     np.testing.assert_array_equal(crop.known, inside & (keypoints[:17, 2] > 0))
     assert set(np.flatnonzero(crop.known)) == {11}
+    np.testing.assert_array_equal(crop.gone, ~inside & (keypoints[:17, 2] > 0))
+    assert not crop_person(drawn(keypoints), BOX, keypoints, SIZE).gone.any()
+
+
+def test_what_the_edge_cuts_away_is_gone_even_where_the_crop_reaches_beyond() -> None:
+    keypoints = standing()
+    keypoints[9, 2] = 0
+    options = Augmentation(scale=0, turn_deg=0, shift=0, half=0, cut=1)
+    beyond = 0
+    for seed in range(20):
+        # The mirror image comes first, then the border, then the cut.
+        generator = np.random.default_rng(seed)
+        mirrored = generator.random() < 0.5
+        generator.random(2)
+        _part, _box, points = cut_picture(drawn(keypoints), BOX, keypoints, generator)
+        crop = crop_person(drawn(keypoints), BOX, keypoints, SIZE, options, np.random.default_rng(seed))
+        v = points[list(MIRRORED) if mirrored else slice(17), 2]
+        np.testing.assert_array_equal(crop.gone, v < 0)
+        np.testing.assert_array_equal(crop.known, v > 0)
+        inside = ((crop.points >= 0) & (crop.points <= [SIZE[1] - 1, SIZE[0] - 1])).all(1)
+        beyond += int((crop.gone & inside).sum())
+    assert beyond > 10
 
 
 def test_half_bodies() -> None:
@@ -143,6 +166,7 @@ def test_pictures_that_end_within_the_person() -> None:
         assert (points[:, 2] > 0).sum() >= 4
         assert (box[:2] >= 0).all()
         assert (box[2:] <= [width - 1, height - 1]).all()
+        np.testing.assert_array_equal(points[:, 2] != 0, keypoints[:, 2] != 0)
         known = points[points[:, 2] > 0]
         assert (known[:, :2] < [width, height]).all()
         assert (known[:, :2] >= 0).all()
