@@ -55,7 +55,8 @@ class CosineAntenna(nn.Module):
         elif beamwidth_rad is not None and exponent is None:
             if not 0 < beamwidth_rad < math.pi:
                 raise TensorsimError(f"beamwidth_rad: got {beamwidth_rad}, expected between 0 and pi")
-            self.exponent = math.log(0.5) / math.log(math.cos(beamwidth_rad / 2))
+            # log(cos(a)), exact for narrow beams too.
+            self.exponent = math.log(0.5) / math.log1p(-2 * math.sin(beamwidth_rad / 4) ** 2)
         else:
             raise TensorsimError(
                 f"CosineAntenna: got exponent {exponent} and beamwidth_rad {beamwidth_rad}, "

@@ -225,7 +225,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     )
     bar = tqdm(total=config.steps, initial=first, disable=config.quiet or rank > 0, unit="step")
     began, trained = time.perf_counter(), 0
-    for step, batch in enumerate(loader, start=first):
+    for step, batch in enumerate(_batches(loader), start=first):
         torch.manual_seed(config.seed * 1_000_003 + step * processes + rank)
         recipe.net.train()
         factor = recipe.rate(step, config.steps)
@@ -267,6 +267,14 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     if processes > 1:
         distributed.destroy_process_group()
     return best
+
+
+def _batches(loader: DataLoader[Batch]) -> Iterator[Batch]:
+    """Batches; an error of a worker comes as it was raised there, without the traceback that torch puts around it."""
+    try:
+        yield from loader
+    except TensorsimError as error:
+        raise TensorsimError(str(error).strip().rpartition("TensorsimError: ")[2]) from error
 
 
 def _decay(decay: float, count: int) -> float:

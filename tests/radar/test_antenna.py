@@ -119,6 +119,8 @@ def test_cosine_pattern_at_its_half_power_angle_and_behind():
         assert float(antenna(f64(*direction))) ** 2 == pytest.approx(0.5, rel=1e-12)
     assert float(antenna(f64(0.0, 3.0, 0.0))) == pytest.approx(1.0)
     assert float(antenna(f64(0.1, -3.0, 0.0))) == 0.0
+    narrow = CosineAntenna(beamwidth_rad=1e-9)  # cos(a)^q = exp(-q a^2 / 2) near the axis
+    assert narrow.exponent == pytest.approx(2 * math.log(2) / 0.5e-9**2, rel=1e-12)
 
 
 def test_table_is_bilinear_in_decibels_and_holds_its_edge():

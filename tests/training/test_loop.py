@@ -87,6 +87,19 @@ def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path: Path, workers: 
     assert kept == [[str(step), "loss"] for step in range(5, 41, 5)]
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_of_a_worker_is_told_in_one_line(tmp_path: Path, workers: int) -> None:
+    class Damaged(Line):
+        def sample(self, index: int) -> dict[str, Any]:
+            if index == 40:
+                raise TensorsimError("a.tar: damaged: cut short")
+            return super().sample(index)
+
+    with pytest.raises(TensorsimError) as raised:
+        fit(Damaged(), config(tmp_path, workers=workers))
+    assert str(raised.value) == "a.tar: damaged: cut short"
+
+
 def test_logs_are_there(tmp_path: Path) -> None:
     fit(Line(), config(tmp_path))
     rows = list(csv.reader((tmp_path / "metrics.csv").read_text().splitlines()))
