@@ -214,6 +214,7 @@ class VideoToPose(nn.Module):
         told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
+        told = told & seen.any(dim=-1)
         joints = self.bone_fit(joints, seen & told.unsqueeze(-1), fps)
         # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
         # the pose that was found stands in for it, as long as the person is in the scene.

@@ -92,7 +92,9 @@ class MetricPose(nn.Module):
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y takes ``s = f H / y``
     pixels, and the lifter gives s whatever the pose, so the hips are at range ``y = H (f / s - d)``, d the
     mean depth of the joints beyond the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm.
-    Each joint lies on its line of sight at its own depth. The floor follows the lower ankle as a low running
+    Each joint lies on its line of sight at its own depth. Frames that show fewer than ten joints tell no size: they
+    take that of the others, and one whose joints would make a body of less than 0.65 of it is not believed (a leg at
+    the edge of the picture, taken for a whole person). The floor follows the lower ankle as a low running
     quantile, so that a jump leaves it and a wrong ankle does not move it.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
@@ -117,8 +119,8 @@ class MetricPose(nn.Module):
         (..., P, T) bool, image height and width in pixels, frames per second and, where the camera moves, its
         world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward) -> world joints
         (..., P, T, 14, 3) in metres and whether each was seen (..., P, T, 14). What was not seen is filled: a
-        hidden joint from the pose that the lifter found, an invalid frame from the nearest valid one; people
-        without any are zeros. Differentiable.
+        hidden joint from the pose that the lifter found, a frame that is invalid or not believed from the
+        nearest other one; people without any are zeros. Differentiable.
 
     Raises:
         TensorsimError: heights or distances that are not positive, an unknown mode, wrong shapes, NaN, or a
@@ -151,6 +153,7 @@ class MetricPose(nn.Module):
         self.floor_window_s = floor_window_s
         self.calibrated = calibrated
         self.whole_body_joints = 10  # seen joints that make a body whole enough to tell its size
+        self.squeezed = 0.65  # of the size that whole bodies tell: below, a part was taken for a whole
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
         camera = CameraConfig() if camera is None else camera
@@ -205,12 +208,12 @@ class MetricPose(nn.Module):
         check_positive(fps, "fps")
 
         seen = (scores >= self.keypoint_threshold) & valid[..., None]
-        image = torch.where(seen[..., None], keypoints, lifted.keypoints)
         height = self._of_each(self.heights, keypoints)
         distance = self._of_each(self.distances, keypoints)
         if self.mode == "paper":
             if camera_pose is not None:
                 raise TensorsimError("camera_pose: got camera poses, expected none: the paper has no camera")
+            image = torch.where(seen[..., None], keypoints, lifted.keypoints)
             joints = paper_pose(image, lifted, valid, height, distance)
         else:
             pose = self.camera_pose.to(keypoints.dtype)
@@ -231,7 +234,8 @@ class MetricPose(nn.Module):
 
             # The fitted scale is that at the mean depth of the joints, not of the hips.
             weights = scores.clamp(min=0.0)
-            beyond = (weights * lifted.depth).sum(dim=-1) / weights.sum(dim=-1).clamp(min=1e-6)
+            weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+            beyond = (weights * lifted.depth).sum(dim=-1)
             scale = fill_gaps(lifted.scale, valid).clamp(min=1e-3)
             beyond = fill_gaps(beyond, valid)
             focal = torch.full_like(scale, focal_px)
@@ -241,6 +245,14 @@ class MetricPose(nn.Module):
             whole = valid & (seen.sum(dim=-1) >= self.whole_body_joints)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
             root_range = height * robust_smooth(focal / scale - beyond, whole, self.range_smoothing_s * fps)
+            # A network that sees a leg alone may take it for a small body: such a frame says nothing.
+            body_px = focal / (root_range / height + beyond).clamp(min=1e-3)
+            valid = valid & (whole | (scale > self.squeezed * body_px))
+            seen = seen & valid[..., None]
+            # Hidden joints are where the pose has them, at the size that the other frames tell.
+            middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)
+            placed = middle + (body_px / scale)[..., None, None] * (lifted.keypoints - middle)
+            image = torch.where(seen[..., None], keypoints, placed)
             reach = root_range[..., None] + height[..., None] * lifted.depth
             joints = back_project(image, reach, focal, torch.tensor(center).to(image), pose)
             if not self.calibrated:

@@ -308,6 +308,55 @@ def test_hidden_joints_and_absent_people_are_filled_and_marked() -> None:
     assert torch.equal(seen, expected)
 
 
+def place_seen(module: MetricPose, image: Tensor, scores: Tensor, lifted: Lifted) -> tuple[Tensor, Tensor]:
+    lifted = Lifted(*(field[None] for field in lifted))
+    valid = torch.ones(1, len(image), dtype=torch.bool)
+    joints, seen = module(image[None], scores[None], lifted, valid, HEIGHT, WIDTH, FPS)
+    return joints[0], seen[0]
+
+
+def misread(image: Tensor, lifted: Lifted, frames: slice, shown: list[int], factor: float) -> Lifted:
+    """As if the size found in some frames, from the joints that show, were wrong by a factor."""
+    keypoints, scale = lifted.keypoints.clone(), lifted.scale.clone()
+    middle = image[frames, shown].mean(dim=1, keepdim=True)
+    keypoints[frames] = middle + factor * (keypoints[frames] - middle)
+    scale[frames] *= factor
+    return lifted._replace(keypoints=keypoints, scale=scale)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.3])
+def test_hidden_legs_are_as_long_as_before(factor: float) -> None:
+    world = walker((0.0, 4.0), (0.3, 0.0))
+    image, lifted = film(world)
+    shown = [j for j, name in enumerate(JOINTS) if "knee" not in name and "ankle" not in name][:8]
+    scores = torch.zeros(90, 14, dtype=torch.float64)
+    scores[:60], scores[60:, shown] = 1.0, 1.0
+    found = misread(image, lifted, slice(60, 90), shown, factor)
+    joints, seen = place_seen(MetricPose(person_height_m=(TALL,)), image, scores, found)
+    assert seen[60:].sum(dim=-1).unique().tolist() == [8]
+    assert float((joints - world).norm(dim=-1).max()) < 0.1
+    thigh = (joints[:, 8] - joints[:, 9]).norm(dim=-1)
+    assert float(thigh.std() / thigh.mean()) < 0.03
+
+
+def test_a_part_taken_for_a_small_body_says_nothing() -> None:
+    world = walker((0.0, 4.0), (0.5, 0.0))
+    image, lifted = film(world)
+    shown = [j for j, name in enumerate(JOINTS) if "knee" in name or "ankle" in name]
+    scores = torch.ones(90, 14, dtype=torch.float64)
+    scores[85:] = 0.0
+    scores[85:, shown] = 1.0
+    found = misread(image, lifted, slice(85, 90), shown, 0.4)
+    joints, seen = place_seen(MetricPose(person_height_m=(TALL,)), image, scores, found)
+    assert seen[:85].all()
+    assert not seen[85:].any()
+    torch.testing.assert_close(joints[85:], joints[84:85].expand(5, -1, -1))
+    # Whoever is small while the whole body shows is far away.
+    far = misread(image, lifted, slice(85, 90), list(range(14)), 0.4)
+    joints, seen = place_seen(MetricPose(person_height_m=(TALL,)), image, torch.ones_like(scores), far)
+    assert seen.all()
+
+
 def test_a_lifted_walker_recedes_at_its_speed() -> None:
     """The whole way: a pool that has other poses, noise of 2 px, and no knowledge of the scale."""
     world = walker((0.2, 3.0), (0.0, 1.3))
