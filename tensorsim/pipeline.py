@@ -214,14 +214,15 @@ class VideoToPose(nn.Module):
         told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
-        told = told & seen.any(dim=-1)
+        told = told & seen.any(dim=-1)  # less the frames that it does not believe
         joints = self.bone_fit(joints, seen & told.unsqueeze(-1), fps)
         # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
         # the pose that was found stands in for it, as long as the person is in the scene.
         in_scene = told.unsqueeze(-1).expand_as(seen)
         coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         joints = self.smoother(joints, in_scene & ~coasting, fps)
-        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid)
+        # Nobody is where no frame of a track shows a joint.
+        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & told.any(dim=-1, keepdim=True))
 
 
 class _AsPlaced(nn.Module):

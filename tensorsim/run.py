@@ -289,6 +289,8 @@ def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
     rows = []
     for person in range(pose.joints.shape[1]):
         frames = torch.nonzero(pose.valid[0, person]).flatten()
+        if frames.numel() == 0:
+            continue  # a track on which no joint was seen
         torso = pose.joints[0, person, frames][:, [1, 8, 11]].double().mean(dim=1)
         duration_s = max(float(frames[-1] - frames[0]) / fps, 1 / fps)
         rows.append(

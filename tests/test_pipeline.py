@@ -13,6 +13,7 @@ from torch import Tensor
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
+from tensorsim.run import people_of
 from tensorsim.vision.topdown import FlipTest
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
@@ -192,6 +193,17 @@ def test_a_foot_alone_at_the_end_of_a_track_does_not_fold_the_body() -> None:
     assert (joints[0, 0, 16:, 8, 1].diff() > 0).all(), "goes on walking away"
 
 
+def test_a_track_that_shows_no_joint_is_nobody() -> None:
+    stage = pipeline().video_to_pose
+    whole = stage(film(*walker(20, FPS, 4.0, 0.5, 0.0)).unsqueeze(0), FPS)
+    tracks = ts.Tracks(whole.boxes, whole.valid, whole.valid)
+    pose = stage.lift(tracks, whole.keypoints, 0.2 * whole.keypoint_scores, 240, 320, FPS)
+    assert not pose.valid.any()
+    assert torch.isfinite(pose.joints).all()
+    assert people_of(pose, FPS) == []
+    assert people_of(whole, FPS)[0]["last_frame"] == 19
+
+
 def test_padded_frames_do_not_count() -> None:
     stage, clips = pipeline(), two_clips()
     padded = clips.clone()
@@ -311,9 +323,10 @@ def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
 
     detector = ts.vision.RTMDet.from_pretrained(shared_data / "weights" / "rtmdet_nano_person.onnx")
     network = ts.vision.HRNet(18).eval()
-    torch.nn.init.normal_(
-        network.final_layer.weight, std=0.3
-    )  # untrained: let some scores pass the threshold
+    # Untrained: let the scores pass the threshold, or nobody is there.
+    torch.nn.init.normal_(network.final_layer.weight, std=0.3)
+    assert network.final_layer.bias is not None
+    torch.nn.init.constant_(network.final_layer.bias, 1.0)
     radar = ts.RadarConfig.through_wall(prf_hz=4096.0)
     stage = VideoToDoppler(detector, network, radar=radar, snr_db=None).eval()
     ts.export.to_torchscript(stage, tmp_path / "sim.pt")
@@ -326,3 +339,4 @@ def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
         result = run_without_tensorsim(tmp_path / "sim.pt", (clip, reader.fps), tmp_path)
         assert_same(result, expected, atol=1e-4)
         assert expected.valid.shape[1] >= 1
+        assert expected.valid.any(dim=-1).all()

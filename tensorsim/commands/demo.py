@@ -139,8 +139,9 @@ class Demo(NetworkOptions, RadarOptions):
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         figures = likeness["doppler_time"]
+        people_found = int(pose.valid[0].any(1).sum())
         print(
-            f"{self.out}: {ACTIVITIES[activity]}, {pose.valid.shape[1]} people found; Doppler-time map from the film "
+            f"{self.out}: {ACTIVITIES[activity]}, {people_found} people found; Doppler-time map from the film "
             f"against that of the true motion: PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']}"
         )
 

@@ -113,7 +113,7 @@ class Simulate(NetworkOptions, RadarOptions):
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""
-        print(f"{self.out}: {pose.valid.shape[1]} people in {pose.valid.shape[2]} frames{shown}")
+        print(f"{self.out}: {int(pose.valid[0].any(1).sum())} people in {pose.valid.shape[2]} frames{shown}")
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""

@@ -72,7 +72,7 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, fl
     """
     if not persons:
         raise TensorsimError("evaluate_pose: got no people, expected some with labelled keypoints")
-    pose = network if isinstance(network, TopDownPose) else TopDownPose(network)
+    pose = _stage(network)
     found = [_find(pose, person.sample.image(), person.box)[0] for person in persons]
     labels = torch.from_numpy(np.stack([person.keypoints[:17] for person in persons]))
     points, known = labels[..., :2], labels[..., 2] > 0
@@ -102,7 +102,7 @@ def evaluate_cut(
         Shares of labelled keypoints with such a score: ``seen`` of those in the picture, ``ghosts`` of those beyond
         its edge. NaN where there are none.
     """
-    pose = network if isinstance(network, TopDownPose) else TopDownPose(network)
+    pose = _stage(network)
     inside, beyond = [torch.zeros(0)], [torch.zeros(0)]
     for index, person in enumerate(persons):
         generator = np.random.default_rng((seed, index))
@@ -116,11 +116,17 @@ def evaluate_cut(
     return {"seen": float(torch.cat(inside).mean()), "ghosts": float(torch.cat(beyond).mean())}
 
 
+def _stage(network: nn.Module) -> TopDownPose:
+    """The network as the pipeline has it, all of it on the device of its parameters."""
+    device = next(iter(network.parameters()), torch.zeros(0)).device
+    return (network if isinstance(network, TopDownPose) else TopDownPose(network)).to(device)
+
+
 def _find(pose: TopDownPose, picture: Picture, box: Floats) -> tuple[Tensor, Tensor]:
     """Keypoints (17, 2) and scores (17,) of the person in a box of a picture, on the CPU."""
     device = next(iter(pose.parameters()), torch.zeros(0)).device
     image = torch.from_numpy(picture).permute(2, 0, 1)[None].to(device)
     boxes = torch.from_numpy(box)[None, None].to(device)
     with torch.no_grad():
-        points, scores = pose.to(device)(image, boxes, torch.ones(1, 1, dtype=torch.bool, device=device))
+        points, scores = pose(image, boxes, torch.ones(1, 1, dtype=torch.bool, device=device))
     return points[0, 0].cpu(), scores[0, 0].cpu()
