@@ -3,6 +3,11 @@
 The checks compile under TorchScript, so a scripted graph refuses the same inputs with the same words.
 """
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -60,7 +65,34 @@ def check_finite(x: Tensor, name: str) -> None:
         raise TensorsimError(f"{name}: got NaN or infinite values, expected finite numbers")
 
 
+def check_complex_map(x: Tensor, name: str, layout: str) -> None:
+    """Refuse anything but complex (..., M, columns) with something in it."""
+    check_min_rank(x, 2, name, layout)
+    if not x.is_complex():
+        raise TensorsimError(f"{name}: got dtype {x.dtype}, expected a complex tensor")
+    if x.numel() == 0:
+        raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout} without empty dimensions")
+
+
 def check_positive(value: float, name: str) -> None:
     """Refuse a number that is not finite and above zero."""
     if not (value > 0.0 and value < float("inf")):
         raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """The messages of tensorsim's own warnings in the block, each once; other warnings pass through."""
+    messages: list[str] = []
+    show = warnings.showwarning
+
+    def collect(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if not issubclass(category, TensorsimWarning):
+            show(message, category, *rest, **more)
+        elif str(message) not in messages:
+            messages.append(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", TensorsimWarning)
+        warnings.showwarning = collect
+        yield messages

@@ -2,7 +2,7 @@
 
 Each class is one ``nn.Module`` made of the stages beside it; every stage can be replaced by another with the
 same interface. ``forward`` works on whole clips in memory and scripts; the methods it is made of are public so
-that a long film can be streamed through them piece by piece (see ``tensorsim.run``).
+that a long film can be streamed through them piece by piece (see ``tensorsim.streaming``).
 """
 
 import os
@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import coco_to_body
 from tensorsim.config import CameraConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive, check_rank, check_size
 from tensorsim.motion.resample import PoseResampler
@@ -21,17 +22,16 @@ from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
-from tensorsim.vision.along_time import brief_gaps
-from tensorsim.vision.cpm import CPM
-from tensorsim.vision.hrnet import HRNet
-from tensorsim.vision.kalman import KalmanSmoother
-from tensorsim.vision.lifter import NearestPoseLifter
-from tensorsim.vision.metric_pose import MetricPose
-from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
-from tensorsim.vision.rtmdet import RTMDet
-from tensorsim.vision.skeleton import coco_to_body
-from tensorsim.vision.topdown import TopDownPose
-from tensorsim.vision.tracker import GNNTracker
+from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.pose2d.cpm import CPM
+from tensorsim.vision.pose2d.hrnet import HRNet
+from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.topdown import TopDownPose
+from tensorsim.vision.smoothing.along_time import brief_gaps
+from tensorsim.vision.smoothing.kalman import KalmanSmoother
+from tensorsim.vision.tracking.tracker import GNNTracker
 
 
 class VideoToPose(nn.Module):
@@ -52,7 +52,7 @@ class VideoToPose(nn.Module):
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages.
-        bone_fit: a :class:`~tensorsim.vision.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
+        bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
             keypoints that are exact; None leaves it out.
 
     Raises:
@@ -226,7 +226,7 @@ class VideoToPose(nn.Module):
 
 
 class _AsPlaced(nn.Module):
-    """No :class:`~tensorsim.vision.bone_fit.BoneFit`."""
+    """No :class:`~tensorsim.vision.lifting.bone_fit.BoneFit`."""
 
     def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
         return joints

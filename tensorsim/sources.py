@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from tensorsim import run
 from tensorsim.config import CameraConfig
-from tensorsim.data.camera import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.pipeline import VideoToPose
+from tensorsim.streaming import pose_of_film
 from tensorsim.types import Pose, Tracks
-from tensorsim.vision.along_time import nearest_valid
+from tensorsim.vision.smoothing.along_time import nearest_valid
 
 #: Size of the picture on which people without a film are drawn, and its grey.
 CANVAS = (360, 640)
@@ -65,7 +65,7 @@ def film_source(reader: VideoReader, stage: VideoToPose, device: torch.device) -
         "video",
         reader.fps,
         reader.frame_count,
-        lambda quiet: run.pose_of_film(stage, reader, device, quiet),
+        lambda quiet: pose_of_film(stage, reader, device, quiet),
         lambda: reader.chunks(8),
         stage.keypoint_threshold,
         {},

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import tensorsim as ts
-from tensorsim import cli, run
+from tensorsim import cli, streaming
 from tensorsim.commands import simulate
 from tensorsim.commands.options import RadarOptions
 from tensorsim.data.video import VideoReader
@@ -66,7 +66,7 @@ def test_streaming_equals_the_graph(walk: Path) -> None:
     stage = VideoToPose(RectangleDetector(), StandingPose(), frames_per_batch=3)
     whole = torch.cat(list(reader.chunks(100)))
     with torch.no_grad():
-        streamed = run.pose_of_film(stage, reader, torch.device("cpu"), quiet=True)
+        streamed = streaming.pose_of_film(stage, reader, torch.device("cpu"), quiet=True)
         assert_same(streamed, stage(whole.unsqueeze(0), reader.fps), atol=1e-5)
         smoother = ts.motion.SavitzkyGolay(33, 3)
         for options in (
@@ -75,7 +75,7 @@ def test_streaming_equals_the_graph(walk: Path) -> None:
         ):
             radar = ts.radar.RadarSimulator(ts.RadarConfig.through_wall(), snr_db=None)
             maps_stage = PoseToDoppler(radar, **options)  # type: ignore[arg-type]
-            maps = run.maps_of_pose(maps_stage, streamed, reader.fps, torch.device("cpu"), quiet=True)
+            maps = streaming.maps_of_pose(maps_stage, streamed, reader.fps, torch.device("cpu"), quiet=True)
             expected = maps_stage(streamed.joints, streamed.valid, reader.fps)
             assert_same(maps, [f[0] for f in expected], atol=1e-5)
 
@@ -176,7 +176,10 @@ def test_the_seed_repeats_the_noise(walk: Path, tmp_path: Path, stand_ins: list[
     assert not np.array_equal(maps[0], maps[2])
 
 
-@pytest.mark.parametrize("moment", ["pose_of_film", "maps_of_pose", "write_overlay"])
+@pytest.mark.parametrize(
+    "moment",
+    ["tensorsim.sources.pose_of_film", "tensorsim.results.maps_of_pose", "tensorsim.results.write_overlay"],
+)
 def test_an_interrupt_leaves_nothing_half_written(
     walk: Path,
     tmp_path: Path,
@@ -188,7 +191,7 @@ def test_an_interrupt_leaves_nothing_half_written(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, moment, interrupt)
+    monkeypatch.setattr(moment, interrupt)
     out = tmp_path / "results" / "out"
     with pytest.raises(SystemExit) as exit_:
         cli.main(["simulate", str(walk), "--out", str(out), *stand_ins])

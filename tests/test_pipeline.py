@@ -13,8 +13,8 @@ from torch import Tensor
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
-from tensorsim.run import people_of
-from tensorsim.vision.topdown import FlipTest
+from tensorsim.results import people_of
+from tensorsim.vision.pose2d.topdown import FlipTest
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
 

@@ -189,7 +189,7 @@ def test_at_most_one_default_per_network() -> None:
 
 
 def test_input_size_travels_with_the_weights(tmp_path: Path) -> None:
-    from tensorsim.vision.hrnet import HRNetConfig
+    from tensorsim.vision.pose2d.hrnet import HRNetConfig
 
     config = HRNetConfig(width=4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4)
     path = tmp_path / "small.safetensors"

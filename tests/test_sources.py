@@ -11,9 +11,9 @@ import torch
 from torch import nn
 
 import tensorsim as ts
-from tensorsim.data.camera import camera_on, seen_keypoints
 from tensorsim.data.video import VideoReader, write_video
 from tensorsim.errors import TensorsimError
+from tensorsim.geometry.framing import camera_on, seen_keypoints
 from tensorsim.sources import CANVAS, NEAREST_M, Cut, keypoint_source, kind_of, motion_source
 from tests.bvh import write_bvh
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from tensorsim.data.render import RenderedVideo
+    from tensorsim.render.renderer import RenderedVideo
     from tensorsim.types import Pose
 
 FILM_FPS = 30.0
@@ -56,21 +56,22 @@ class Demo(NetworkOptions, RadarOptions):
         import numpy as np
         import torch
 
-        from tensorsim import run
+        from tensorsim import results
         from tensorsim.config import ACTIVITIES
-        from tensorsim.data.camera import camera_on
-        from tensorsim.data.render import PersonRenderer
         from tensorsim.data.video import VideoReader, write_video
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
+        from tensorsim.geometry.framing import camera_on
         from tensorsim.motion.activities import ActivityGenerator
         from tensorsim.motion.people import PeopleConfig
         from tensorsim.pipeline import VideoToPose
+        from tensorsim.render.renderer import PersonRenderer
         from tensorsim.sources import drawn_by, film_source
-        from tensorsim.vision.kalman import KalmanSmoother
+        from tensorsim.streaming import maps_of_pose
+        from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
         device = usable_device(self.device)
-        with run.collected_warnings() as messages, torch.inference_mode():
+        with collected_warnings() as messages, torch.inference_mode():
             networks = load_networks(detector, pose_network, self.flip_test)
             maps_stage = self.pose_to_doppler(scene, self.duration).to(device).eval()
             true_stage = (
@@ -102,16 +103,16 @@ class Demo(NetworkOptions, RadarOptions):
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people.to(device).eval(), device)
-                pose, maps = run.simulate(source, maps_stage, folder, self.seed, device, self.quiet)
+                pose, maps = results.simulate(source, maps_stage, folder, self.seed, device, self.quiet)
                 torch.manual_seed(self.seed)
-                true_maps = run.maps_of_pose(
+                true_maps = maps_of_pose(
                     true_stage,
                     true_pose(truth.joints, truth.valid),
                     FILM_FPS * MOMENTS_PER_FRAME,
                     device,
                     self.quiet,
                 )
-                run.write_maps(folder, maps, run.axes_of(maps_stage, maps), true_maps)
+                results.write_maps(folder, maps, results.axes_of(maps_stage, maps), true_maps)
                 np.savez(
                     folder / "pose_truth.npz",
                     joints_m=film.joints.numpy(),
@@ -121,11 +122,11 @@ class Demo(NetworkOptions, RadarOptions):
                     valid=truth.valid[:, ::MOMENTS_PER_FRAME].numpy(),
                     fps=FILM_FPS,
                 )
-                likeness = run.similarity(maps, true_maps)
-                label = run.label_of(recognizer, maps)
+                likeness = results.similarity(maps, true_maps)
+                label = results.label_of(recognizer, maps)
                 summary = (
                     label
-                    | run.summary_of(source, scene, pose, maps, self.seed)
+                    | results.summary_of(source, scene, pose, maps, self.seed)
                     | {
                         "activity": ACTIVITIES[activity],
                         "person_height_m": round(height_m, 4),
@@ -135,7 +136,7 @@ class Demo(NetworkOptions, RadarOptions):
                         "warnings": messages,
                     }
                 )
-                run.write_summary(folder, summary)
+                results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         figures = likeness["doppler_time"]

@@ -32,7 +32,7 @@ class EvaluateDetector:
         from tensorsim.training.detector_metrics import compare_tracks, measure, tracks_of_film
         from tensorsim.training.pose_data import split
         from tensorsim.training.shards import Sample, Shards, find_shards, read_coco_folder
-        from tensorsim.vision.rtmdet import RTMDet
+        from tensorsim.vision.detection.rtmdet import RTMDet
 
         groups: dict[str, list[Sample]] = {}
         if self.data is not None:

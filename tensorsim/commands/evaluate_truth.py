@@ -57,11 +57,11 @@ class EvaluateTruth:
         elif self.detector is not None or self.pose is not None:
             raise TensorsimError("--detector, --pose: got them without setting c, which they are for")
 
+        from tensorsim.errors import collected_warnings
         from tensorsim.evaluation.report import markdown, save_pictures, write_csv
         from tensorsim.evaluation.settings import Pipelines
         from tensorsim.evaluation.truth import TruthLoop, example_maps
         from tensorsim.radar.presets import PRESETS
-        from tensorsim.run import collected_warnings
 
         loop = TruthLoop(
             self.out, self.clips, self.activities, self.motion, self.motion_fps, self.scenes, self.settings,

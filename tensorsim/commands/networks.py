@@ -54,6 +54,6 @@ def load_networks(detector: Path, pose: Path, flip_test: bool) -> tuple[Any, Any
         TensorsimError: files that are damaged, unsafe or of another network.
     """
     from tensorsim.pipeline import pretrained_pose
-    from tensorsim.vision.rtmdet import RTMDet
+    from tensorsim.vision.detection.rtmdet import RTMDet
 
     return RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test)

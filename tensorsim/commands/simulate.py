@@ -10,7 +10,7 @@ import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
     import torch
@@ -78,7 +78,7 @@ class Simulate(NetworkOptions, RadarOptions):
 
         import torch
 
-        from tensorsim import run
+        from tensorsim import results
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
         from tensorsim.sources import KINDS, kind_of
@@ -93,23 +93,23 @@ class Simulate(NetworkOptions, RadarOptions):
         scene = self.radar_scene()
         recognizer = self.recognizer(scene)
         device = usable_device(self.device)
-        with run.collected_warnings() as messages, torch.inference_mode():
+        with collected_warnings() as messages, torch.inference_mode():
             source, networks = self._source(kind, device)
             length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
             stage = self.pose_to_doppler(scene, length_s).to(device).eval()
             with complete_or_nothing(self.out) as folder:
-                pose, maps = run.simulate(source, stage, folder, self.seed, device, self.quiet)
-                run.write_maps(folder, maps, run.axes_of(stage, maps))
-                label = run.label_of(recognizer, maps)
+                pose, maps = results.simulate(source, stage, folder, self.seed, device, self.quiet)
+                results.write_maps(folder, maps, results.axes_of(stage, maps))
+                label = results.label_of(recognizer, maps)
                 summary = (
                     label
-                    | run.summary_of(source, scene, pose, maps, self.seed)
+                    | results.summary_of(source, scene, pose, maps, self.seed)
                     | {
                         "config": self.described() | networks,
                         "warnings": messages,
                     }
                 )
-                run.write_summary(folder, summary)
+                results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""
@@ -170,10 +170,10 @@ class Simulate(NetworkOptions, RadarOptions):
 
         from tensorsim.config import CameraConfig
         from tensorsim.pipeline import VideoToPose
-        from tensorsim.vision.kalman import KalmanSmoother
-        from tensorsim.vision.lifter import NearestPoseLifter
-        from tensorsim.vision.metric_pose import MetricPose
-        from tensorsim.vision.pose_library import load_pose_library
+        from tensorsim.vision.lifting.lifter import NearestPoseLifter
+        from tensorsim.vision.lifting.metric_pose import MetricPose
+        from tensorsim.vision.lifting.pose_library import load_pose_library
+        from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
         return VideoToPose(
             nn.Identity() if detector is None else detector,

@@ -35,7 +35,7 @@ class TrainDetector(PeopleOptions):
 
         from tensorsim.training.detector import DetectorRecipe, TrainedRTMDet, read_sources
         from tensorsim.training.detector_metrics import calibrate
-        from tensorsim.vision.rtmdet import RTMDet
+        from tensorsim.vision.detection.rtmdet import RTMDet
         from tensorsim.weights import save_weights
 
         check_positive(self.learning_rate, "--learning-rate")

@@ -38,7 +38,7 @@ class TrainPose(PeopleOptions):
         from tensorsim.training.pose import HELD_OUT_PERCENT, PoseRecipe
         from tensorsim.training.pose_data import RenderedPeople, people, split, upright
         from tensorsim.training.shards import Shards, find_shards
-        from tensorsim.vision.hrnet import HRNet, HRNetConfig
+        from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 
         check_positive(self.learning_rate, "--learning-rate")
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=500)

@@ -1,9 +1,9 @@
 """Video in, synthetic people, motion files, results out."""
 
-from tensorsim.data.camera import camera_on
 from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
-from tensorsim.data.render import PersonRenderer, RenderedVideo
 from tensorsim.data.video import VideoReader, write_video
+from tensorsim.geometry.framing import camera_on
+from tensorsim.render.renderer import PersonRenderer, RenderedVideo
 
 __all__ = [
     "Keypoints2D",

@@ -7,12 +7,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import body_height
 from tensorsim.config import ACTIVITIES
 from tensorsim.data.motion_files import Motion, load_motion, motion_keys, place
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator, activity_index
 from tensorsim.motion.resample import PoseResampler
-from tensorsim.vision.pose_library import body_height
 
 #: Length of the paper's clips.
 CLIP_S = 4.0

@@ -7,14 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import body_to_coco
 from tensorsim.config import CameraConfig
-from tensorsim.data.camera import keypoint_boxes
-from tensorsim.data.render import PersonRenderer
-from tensorsim.data.render_cast import View
 from tensorsim.evaluation.clips import Clip
 from tensorsim.files import complete_file
-from tensorsim.motion.body import body_to_coco
+from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
+from tensorsim.render.cast import View
+from tensorsim.render.renderer import PersonRenderer
 from tensorsim.types import Tracks
 
 #: Frame rate of the films.

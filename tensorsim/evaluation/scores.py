@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tensorsim.radar import metrics
+from tensorsim.radar.analysis import metrics
 from tensorsim.types import RadarMaps
 
 #: The three maps by their names in ``RadarMaps``, and how tables call them.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import Clip
 from tensorsim.evaluation.films import CAMERA, FPS, Filmed, Observed, project, true_keypoints
@@ -17,10 +18,10 @@ from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.presets import RadarScene
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import Lifted
-from tensorsim.vision.bone_fit import BoneFit
-from tensorsim.vision.kalman import KalmanSmoother
-from tensorsim.vision.lifter import NearestPoseLifter
-from tensorsim.vision.metric_pose import MetricPose, mid_hips
+from tensorsim.vision.lifting.bone_fit import BoneFit
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
 #: Columns per second of range-time maps that have more pulses than that.
 DISPLAY_RATE_HZ = 256.0

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captured_clips
 from tensorsim.evaluation.films import FPS, Filmed, filmed
@@ -22,7 +23,6 @@ from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
 from tensorsim.files import complete_file
 from tensorsim.radar.presets import PRESETS
-from tensorsim.vision.metric_pose import mid_hips
 
 #: What a trivial guess gets: nothing; the mean of the row's other clips; another clip of the row.
 GUESSES = ("empty", "mean", "shuffled")
@@ -237,7 +237,7 @@ def _cell(
 
 def _film(loop: TruthLoop, clip: Clip, networks: list[nn.Module]) -> Filmed:
     from tensorsim.pipeline import pretrained_pose
-    from tensorsim.vision.rtmdet import RTMDet
+    from tensorsim.vision.detection.rtmdet import RTMDet
 
     assert loop.detector is not None
     assert loop.pose is not None

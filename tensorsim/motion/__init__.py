@@ -1,7 +1,7 @@
 """Joints at video rate -> scatterers at pulse rate."""
 
+from tensorsim.body.skeleton import body_to_coco
 from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion
-from tensorsim.motion.body import body_to_coco
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import People, PeopleConfig

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tensorsim.motion.body import BodyPose
+from tensorsim.body.kinematics import BodyPose
 from tensorsim.motion.feet import tread
 from tensorsim.motion.people import People
 from tensorsim.motion.walking import Gait, boulic_gait, cycle_s

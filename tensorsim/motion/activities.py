@@ -7,17 +7,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tensorsim.body.kinematics import forward_kinematics, rotation
+from tensorsim.body.proportions import ANKLE_HEIGHT, FLESH, Proportions
+from tensorsim.body.skeleton import mirror
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.motion.act import Act
-from tensorsim.motion.body import (
-    ANKLE_HEIGHT,
-    FLESH,
-    Proportions,
-    forward_kinematics,
-    mirror,
-    rotation,
-)
 from tensorsim.motion.feet import LEFT_LEG, RIGHT_LEG, place_ankles
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.proportions import ANKLE_HEIGHT, SHANK, THIGH, TRUNK, UPPER_ARM
 from tensorsim.config import JOINTS, Vector
 from tensorsim.errors import TensorsimError, check_positive
-from tensorsim.motion.body import ANKLE_HEIGHT, SHANK, THIGH, TRUNK, UPPER_ARM
 from tensorsim.motion.scatterers import check_antenna, check_people, one_scene, weights
 
 #: From the ankle forward to the toes (a foot is 0.152 long).

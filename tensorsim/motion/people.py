@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tensorsim.body.proportions import Proportions
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import Proportions
 
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
 VARIED_NUMBERS = 24

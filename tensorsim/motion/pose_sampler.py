@@ -9,8 +9,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.body.proportions import Proportions
+from tensorsim.body.skeleton import mirror
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import BodyPose, Proportions, forward_kinematics, mirror
 
 _DEGREE = math.pi / 180
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from tensorsim.body.kinematics import BodyPose
 from tensorsim.motion.act import REST_HIP, REST_KNEE, SWING_LIFT, Act, Vary, make_pose, on_the_spot, with_gait
-from tensorsim.motion.body import BodyPose
 from tensorsim.motion.feet import tread
 from tensorsim.motion.people import People
 from tensorsim.motion.timing import bell, minimum_jerk, segment, toppling_angles, travel

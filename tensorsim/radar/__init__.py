@@ -1,15 +1,8 @@
 """Scatterers -> echo -> maps."""
 
-from tensorsim.radar import metrics
-from tensorsim.radar.antenna import CosineAntenna, TabulatedAntenna
-from tensorsim.radar.array import AngleMapper, AngleMaps, align_transmitters
-from tensorsim.radar.closed_form import RangeBinSynthesizer
-from tensorsim.radar.doppler import DopplerTimeMap, RangeDopplerVideo
-from tensorsim.radar.echo import EchoSynthesizer, SideChannels
-from tensorsim.radar.gait import BulkDopplerCompensation, CadenceVelocityDiagram
-from tensorsim.radar.gait_parameters import GaitEstimator, GaitParameters
-from tensorsim.radar.mti import MovingTargetIndicator
-from tensorsim.radar.noise import ReceiverNoise
+from tensorsim.radar.analysis import metrics
+from tensorsim.radar.analysis.gait import BulkDopplerCompensation, CadenceVelocityDiagram
+from tensorsim.radar.analysis.gait_parameters import GaitEstimator, GaitParameters
 from tensorsim.radar.presets import (
     PRESETS,
     RadarScene,
@@ -18,10 +11,17 @@ from tensorsim.radar.presets import (
     radar_scene,
     save_radar_yaml,
 )
-from tensorsim.radar.range_profile import FollowingGate, RangeProfile
-from tensorsim.radar.ridges import PathRidgeExtractor, RidgeExtractor
+from tensorsim.radar.processing.array import AngleMapper, AngleMaps, align_transmitters
+from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo
+from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
+from tensorsim.radar.processing.ridges import PathRidgeExtractor, RidgeExtractor
+from tensorsim.radar.processing.synchrosqueeze import SynchrosqueezedMap
 from tensorsim.radar.simulator import RadarSimulator
-from tensorsim.radar.synchrosqueeze import SynchrosqueezedMap
+from tensorsim.radar.synthesis.antenna import CosineAntenna, TabulatedAntenna
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer, SideChannels
+from tensorsim.radar.synthesis.noise import ReceiverNoise
 
 __all__ = [
     "PRESETS",

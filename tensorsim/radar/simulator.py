@@ -8,16 +8,17 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, check_positive, is_exporting
-from tensorsim.radar.ambiguity import SpeedCheck, check_unambiguous
-from tensorsim.radar.closed_form import RangeBinSynthesizer
-from tensorsim.radar.columns import Columns, block_rms, join_pulses
-from tensorsim.radar.doppler import DopplerTimeMap
-from tensorsim.radar.echo import EchoSynthesizer, check_scene
-from tensorsim.radar.engines import RangeBinEngine, TimeEngine
-from tensorsim.radar.mti import MovingTargetIndicator
-from tensorsim.radar.noise import ProfileNoise, ReceiverNoise, decibels
-from tensorsim.radar.range_profile import FollowingGate, RangeProfile, flatten_batch, unflatten_batch
-from tensorsim.radar.ridges import RidgeExtractor, Ridges
+from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.radar.processing.ambiguity import SpeedCheck, check_unambiguous
+from tensorsim.radar.processing.columns import Columns, block_rms, join_pulses
+from tensorsim.radar.processing.doppler import DopplerTimeMap
+from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
+from tensorsim.radar.processing.ridges import RidgeExtractor, Ridges
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer, check_scene
+from tensorsim.radar.synthesis.engines import RangeBinEngine, TimeEngine
+from tensorsim.radar.synthesis.noise import ProfileNoise, ReceiverNoise, decibels
 from tensorsim.types import RadarMaps
 
 #: ``source(start, stop)`` gives pulses start to stop of a scene: positions (stop - start, S, 3) and RCS.
@@ -59,32 +60,32 @@ class RadarSimulator(nn.Module):
 
     The IF is never held whole: it is made and turned into profiles ``pulse_chunk`` pulses at a time. The profiles
     are, since the noise in them is set by the mean power of the clip; it is drawn where they are, with the
-    covariance that windowed white noise has there (:class:`~tensorsim.radar.noise.ProfileNoise`). ``stream`` takes
-    clips of any length without holding their profiles, and makes them twice for it; ``doppler_time`` makes that map
-    alone, for data sets: fastest with ``engine="range-bins"``, few ``near_bins`` and a ``range_gate_m``.
+    covariance that windowed white noise has there (:class:`~tensorsim.radar.synthesis.noise.ProfileNoise`). ``stream``
+    takes clips of any length without holding their profiles, and makes them twice for it; ``doppler_time`` makes
+    that map alone, for data sets: fastest with ``engine="range-bins"``, few ``near_bins`` and a ``range_gate_m``.
 
     Args:
         radar: the radar.
         wall: a wall in the scene.
-        scene: all other arguments of an :class:`~tensorsim.radar.echo.EchoSynthesizer`, by name: ``multipath``,
+        scene: all other arguments of an :class:`~tensorsim.radar.EchoSynthesizer`, by name: ``multipath``,
             ``leakage``, ``wall_echo``, ``incidence``, ``floor``, ...
         echo: a ready one, in place of the wall and the scene.
         engine: ``"time"`` makes the IF and transforms it; ``"range-bins"`` makes the bins in closed form, see
-            :class:`~tensorsim.radar.closed_form.RangeBinSynthesizer`. The maps are the same.
+            :class:`~tensorsim.radar.RangeBinSynthesizer`. The maps are the same.
         near_bins: for ``"range-bins"``: only bins within this many of each path. Faster; its error is
             ``simulator.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann).
         range_gate_m: (nearest, farthest) metres: the maps have these bins only. One number is the width of a
             gate that follows the targets after the moving target indicator, see
-            :class:`~tensorsim.radar.range_profile.FollowingGate`. None keeps all bins.
-        snr_db, noise_reference: see :class:`~tensorsim.radar.noise.ReceiverNoise`; a scene without echo gets
+            :class:`~tensorsim.radar.FollowingGate`. None keeps all bins.
+        snr_db, noise_reference: see :class:`~tensorsim.radar.ReceiverNoise`; a scene without echo gets
             the noise of one with a target of 1 m^2 at 3 m in free space. ``"absolute"`` takes the bandwidth
             from the sample rate.
         noise_figure_db, transmit_power_w: for ``noise_reference="absolute"``.
-        range_window: see :class:`~tensorsim.radar.range_profile.RangeProfile`.
-        mti: the method of a :class:`~tensorsim.radar.mti.MovingTargetIndicator`, or a ready one.
-        window_s, overlap, integration: see :class:`~tensorsim.radar.doppler.DopplerTimeMap`.
+        range_window: see :class:`~tensorsim.radar.RangeProfile`.
+        mti: the method of a :class:`~tensorsim.radar.MovingTargetIndicator`, or a ready one.
+        window_s, overlap, integration: see :class:`~tensorsim.radar.DopplerTimeMap`.
         doppler: a ready one; the three arguments above then have no effect.
-        ridge_count: see :class:`~tensorsim.radar.ridges.RidgeExtractor`.
+        ridge_count: see :class:`~tensorsim.radar.RidgeExtractor`.
         ridges: a ready one, in place of ``ridge_count``.
         pulse_chunk: pulses worked on at a time, over all clips of a batch. Noise is drawn for a few chunks at
             once, so with one seed another chunk is another realisation.
@@ -101,7 +102,7 @@ class RadarSimulator(nn.Module):
 
     Raises:
         TensorsimError: see the stages; a clip shorter than ``min_pulses``; motion that the PRF cannot follow
-            (eager only, like its warning; see :class:`~tensorsim.radar.ambiguity.SpeedCheck`).
+            (eager only, like its warning; see :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
     """
 
     def __init__(

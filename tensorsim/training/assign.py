@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tensorsim.vision.detection import box_area, box_iou
+from tensorsim.geometry.boxes import box_area, box_iou
 
 #: Objects get as many cells as the sum of their best overlaps, of at most this many cells.
 MOST_CELLS = 13

@@ -18,13 +18,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from tensorsim.body.kinematics import rest_on_floor, rotation
 from tensorsim.config import CameraConfig
-from tensorsim.data.render import PersonRenderer
-from tensorsim.data.render_cast import camera_axes
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
-from tensorsim.motion.body import rest_on_floor, rotation
+from tensorsim.geometry.camera import camera_to_world
 from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.render.renderer import PersonRenderer
 
 #: Rendered this many times larger than kept, so that outlines have soft edges.
 OVERSAMPLING = 2
@@ -101,7 +101,7 @@ def render_cutout(pose: Tensor, seed: int, side: int = 288) -> Cutout:
     camera = CameraConfig(position_m=position, pitch_rad=pitch)
     pixels = side * OVERSAMPLING
     # The focal length and the principal point that make joints, with flesh around them, fill the picture.
-    x, y, z = ((joints - joints.new_tensor(position)) @ camera_axes(camera, joints).T).unbind(-1)
+    x, y, z = ((joints - joints.new_tensor(position)) @ camera_to_world(camera)[:, :3].to(joints)).unbind(-1)
     low, high = torch.stack([x / z, y / z], dim=-1).aminmax(dim=0)
     flesh = 0.17 * height / 1.75 / distance
     focal = pixels / float((high - low).max() + 2 * flesh)

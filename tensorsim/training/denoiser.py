@@ -23,10 +23,10 @@ from tensorsim.files import complete_file
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers
-from tensorsim.radar.columns import block_rms
-from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.maps import SCENES, one_person_many_ways
 from tensorsim.types import RadarMaps

@@ -8,10 +8,10 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
 from tensorsim.enhance.ksvd import ksvd_denoise
-from tensorsim.radar.doppler import DopplerFrames
-from tensorsim.radar.metrics import envelope_rmse, level_envelope, psnr
+from tensorsim.radar.analysis.metrics import envelope_rmse, level_envelope, psnr
 from tensorsim.radar.presets import PRESETS
-from tensorsim.radar.ridges import RidgeExtractor
+from tensorsim.radar.processing.doppler import DopplerFrames
+from tensorsim.radar.processing.ridges import RidgeExtractor
 from tensorsim.training.denoiser import simulate_pair
 
 #: PSNR of magnitudes over their peak; of decibels cut off 40 dB below it; speed errors of Doppler-time maps.

@@ -10,13 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.geometry.boxes import distances_to_boxes
 from tensorsim.training.assign import detection_losses
 from tensorsim.training.detector_data import PictureMaker, Sources
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.pose_data import lean_deg, split
 from tensorsim.training.shards import Sample, Shards, find_shards
-from tensorsim.vision.detection import distances_to_boxes
-from tensorsim.vision.rtmdet import RTMDet
+from tensorsim.vision.detection.rtmdet import RTMDet
 
 #: Of the COCO pictures, never trained on.
 HELD_OUT_PERCENT = 20

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
+from tensorsim.geometry.boxes import box_iou
 from tensorsim.training.shards import Sample
 from tensorsim.types import Detections, Tracks
-from tensorsim.vision.detection import box_iou
-from tensorsim.vision.rtmdet import RTMDet
-from tensorsim.vision.tracker import GNNTracker
+from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.tracking.tracker import GNNTracker
 
 
 def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> dict[str, float]:

@@ -20,7 +20,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import Clip, activity_clips
 from tensorsim.evaluation.films import FPS, Observed, filmed, project
-from tensorsim.vision.topdown import MIRRORED
+from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Frames of a piece and from one to the next; frames of a piece that are compared.
 _PIECE, _STEP, _COMPARED = 12, 6, (0, 4, 8, 11)

@@ -15,13 +15,13 @@ from tensorsim.evaluation.films import CAMERA, FPS
 from tensorsim.evaluation.settings import Pipelines, Setting
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
-from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.training.film_errors import FilmErrors, activity_told, films_of
-from tensorsim.vision.lifter import NearestPoseLifter
-from tensorsim.vision.metric_pose import MetricPose
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
 
 
 class FilmLoss:

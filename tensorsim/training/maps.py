@@ -30,13 +30,13 @@ from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
-from tensorsim.radar.closed_form import RangeBinSynthesizer
-from tensorsim.radar.doppler import DopplerFrames
-from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.mti import MovingTargetIndicator
-from tensorsim.radar.noise import mean_power
 from tensorsim.radar.presets import PRESETS
-from tensorsim.radar.range_profile import RangeProfile
+from tensorsim.radar.processing.doppler import DopplerFrames
+from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
+from tensorsim.radar.synthesis.noise import mean_power
 from tensorsim.recognition.map_image import MapToImage
 from tensorsim.training.film_errors import FilmErrors
 from tensorsim.training.film_maps import FilmLoss

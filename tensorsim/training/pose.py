@@ -19,8 +19,8 @@ from tensorsim.errors import TensorsimError
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople, crop_person, lean_deg
 from tensorsim.training.pose_metrics import evaluate_pose
-from tensorsim.vision.hrnet import HRNet
-from tensorsim.vision.topdown import MIRRORED
+from tensorsim.vision.pose2d.hrnet import HRNet
+from tensorsim.vision.pose2d.topdown import MIRRORED
 
 STRIDE = 4  # crop pixels per heat-map pixel
 #: Share of the pictures of each source that are never trained on, see :func:`tensorsim.training.pose_data.split`.
@@ -30,7 +30,7 @@ HELD_OUT_PERCENT = {"coco_small": 15, "lspet": 3}
 def gaussian_maps(points: Tensor, size: tuple[int, int], sigma: float) -> Tensor:
     """Heat maps (..., h, w) with a Gaussian of peak 1 and this sigma, in map pixels, at points (..., 2) of the maps.
 
-    The peak is where the point is, between the pixels (as DARK has it, :mod:`tensorsim.vision.heatmaps`).
+    The peak is where the point is, between the pixels (as DARK has it, :mod:`tensorsim.vision.pose2d.heatmaps`).
     """
     v = torch.arange(size[0], dtype=points.dtype, device=points.device)
     u = torch.arange(size[1], dtype=points.dtype, device=points.device)
@@ -89,7 +89,7 @@ def person_loss(
 
 
 class PoseRecipe(Recipe):
-    """Train :class:`~tensorsim.vision.hrnet.HRNet` on people from three sources.
+    """Train :class:`~tensorsim.vision.HRNet` on people from three sources.
 
     Args:
         net: the network, for crops of its ``input_size``.

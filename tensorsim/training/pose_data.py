@@ -1,7 +1,7 @@
 """Crops of people to train a pose network on: labelled pictures and rendered people, turned, scaled and mirrored.
 
-Crops follow :mod:`tensorsim.vision.crops`: pixel centres at integers, and without augmentation a crop is the one
-that :class:`~tensorsim.vision.crops.BoxCrop` gives for the person's box.
+Crops follow :mod:`tensorsim.vision.pose2d.crops`: pixel centres at integers, and without augmentation a crop is the one
+that :class:`~tensorsim.vision.pose2d.crops.BoxCrop` gives for the person's box.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.shards import Floats, Sample
-from tensorsim.vision.topdown import MIRRORED
+from tensorsim.vision.pose2d.topdown import MIRRORED
 
 Picture = npt.NDArray[np.uint8]
 Doubles = npt.NDArray[np.float64]

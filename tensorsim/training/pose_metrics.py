@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.training.pose_data import Person, Picture, cut_picture
 from tensorsim.training.shards import Floats
-from tensorsim.vision.topdown import TopDownPose
+from tensorsim.vision.pose2d.topdown import TopDownPose
 
 _FACE = (0.026, 0.025, 0.025, 0.035, 0.035)
 _ARMS = (0.079, 0.079, 0.072, 0.072, 0.062, 0.062)
@@ -60,8 +60,8 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, fl
     """Find the keypoints of people in their boxes, as the pipeline does, and compare with the labels.
 
     Args:
-        network: a :class:`~tensorsim.vision.topdown.TopDownPose`, or crops to heat maps, as
-            :class:`~tensorsim.vision.hrnet.HRNet`; in evaluation mode.
+        network: a :class:`~tensorsim.vision.TopDownPose`, or crops to heat maps, as
+            :class:`~tensorsim.vision.HRNet`; in evaluation mode.
         persons: whom to look for.
 
     Returns:

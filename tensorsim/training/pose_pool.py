@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import mirror
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.motion.activities import ActivityGenerator
-from tensorsim.motion.body import mirror
 from tensorsim.motion.people import PeopleConfig
 from tensorsim.motion.pose_sampler import sample_poses
-from tensorsim.vision.pose_library import standardise_poses, turn
+from tensorsim.vision.lifting.pose_library import standardise_poses, turn
 
 #: Standard deviation of the lengths of segments in generated pools, as a share of them: skeletons that people
 #: and networks draw differ by more than bodies do.

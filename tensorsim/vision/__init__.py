@@ -1,16 +1,16 @@
 """Frames -> metric 3D joints at video rate."""
 
-from tensorsim.vision.cpm import CPM
-from tensorsim.vision.hrnet import HRNet
-from tensorsim.vision.kalman import KalmanSmoother
-from tensorsim.vision.lifter import NearestPoseLifter
-from tensorsim.vision.metric_pose import MetricPose
-from tensorsim.vision.onnx_heatmaps import OnnxHeatmaps
-from tensorsim.vision.rtmdet import RTMDet
-from tensorsim.vision.skeleton import coco_to_body
-from tensorsim.vision.topdown import TopDownPose
-from tensorsim.vision.tracker import GNNTracker
-from tensorsim.vision.videopose3d import VideoPose3D
+from tensorsim.body.skeleton import coco_to_body
+from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.videopose3d import VideoPose3D
+from tensorsim.vision.pose2d.cpm import CPM
+from tensorsim.vision.pose2d.hrnet import HRNet
+from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.topdown import TopDownPose
+from tensorsim.vision.smoothing.kalman import KalmanSmoother
+from tensorsim.vision.tracking.tracker import GNNTracker
 
 __all__ = [
     "CPM",

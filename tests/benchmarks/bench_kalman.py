@@ -6,9 +6,9 @@ python -m tests.benchmarks.bench_kalman
 import numpy as np
 import torch
 
-from tensorsim.vision.kalman import KalmanSmoother
+from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tests.benchmarks.timing import medians, seconds
-from tests.vision.test_kalman import by_filterpy
+from tests.vision.smoothing.test_kalman import by_filterpy
 
 CLIPS, FRAMES, JOINTS, FPS = 64, 120, 14, 30.0
 NOISE = {"process_noise": 0.001, "measurement_noise": 0.01}

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.pose_sampler import sample_poses
-from tensorsim.vision.pose_library import all_headings, standardise_poses
-from tensorsim.vision.pose_search import PoseSearch, seen_along_depth
+from tensorsim.vision.lifting.pose_library import all_headings, standardise_poses
+from tensorsim.vision.lifting.pose_search import PoseSearch, seen_along_depth
 from tests.benchmarks.timing import medians, seconds
 
 try:

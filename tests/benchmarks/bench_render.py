@@ -7,8 +7,8 @@ import time
 
 import torch
 
-from tensorsim.data.render import PersonRenderer
-from tensorsim.motion.body import BodyPose, forward_kinematics
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.render.renderer import PersonRenderer
 
 FRAMES = 120
 

@@ -13,8 +13,8 @@ import numpy as np
 import onnxruntime
 import torch
 
-from tensorsim.vision.detection import letterbox_size, non_maximum_suppression
-from tensorsim.vision.rtmdet import RTMDet
+from tensorsim.geometry.boxes import letterbox_size, non_maximum_suppression
+from tensorsim.vision.detection.rtmdet import RTMDet
 from tests.benchmarks.timing import medians
 
 

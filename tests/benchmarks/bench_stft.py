@@ -11,7 +11,7 @@ from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 
 from tensorsim.config import RadarConfig
-from tensorsim.radar.doppler import DopplerTimeMap
+from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tests.benchmarks.timing import chosen_clock, host, medians
 
 ROUNDS = 7

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.training.pose_pool import facing_away, with_mirror_images, without_near_duplicates
-from tensorsim.vision.lifter import NearestPoseLifter
-from tensorsim.vision.pose_library import body_height, load_pose_library, mid_hip, standardise_poses, turn
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.pose_library import load_pose_library, standardise_poses, turn
 from tests.conftest import SHARED_DATA
 
 FRAMES, SIDES = 45, 8
@@ -54,7 +55,7 @@ def generated_clips(seed: int) -> dict[str, Tensor]:
 
 def film(joints: Tensor, side: int) -> tuple[Tensor, Tensor]:
     """Key points (T, 14, 2) in pixels and true joints (T, 14, 3) in metres relative to the hips."""
-    body = HEIGHT_M * (joints - mid_hip(joints)[:, None]) / body_height(joints).mean()
+    body = HEIGHT_M * (joints - mid_hips(joints)[:, None]) / body_height(joints).mean()
     body = turn(body, torch.full((len(body),), 2 * math.pi * side / SIDES))
     across = torch.stack([body[..., 0], -body[..., 2]], dim=-1)
     image = FOCAL_PX * across / (RANGE_M + body[..., 1])[..., None]
@@ -67,11 +68,11 @@ def judge(lifter: NearestPoseLifter, joints: Tensor) -> np.ndarray:
     films = [film(joints[:FRAMES], side) for side in range(SIDES)]
     image, true = (torch.stack(x) for x in zip(*films, strict=True))
     depth = HEIGHT_M * lifter(image, torch.ones(image.shape[:-1])).depth
-    depth = depth - mid_hip(depth[..., None])
+    depth = depth - mid_hips(depth[..., None])
     rays = torch.cat([image / FOCAL_PX, torch.ones_like(image[..., :1])], dim=-1)
     u, v, y = (rays * (RANGE_M + depth)[..., None]).unbind(-1)
     found = torch.stack([u, y - RANGE_M, -v], dim=-1)
-    found = found - mid_hip(found)[..., None, :]
+    found = found - mid_hips(found)[..., None, :]
     wrong = depth - true[..., 1]
     return 100 * np.array(
         [

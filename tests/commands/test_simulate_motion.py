@@ -11,7 +11,7 @@ import torch
 import tensorsim as ts
 from tensorsim import cli
 from tensorsim.commands.options import RadarOptions
-from tensorsim.data.camera import camera_on, seen_keypoints
+from tensorsim.geometry.framing import camera_on, seen_keypoints
 from tests.bvh import write_bvh
 from tests.test_cli import FILES
 from tests.test_sources import coco_json

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
 from tensorsim.data.motion_files import (
     H36M_JOINTS,
@@ -20,7 +21,6 @@ from tensorsim.data.motion_files import (
     place,
 )
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import BodyPose, forward_kinematics
 
 
 def walker(frames: int = 5) -> np.ndarray:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import coco_to_body, mid_hips
 from tensorsim.config import ACTIVITIES, RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation import films, report, settings, truth
@@ -19,8 +20,7 @@ from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, project, true
 from tensorsim.evaluation.scores import MAPS, Maps, compare, mean_maps
 from tensorsim.evaluation.settings import STAGES, Pipelines, Setting, true_lifting
 from tensorsim.radar.presets import PRESETS, RadarScene
-from tensorsim.vision.metric_pose import MetricPose, mid_hips
-from tensorsim.vision.skeleton import coco_to_body
+from tensorsim.vision.lifting.metric_pose import MetricPose
 from tests.film import RectangleDetector, StandingPose
 
 SCENE = "through-wall"

@@ -10,18 +10,19 @@ import torch
 from scipy.integrate import quad, solve_ivp
 from torch import Tensor
 
+from tensorsim.body import kinematics
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.body.proportions import Proportions
+from tensorsim.body.skeleton import body_to_coco, coco_to_body, mirror
 from tensorsim.config import ACTIVITIES, COCO_KEYPOINTS, JOINTS, RadarConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.motion import body
 from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion, activity_index, perform
-from tensorsim.motion.body import BodyPose, Proportions, body_to_coco, forward_kinematics, mirror
 from tensorsim.motion.feet import tread, two_bone_leg
 from tensorsim.motion.people import VARIED_NUMBERS, PeopleConfig, draw_people, nominal_people
 from tensorsim.motion.scatterers import JointScatterers
 from tensorsim.motion.scripts import SCRIPTS
 from tensorsim.motion.timing import bell, segment, toppling_angles, travel
 from tensorsim.radar.simulator import RadarSimulator
-from tensorsim.vision.skeleton import coco_to_body
 
 BONES = [
     ("head", "neck"),
@@ -73,8 +74,8 @@ def test_bones_keep_their_length() -> None:
 def test_nobody_sinks_or_floats() -> None:
     lowest = crowd().joints[..., 2].amin(dim=-1)
     assert float(lowest.min()) > 0
-    ankle_height = body.ANKLE_HEIGHT * crowd().people.height_m[:, None]
-    clearance = body.FLESH * crowd().people.height_m[:, None]
+    ankle_height = kinematics.ANKLE_HEIGHT * crowd().people.height_m[:, None]
+    clearance = kinematics.FLESH * crowd().people.height_m[:, None]
     assert float((lowest - ankle_height).min()) > -0.015
     assert float((lowest - clearance).max()) < 0.03  # between heel strike and heel off both ankles are up
 
@@ -113,13 +114,13 @@ def test_feet_on_their_way_are_in_the_air() -> None:
     joints, height = crowd().joints, crowd().people.height_m[:, None]
     for name in ("right_ankle", "left_ankle"):
         v = velocity(at(joints, name))
-        low = (at(joints, name)[:, 1:, 2] - body.ANKLE_HEIGHT * height).abs() < 0.006
+        low = (at(joints, name)[:, 1:, 2] - kinematics.ANKLE_HEIGHT * height).abs() < 0.006
         scuffs = v[..., :2].norm(dim=-1) * (low & (v[..., 2].abs() < 0.05))
         assert float(scuffs.max()) < 0.7
         # People who walk do lift their feet.
         walking = (
             at(joints, name)[crowd().activity == 7][..., 2]
-            - body.ANKLE_HEIGHT * height[crowd().activity == 7]
+            - kinematics.ANKLE_HEIGHT * height[crowd().activity == 7]
         )
         assert float(walking.amax(dim=-1).min()) > 0.1
 
@@ -354,7 +355,7 @@ def test_people_follow_their_distributions() -> None:
     assert math.pi / 6 - 0.01 < float(turned.abs().max()) <= math.pi / 6
     assert people.factor.shape == (4000, VARIED_NUMBERS)
     assert 0.149 < float((people.factor - 1).abs().max()) <= 0.15
-    thigh = torch.as_tensor(people.proportions.thigh) / body.THIGH
+    thigh = torch.as_tensor(people.proportions.thigh) / kinematics.THIGH
     assert float(thigh.std()) == pytest.approx(0.03, abs=0.003)
     shoulders = torch.as_tensor(people.proportions.half_shoulders)
     assert float(shoulders[people.female].mean()) < float(shoulders[~people.female].mean())

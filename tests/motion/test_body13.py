@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import JOINTS, RadarConfig
 from tensorsim.motion.activities import ActivityGenerator
-from tensorsim.motion.body import BodyPose, forward_kinematics
 from tensorsim.motion.body13 import NODES, Body13Scatterers
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers

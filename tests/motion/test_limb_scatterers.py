@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.kinematics import BodyPose, forward_kinematics, rest_on_floor, rotation
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import BodyPose, forward_kinematics, rest_on_floor, rotation
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers, bisector, ellipsoid_rcs
 from tests.stage import StageTester, assert_same
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from tensorsim.config import JOINT_RCS_M2, RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
-from tensorsim.radar.echo import EchoSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.stage import StageTester, assert_same
 
 

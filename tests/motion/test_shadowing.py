@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor, nn
 
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import BodyPose, forward_kinematics
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.scatterers import JointScatterers
 from tensorsim.motion.shadowing import Shadowing, segment_distance

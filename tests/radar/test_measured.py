@@ -8,10 +8,10 @@ import torch
 
 from tensorsim.config import JOINT_RCS_M2, JOINTS, RadarConfig
 from tensorsim.motion.resample import PoseResampler
-from tensorsim.radar.doppler import DopplerTimeMap
-from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.gait_parameters import GaitEstimator, GaitParameters
-from tensorsim.radar.range_profile import RangeProfile
+from tensorsim.radar.analysis.gait_parameters import GaitEstimator, GaitParameters
+from tensorsim.radar.processing.doppler import DopplerTimeMap
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 
 #: 24 GHz, 160 Hz per m/s. The measured radar does not sweep; a sweep of 10 MHz has range bins of 15 m.
 CW = RadarConfig(

@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 
 from tensorsim.config import WallConfig
-from tensorsim.radar.doppler import DopplerTimeMap
-from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.range_profile import RangeProfile
+from tensorsim.radar.processing.doppler import DopplerTimeMap
+from tensorsim.radar.processing.range_profile import RangeProfile
 from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.radar.scenes import SMALL, swinging
 
 few = settings(max_examples=8, deadline=None, derandomize=True)

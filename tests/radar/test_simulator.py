@@ -9,13 +9,13 @@ import torch
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.radar.ambiguity import check_unambiguous, radial_speed
-from tensorsim.radar.columns import block_rms
-from tensorsim.radar.doppler import DopplerTimeMap
-from tensorsim.radar.echo import EchoSynthesizer
-from tensorsim.radar.mti import MovingTargetIndicator
-from tensorsim.radar.ridges import RidgeExtractor
+from tensorsim.radar.processing.ambiguity import check_unambiguous, radial_speed
+from tensorsim.radar.processing.columns import block_rms
+from tensorsim.radar.processing.doppler import DopplerTimeMap
+from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.ridges import RidgeExtractor
 from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.radar import reference
 from tests.radar.scenes import SMALL, SceneCase, joint_rcs, recorded_walk, swinging, tensors
 from tests.stage import assert_same

@@ -24,8 +24,8 @@ from tensorsim.training.detector_metrics import (
 )
 from tensorsim.training.loop import LoopConfig, fit
 from tensorsim.types import Detections, Tracks
-from tensorsim.vision.rtmdet import RTMDet
-from tensorsim.vision.rtmdet_layers import RTMDET_SIZES, RTMDetSize
+from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.detection.rtmdet_layers import RTMDET_SIZES, RTMDetSize
 from tensorsim.weights import save_weights
 from tests.training.tars import write_tar
 from tests.training.test_detector_data import cutouts, encoded, shard

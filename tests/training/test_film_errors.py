@@ -8,7 +8,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip, activity_clips
 from tensorsim.evaluation.films import FPS, Observed, project
 from tensorsim.training.film_errors import FilmErrors, Look, Watched, watched_films
-from tensorsim.vision.topdown import MIRRORED
+from tensorsim.vision.pose2d.topdown import MIRRORED
 
 KICK, WALK = ActivityClip("S3 Kicking", "0", 2), ActivityClip("S8 Walking", "0", 7)
 

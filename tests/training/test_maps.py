@@ -11,8 +11,8 @@ from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip
 from tensorsim.evaluation.films import true_keypoints
 from tensorsim.motion.activities import ActivityGenerator
-from tensorsim.radar.echo import EchoSynthesizer
 from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.recognition.map_image import MapToImage, scaled
 from tensorsim.training.film_errors import FilmErrors, Watched
 from tensorsim.training.maps import (

@@ -14,9 +14,9 @@ from tensorsim.training.pose import PoseRecipe, gaussian_maps, heatmap_loss, per
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
 from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck
 from tensorsim.training.shards import Sample
-from tensorsim.vision.heatmaps import HeatmapDecoder
-from tensorsim.vision.hrnet import HRNet, HRNetConfig
-from tensorsim.vision.topdown import MIRRORED
+from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
+from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
+from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.training.test_pose_data import BOX, drawn, sample, standing, write_cutouts
 from tests.training.test_shards import jpg
 

@@ -23,8 +23,8 @@ from tensorsim.training.pose_data import (
     upright,
 )
 from tensorsim.training.shards import Sample
-from tensorsim.vision.crops import BoxCrop, crop_to_image
-from tensorsim.vision.topdown import MIRRORED
+from tensorsim.vision.pose2d.crops import BoxCrop, crop_to_image
+from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.training.tars import write_tar
 from tests.training.test_shards import jpg
 

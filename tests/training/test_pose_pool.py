@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file
 
 from tensorsim import cli
+from tensorsim.body.skeleton import body_height, mirror
 from tensorsim.commands.library import BuildLibrary
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.body import mirror
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.training.pose_pool import (
     facing_away,
@@ -22,8 +22,8 @@ from tensorsim.training.pose_pool import (
     with_mirror_images,
     without_near_duplicates,
 )
-from tensorsim.vision.lifter import NearestPoseLifter
-from tensorsim.vision.pose_library import body_height, load_pose_library, standardise_poses, turn
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.pose_library import load_pose_library, standardise_poses, turn
 
 
 def test_every_heading_of_a_pose_becomes_the_same() -> None:

@@ -1,0 +1,1 @@
+"""The body: its joints and bones, its proportions, and how it moves."""

@@ -1,0 +1,93 @@
+"""A camera that has everybody in its picture, and what it would see of them without anything in the way."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tensorsim.body.skeleton import body_to_coco
+from tensorsim.config import CameraConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.render.cast import NEAR_M, View
+
+#: A body reaches beyond its joints by so much, upwards from the nose and downwards from the ankles.
+_ABOVE_M, _BELOW_M = 0.25, 0.10
+#: Nobody is filmed through a longer lens than this, however small the motion.
+_NARROWEST_RAD = math.radians(40.0)
+
+
+def camera_on(
+    joints: Tensor,
+    valid: Tensor,
+    height: int,
+    width: int,
+    margin: float = 0.12,
+    position_m: tuple[float, float, float] = CameraConfig.position_m,
+) -> CameraConfig:
+    """A still camera turned, tilted and zoomed so that whole bodies stay in its picture.
+
+    Args:
+        joints: (P, T, 14, 3) world metres.
+        valid: (P, T) bool; who is not there need not be seen. Points beside or behind the camera are left out.
+        height, width: of the picture in pixels.
+        margin: free part of the half picture.
+        position_m: where it stands, by default at the radar.
+
+    Raises:
+        TensorsimError: nobody is ever in front of the camera.
+    """
+    bodies = joints[valid].double()
+    reach = bodies.new_tensor([[0.0, 0.0, _ABOVE_M], [0.0, 0.0, -_BELOW_M]])
+    points = torch.cat([bodies + reach[0], bodies + reach[1]]).flatten(0, -2) - bodies.new_tensor(position_m)
+    points = points[points[:, 1] > NEAR_M]
+    if points.numel() == 0:
+        raise TensorsimError(f"camera: got nobody in front of {position_m}, expected somebody at larger y")
+    yaw = _middle(torch.atan2(points[:, 0], points[:, 1]))
+    pitch = _middle(torch.atan2(points[:, 2], points[:, :2].norm(dim=-1)))
+    camera = CameraConfig(focal_px=1.0, center_px=(0.0, 0.0), pitch_rad=pitch, yaw_rad=yaw)
+    tangents, depth = View.of_camera(replace(camera, position_m=(0.0, 0.0, 0.0)), 1, 1, points).project(
+        points
+    )
+    u, v = tangents[depth > NEAR_M].abs().amax(dim=0).tolist()
+    half_width = max(u, v * width / height) / (1 - margin)
+    fov = max(2 * math.atan(half_width), _NARROWEST_RAD)
+    return CameraConfig(None, fov, None, position_m, pitch, yaw)
+
+
+def _middle(angle: Tensor) -> float:
+    return float(angle.amin() + angle.amax()) / 2
+
+
+def seen_keypoints(
+    joints: Tensor, valid: Tensor, camera: CameraConfig, height: int, width: int
+) -> tuple[Tensor, Tensor]:
+    """COCO keypoints of bodies that nothing hides.
+
+    Args:
+        joints: (..., 14, 3) world metres.
+        valid: (...) bool.
+        camera: the camera.
+        height, width: of the picture in pixels.
+
+    Returns:
+        (..., 17, 2) pixels and scores (..., 17): 1 in the picture, else 0. Who is not there is at 0 with score 0.
+    """
+    points = torch.where(valid[..., None, None], body_to_coco(joints), 0.0)
+    pixels, depth = View.of_camera(camera, height, width, joints).project(points)
+    inside = (pixels >= -0.5).all(dim=-1) & (pixels[..., 0] < width - 0.5) & (pixels[..., 1] < height - 0.5)
+    there = valid[..., None] & (depth > NEAR_M)
+    return torch.where(there[..., None], pixels, 0.0), (there & inside).to(joints.dtype)
+
+
+def keypoint_boxes(keypoints: Tensor, scores: Tensor, margin: float = 0.12) -> Tensor:
+    """Boxes (..., 4) ``xyxy`` about keypoints (..., 17, 2) with a score; zeros without any.
+
+    Keypoints lie inside of bodies: boxes are wider by ``margin`` of their longer side all around.
+    """
+    told = (scores > 0)[..., None]
+    low = torch.where(told, keypoints, math.inf).amin(dim=-2)
+    high = torch.where(told, keypoints, -math.inf).amax(dim=-2)
+    extra = margin * (high - low).amax(dim=-1, keepdim=True)
+    boxes = torch.cat([low - extra, high + extra], dim=-1)
+    return torch.where(told.any(dim=-2), boxes, 0.0)

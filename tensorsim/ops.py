@@ -1,0 +1,22 @@
+"""Tensor helpers that several rooms share; they script."""
+
+import torch
+from torch import Tensor
+
+
+def flatten_batch(x: Tensor, rank: int) -> Tensor:
+    """All dimensions before the last ``rank`` as one: (..., *) -> (B, *)."""
+    return x.flatten(0, -rank - 1) if x.dim() > rank else x.unsqueeze(0)
+
+
+def unflatten_batch(x: Tensor, lead: list[int]) -> Tensor:
+    """The inverse: (B, *) -> (*lead, *)."""
+    return x.reshape(lead + list(x.shape[1:]))
+
+
+def safe_sqrt(x: Tensor) -> Tensor:
+    """Square root whose gradient at 0 is 0 instead of infinite."""
+    if not x.requires_grad:
+        return x.sqrt()
+    positive = x > 0
+    return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)

@@ -1,0 +1,1 @@
+"""Intermediate-frequency signal -> range profiles, Doppler-time maps, ridges, angles."""

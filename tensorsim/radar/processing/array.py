@@ -1,0 +1,130 @@
+"""Angle of arrival: range-angle and azimuth-time maps of the channels of an array.
+
+A plane wave from the unit direction u reaches channel v, transmitter at p and receiver at q, ahead of the
+origin by ``u . (p + q) / c``, so that its beat signal has the phase ``-2 pi u . (p + q) / lambda``: the virtual
+element stands at ``p + q``. Maps are those of the conventional (Bartlett) beamformer ``w^H C w`` with the
+steering vector w and the covariance C of the channels (Van Trees, *Optimum Array Processing*, ch. 6).
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import RadarConfig
+from tensorsim.errors import TensorsimError, check_min_rank, check_size
+from tensorsim.radar.synthesis.paths import safe_sqrt
+
+
+class AngleMaps(NamedTuple):
+    """Where echoes come from; magnitudes, those of one channel for a single plane wave.
+
+    Attributes:
+        range_angle: (..., R, D) for D azimuths, root mean square over pulses.
+        azimuth_time: (..., D, M), root of the sum of squares over range bins.
+    """
+
+    range_angle: Tensor
+    azimuth_time: Tensor
+
+
+def steering_vectors(
+    channels_m: Tensor, azimuth_rad: Tensor, elevation_rad: float, wavelength_m: float
+) -> Tensor:
+    """Phase in cycles (D, V) of the beat signal of virtual elements (V, 3) for plane waves from D azimuths."""
+    level = math.cos(elevation_rad)
+    height = torch.full_like(azimuth_rad, math.sin(elevation_rad))
+    direction = torch.stack((azimuth_rad.sin() * level, azimuth_rad.cos() * level, height), -1)
+    return -(direction @ channels_m.T) / wavelength_m
+
+
+def beam_power(profiles: Tensor, cycles: Tensor) -> Tensor:
+    """``w^H C w`` of channels (..., V, X, Y) with steering phases (D, V): mean over Y -> (..., D, X)."""
+    angle = 2 * math.pi * cycles
+    weights = torch.complex(angle.cos(), angle.sin()).to(profiles.dtype) / cycles.shape[1]
+    series = profiles.movedim(-3, -2)  # (..., X, V, Y)
+    covariance = torch.matmul(series, series.mH) / series.shape[-1]
+    power = (torch.matmul(weights.conj(), covariance) * weights).sum(-1).real  # (..., X, D)
+    return power.clamp_min(0.0).transpose(-1, -2)
+
+
+def align_transmitters(profiles: Tensor, transmitters: int) -> Tensor:
+    """Profiles (..., V, M, R) of K transmitters in turn as if all had fired at the start of the pulse interval.
+
+    Transmitter k samples the motion k / K of an interval later than the first, which an angle estimator takes for
+    a direction. A linear phase over Doppler, ``exp(-j 2 pi f k / K)`` for f in [-1/2, 1/2) cycles per interval,
+    brings its pulses back: every Doppler at once, up to PRF / 2. Half a dozen pulses at either end, where the
+    transform takes the clip for periodic, stay wrong; so does the range walk within an interval. Differentiable.
+
+    Raises:
+        TensorsimError: real profiles, or a number of channels that is no multiple of the transmitters.
+    """
+    if not profiles.is_complex():
+        raise TensorsimError(f"profiles: got dtype {profiles.dtype}, expected a complex tensor")
+    check_min_rank(profiles, 3, "profiles", "(..., channels, pulses, range bins)")
+    channels = profiles.shape[-3]
+    if transmitters < 1 or channels % transmitters != 0:
+        raise TensorsimError(
+            f"profiles: got {channels} channels for {transmitters} transmitters, expected a multiple of them"
+        )
+    doppler = torch.fft.fftfreq(profiles.shape[-2], dtype=torch.float64, device=profiles.device)
+    turn = torch.arange(channels, device=profiles.device) // (channels // transmitters)
+    angle = (-2 * math.pi / transmitters) * turn.unsqueeze(-1) * doppler
+    shift = torch.polar(torch.ones_like(angle), angle).to(profiles.dtype).unsqueeze(-1)
+    return torch.fft.ifft(torch.fft.fft(profiles, dim=-2) * shift, dim=-2)
+
+
+class AngleMapper(nn.Module):
+    """Range-angle and azimuth-time maps of range profiles.
+
+    Args:
+        radar: the array; its channels in the order of the echo, ``v = k A + a``.
+        azimuth_rad: (D,) directions; 0 is +y, positive is to the right (+x).
+        elevation_rad: of all of them.
+
+    Shapes: profiles (..., V, M, R) complex -> :class:`AngleMaps`. Differentiable.
+
+    The wavelength is that of the centre of the sweep, whose phase a range profile keeps. Plane waves: ranges
+    large beside ``aperture^2 / lambda``. Transmitters in turn: a target at v m/s shifts the phase between
+    neighbours by ``4 pi v / (lambda K PRF)``, which is not taken out here: see :func:`align_transmitters`.
+
+    Attributes:
+        azimuth_rad: (D,).
+
+    Raises:
+        TensorsimError: a radar without an array; azimuths that are not a finite vector; profiles with another
+            number of channels, or real ones.
+    """
+
+    azimuth_rad: Tensor
+    cycles: Tensor
+
+    def __init__(self, radar: RadarConfig, azimuth_rad: Tensor, elevation_rad: float = 0.0) -> None:
+        super().__init__()
+        if not radar.has_array:
+            raise TensorsimError("radar: got one transmitter and one receiver, expected several: rx_m (A, 3)")
+        azimuth = torch.as_tensor(azimuth_rad).double()
+        if azimuth.dim() != 1 or azimuth.numel() == 0 or not bool(torch.isfinite(azimuth).all()):
+            raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
+        if not math.isfinite(elevation_rad):
+            raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
+        tx = torch.tensor(radar.tx_positions_m, dtype=torch.float64)
+        rx = torch.tensor(radar.rx_positions_m, dtype=torch.float64)
+        channels = (tx[:, None] + rx).flatten(0, 1)
+        cycles = steering_vectors(channels, azimuth, elevation_rad, radar.doppler_wavelength_m)
+        self.register_buffer("cycles", cycles - cycles.round(), persistent=False)
+        self.register_buffer("azimuth_rad", azimuth, persistent=False)
+        self.channels = channels.shape[0]
+
+    def forward(self, profiles: Tensor) -> AngleMaps:
+        """(..., V, M, R) to range-angle (..., R, D) and azimuth-time (..., D, M)."""
+        layout = f"(..., {self.channels} channels, pulses, range bins)"
+        if not profiles.is_complex():
+            raise TensorsimError(f"profiles: got dtype {profiles.dtype}, expected a complex tensor")
+        check_min_rank(profiles, 3, "profiles", layout)
+        check_size(profiles, -3, self.channels, "profiles", layout)
+        cycles = self.cycles.double()
+        by_range = beam_power(profiles.transpose(-1, -2), cycles).transpose(-1, -2)
+        by_pulse = beam_power(profiles, cycles) * profiles.shape[-1]
+        return AngleMaps(safe_sqrt(by_range), safe_sqrt(by_pulse))

@@ -1,0 +1,143 @@
+"""Moving target indication: what stands still goes, what moves stays (Skolnik, *Introduction to Radar
+Systems*, ch. 3)."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import RadarConfig
+from tensorsim.errors import TensorsimError, check_complex_map
+from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.radar.processing.iir import BlockFilter
+
+METHODS = ("two-pulse", "n-pulse", "mean", "high-pass")
+
+
+def n_pulse_canceller(profiles: Tensor, pulses: int) -> Tensor:
+    """The (n - 1)-fold difference along pulses, n = ``pulses``: (..., M, R) -> (..., M - n + 1, R).
+
+    Its weights are binomial, ``(-1)^(n-1-k) C(n - 1, k)``, its response ``|2 sin(pi fd / PRF)|^(n - 1)``.
+    """
+    for _ in range(pulses - 1):
+        profiles = profiles[..., 1:, :] - profiles[..., :-1, :]
+    return profiles
+
+
+def remove_mean(profiles: Tensor) -> Tensor:
+    """Subtract each range bin's mean over pulses: (..., M, R) -> (..., M, R)."""
+    return profiles - profiles.mean(-2, keepdim=True)
+
+
+def highpass_sections(cutoff_hz: float, prf_hz: float, order: int) -> Tensor:
+    """Butterworth high-pass as biquads (ceil(order / 2), 6) float64; -3.01 dB at ``cutoff_hz``."""
+    from scipy.signal import butter
+
+    return torch.as_tensor(butter(order, cutoff_hz, "highpass", fs=prf_hz, output="sos"))
+
+
+class MovingTargetIndicator(nn.Module):
+    """Suppresses the static part of complex range profiles.
+
+    Args:
+        method: ``"two-pulse"`` (M pulses give M - 1); ``"n-pulse"``, a deeper and wider notch (M - n + 1);
+            ``"mean"``, which keeps slow motion at its full strength; ``"high-pass"``, a Butterworth filter that is
+            flat above its cut-off and starts at rest at the first profile, so that a static scene gives exactly 0.
+        radar: PRF and wavelength, for ``"high-pass"`` only.
+        pulses: n of ``"n-pulse"``.
+        cutoff_m_s: radial speed at which ``"high-pass"`` is down by 3 dB.
+        order: order of ``"high-pass"``, 1 to 8.
+
+    Shapes: (..., M, R) complex -> (..., M', R) complex. Differentiable.
+
+    Attributes:
+        lost_pulses: M - M'.
+        delay_pulses: output m belongs to the instant ``(m + delay_pulses) / PRF`` of the input: (n - 1) / 2 for the
+            cancellers, whose weights are symmetric, else 0. The recursive filter delays every Doppler differently:
+            of order 4 by 0.6 periods of its cut-off there, by 0.004 of one at ten times the cut-off.
+        whole_clip: whether every output depends on all pulses or all earlier ones, so that a clip cannot be cut
+            into pieces that overlap by ``lost_pulses``.
+
+    Raises:
+        TensorsimError: unknown method or settings, real profiles, fewer pulses than the method needs.
+    """
+
+    sections: Tensor
+
+    def __init__(
+        self,
+        method: str = "two-pulse",
+        radar: RadarConfig | None = None,
+        pulses: int = 3,
+        cutoff_m_s: float = 0.2,
+        order: int = 4,
+    ) -> None:
+        super().__init__()
+        if method not in METHODS:
+            raise TensorsimError(f"method: got {method!r}, expected one of {METHODS}")
+        if method == "n-pulse" and pulses < 2:
+            raise TensorsimError(f"pulses: got {pulses}, expected at least 2")
+        self.method = method
+        self.lost_pulses = {"two-pulse": 1, "n-pulse": pulses - 1}.get(method, 0)
+        self.delay_pulses = self.lost_pulses / 2
+        self.whole_clip = method in ("mean", "high-pass")
+        sections = torch.zeros(0, 6, dtype=torch.float64)
+        self.filter: nn.Module = nn.Identity()
+        if method == "high-pass":
+            sections = self._design(radar, cutoff_m_s, order)
+            self.filter = BlockFilter(sections)
+        self.register_buffer("sections", sections, persistent=False)
+
+    @staticmethod
+    @torch.jit.unused
+    def _design(radar: RadarConfig | None, cutoff_m_s: float, order: int) -> Tensor:
+        if radar is None:
+            raise TensorsimError(
+                "radar: got None, expected the radar: a high-pass needs its PRF and wavelength"
+            )
+        if not 1 <= order <= 8:
+            raise TensorsimError(f"order: got {order}, expected 1 to 8")
+        cutoff_hz = 2 * cutoff_m_s / radar.doppler_wavelength_m
+        if not 0 < cutoff_hz < radar.prf_hz / 2:
+            limit = radar.doppler_wavelength_m * radar.prf_hz / 4
+            raise TensorsimError(
+                f"cutoff_m_s: got {cutoff_m_s} m/s, expected a speed between 0 and the unambiguous {limit:.4g} m/s"
+            )
+        return highpass_sections(cutoff_hz, radar.prf_hz, order)
+
+    @torch.jit.unused
+    def response(self, doppler_hz: Tensor, prf_hz: float) -> Tensor:
+        """Complex gain (...) of a target at these Doppler frequencies (positive = approaching).
+
+        The gain multiplies the target's echo at the instant that the output belongs to (``delay_pulses``); for the
+        cancellers it is ``(-2j sin(pi fd / PRF))^(n - 1)``. A radial speed v has ``fd = 2 v /
+        radar.doppler_wavelength_m``. For ``"mean"`` it is that of a long clip: 0 at multiples of the PRF, else 1.
+        """
+        # The phase of an approaching target decreases from pulse to pulse.
+        angle = -2 * math.pi * doppler_hz.double() / prf_hz
+        if self.method == "mean":
+            blind = torch.remainder(doppler_hz.double(), prf_hz) == 0
+            return torch.where(blind, 0.0, 1.0).to(torch.complex128)
+        if self.method == "high-pass":
+            delays = torch.exp(-1j * angle[..., None, None] * torch.arange(3, device=angle.device))
+            sections = self.sections.to(delays)
+            numerator, denominator = (sections[:, :3] * delays).sum(-1), (sections[:, 3:] * delays).sum(-1)
+            return (numerator / denominator).prod(-1)
+        return (2j * torch.sin(angle / 2)) ** self.lost_pulses
+
+    def forward(self, profiles: Tensor) -> Tensor:
+        """(..., M, R) to (..., M', R)."""
+        check_complex_map(profiles, "profiles", "(..., pulses, range bins)")
+        least = max(2, self.lost_pulses + 1)
+        if profiles.shape[-2] < least:
+            raise TensorsimError(
+                f"profiles: got shape {list(profiles.shape)}, expected at least {least} pulses"
+            )
+        if self.method == "mean":
+            return remove_mean(profiles)
+        if self.method == "high-pass":
+            moving = flatten_batch(profiles - profiles[..., :1, :], 2)
+            columns = torch.view_as_real(moving).flatten(2)  # real and imaginary parts side by side
+            filtered = self.filter(columns).unflatten(2, (moving.shape[2], 2))
+            return unflatten_batch(torch.view_as_complex(filtered.contiguous()), list(profiles.shape[:-2]))
+        return n_pulse_canceller(profiles, self.lost_pulses + 1)

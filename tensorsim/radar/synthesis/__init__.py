@@ -1,0 +1,1 @@
+"""Scatterers -> intermediate-frequency signal: antennas, propagation paths, walls, noise."""

@@ -1,0 +1,49 @@
+"""The two ways from scatterers to range profiles free of noise, with one interface.
+
+    engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2) -> profiles (B, m, R), energy (B,)
+
+``energy`` is that of the signal that the receiver noise refers to, over m pulses and the N samples of their IF.
+Arguments are not checked: the simulator has done that.
+"""
+
+from torch import Tensor, nn
+
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
+from tensorsim.radar.synthesis.noise import energy
+
+
+class TimeEngine(nn.Module):
+    """By way of the IF: echo and Fourier transform over fast time.
+
+    ``total``: the energy is that of echo and static paths together, and not of the echo alone.
+    """
+
+    def __init__(self, echo: EchoSynthesizer, profile: RangeProfile, total: bool) -> None:
+        super().__init__()
+        self.echo, self.profile, self.total = echo, profile, total
+
+    def forward(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
+        """See the module."""
+        echo = self.echo.target_echo(positions, rcs)
+        samples = echo
+        if len(self.echo.paths.static_ways) > 0:
+            samples = echo + self.echo.static_echo()
+        return self.profile(samples), energy(samples if self.total else echo)
+
+
+class RangeBinEngine(nn.Module):
+    """In closed form; ``total`` as above."""
+
+    def __init__(self, bins: RangeBinSynthesizer, total: bool) -> None:
+        super().__init__()
+        self.bins, self.total = bins, total
+
+    def forward(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
+        """See the module."""
+        beat, strength = self.bins.tones(positions, rcs)
+        profiles = self.bins.bins(beat, strength)
+        if len(self.bins.echo.paths.static_ways) > 0:
+            profiles = profiles + self.bins.static_bins()
+        return profiles, self.bins.energy(beat, strength, self.total).sum(-1)

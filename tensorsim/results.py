@@ -1,0 +1,258 @@
+"""What a simulation writes into its folder: maps, poses, pictures, the overlay film and the summary."""
+
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tensorsim import plot
+from tensorsim.config import ACTIVITIES
+from tensorsim.data.video import write_video
+from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
+from tensorsim.recognition import ActivityRecognizer
+from tensorsim.streaming import maps_of_pose, progress_bar
+from tensorsim.types import Pose, RadarMaps
+
+if TYPE_CHECKING:
+    from tensorsim.radar.presets import RadarScene
+    from tensorsim.sources import Source
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Axes of a set of maps.
+
+    Attributes:
+        range_m: (R,).
+        doppler_hz: (F,), positive = approaching.
+        time_s: (K,) centres of the Doppler-time columns.
+        range_time_rate_hz: columns of the range-time maps per second.
+        speed_per_hz: m/s per Hz of Doppler.
+    """
+
+    range_m: np.ndarray
+    doppler_hz: np.ndarray
+    time_s: np.ndarray
+    range_time_rate_hz: float
+    speed_per_hz: float
+
+
+def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
+    """Axes of the maps that this stage made."""
+    simulator = stage.simulator
+    doppler = simulator.doppler
+    pulses = doppler.length + (maps.doppler_time.shape[-1] - 1) * doppler.hop
+    # What the two-pulse canceller gives lies between the two pulses that it subtracts.
+    delay_s = simulator.mti.delay_pulses / simulator.radar.prf_hz
+    return Axes(
+        range_m=simulator.range_profile.range_m.cpu().numpy(),
+        doppler_hz=doppler.doppler_hz.cpu().numpy(),
+        time_s=doppler.frame_times_s(pulses).cpu().numpy() + delay_s,
+        range_time_rate_hz=simulator.radar.prf_hz / simulator.range_time_block,
+        speed_per_hz=simulator.radar.doppler_wavelength_m / 2,
+    )
+
+
+def write_maps(folder: Path, maps: RadarMaps, axes: Axes, truth: RadarMaps | None = None) -> None:
+    """Write ``maps.npz`` and a PNG per map.
+
+    Args:
+        folder: where to.
+        maps: on the CPU, without batch dimensions.
+        axes: of the maps.
+        truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
+            every PNG.
+    """
+    save_maps(folder / "maps.npz", maps, axes)
+    if truth is not None:
+        save_maps(folder / "maps_truth.npz", truth, axes)
+    for name, title in (
+        ("range_time", "range-time map"),
+        ("range_time_mti", "range-time map after moving target indication"),
+    ):
+        magnitude = getattr(maps, name).numpy()
+        # What the two-pulse canceller gives lies half a pulse later; nothing is left of it at a display rate.
+        offset = (maps.range_time.shape[1] - magnitude.shape[1]) / 2
+        time_s = (np.arange(magnitude.shape[1]) + offset) / axes.range_time_rate_hz
+        reference = None if truth is None else getattr(truth, name).numpy()
+        plot.save_figure(
+            plot.map_figure(magnitude, time_s, axes.range_m, title, "range in m", reference=reference),
+            folder / f"{name}.png",
+        )
+    both = [maps] if truth is None else [maps, truth]
+    plot.save_figure(
+        plot.map_figure(
+            maps.doppler_time.numpy(),
+            axes.time_s,
+            axes.doppler_hz,
+            "Doppler-time map",
+            "Doppler in Hz, positive = approaching",
+            ridges=_strong_ridges(maps, axes),
+            speed_per_axis=axes.speed_per_hz,
+            half_span=max(_doppler_span(one, axes) for one in both),
+            reference=None if truth is None else truth.doppler_time.numpy(),
+            reference_ridges=None if truth is None else _strong_ridges(truth, axes),
+        ),
+        folder / "doppler_time.png",
+    )
+
+
+def save_maps(path: Path, maps: RadarMaps, axes: Axes) -> None:
+    """Write maps and their axes as an npz."""
+    np.savez(
+        path,
+        range_time=maps.range_time.numpy(),
+        range_time_mti=maps.range_time_mti.numpy(),
+        doppler_time=maps.doppler_time.numpy(),
+        ridges_hz=axes.doppler_hz[maps.ridges.numpy()],
+        range_m=axes.range_m,
+        doppler_hz=axes.doppler_hz,
+        time_s=axes.time_s,
+        range_time_rate_hz=axes.range_time_rate_hz,
+    )
+
+
+def _strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
+    """Ridges (3, K) in Hz, NaN where one is no more than noise at the floor of the colours."""
+    floor = float(maps.doppler_time.max()) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
+    return np.where(maps.ridge_magnitudes.numpy() > floor, axes.doppler_hz[maps.ridges.numpy()], np.nan)
+
+
+def _doppler_span(maps: RadarMaps, axes: Axes) -> float:
+    """Half of the part of the Doppler axis that has something to show, in Hz."""
+    level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB)
+    shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB).any(1)]
+    return 1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8))
+
+
+def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float | None]]:
+    """How like maps are to those of the true motion: PSNR of linear and dB maps, SSIM, each map over its peak.
+
+    None where a figure is not finite, as for two empty maps.
+    """
+    from tensorsim.radar.analysis import metrics
+
+    table = {}
+    for name in ("range_time", "range_time_mti", "doppler_time"):
+        pair = getattr(maps, name), getattr(truth, name)
+        figures = {
+            "psnr_linear_db": metrics.psnr(*pair, scale="linear"),
+            "psnr_of_db_map_db": metrics.psnr(*pair, scale="db"),
+            "ssim_linear": metrics.ssim(*pair, scale="linear"),
+            "ssim_of_db_map": metrics.ssim(*pair, scale="db"),
+        }
+        table[name] = {
+            key: round(float(value), 4) if bool(value.isfinite()) else None for key, value in figures.items()
+        }
+    return table
+
+
+def write_pose(folder: Path, pose: Pose, fps: float) -> None:
+    """Write ``pose.npz`` and a picture of the skeletons in the world."""
+    joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
+    np.savez(
+        folder / "pose.npz",
+        joints_m=joints,
+        keypoints_px=pose.keypoints[0].numpy(),
+        keypoint_scores=pose.keypoint_scores[0].numpy(),
+        boxes_px=pose.boxes[0].numpy(),
+        valid=valid,
+        fps=fps,
+    )
+    plot.save_figure(plot.skeleton_figure(joints, valid, fps), folder / "skeleton.png")
+
+
+def write_overlay(
+    folder: Path, chunks: Iterable[Tensor], fps: float, pose: Pose, threshold: float, quiet: bool = False
+) -> None:
+    """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons."""
+    boxes, keypoints = pose.boxes[0].numpy(), pose.keypoints[0].numpy()
+    scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
+
+    def drawn() -> Iterator[np.ndarray]:
+        index = 0
+        with progress_bar("overlay", valid.shape[1], quiet) as bar:
+            for frames in chunks:
+                for frame in frames.permute(0, 2, 3, 1).numpy():
+                    yield plot.draw_people(
+                        frame,
+                        boxes[:, index],
+                        keypoints[:, index],
+                        scores[:, index],
+                        valid[:, index],
+                        threshold,
+                    )
+                    index += 1
+                    bar.update(1)
+
+    write_video(folder / "overlay.mp4", drawn(), fps)
+
+
+def simulate(
+    source: "Source", stage: PoseToDoppler, folder: Path, seed: int, device: torch.device, quiet: bool = False
+) -> tuple[Pose, RadarMaps]:
+    """Find the people of a source, simulate their maps, and write all but the maps: pose, skeleton and overlay."""
+    pose = source.pose(quiet)
+    warn_of_empty_clips(pose.valid)
+    torch.manual_seed(seed)
+    maps = maps_of_pose(stage, pose, source.fps, device, quiet)
+    write_pose(folder, pose, source.fps)
+    write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
+    return pose, maps
+
+
+def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
+    """One row per person: when it is in the scene, how far, and how fast its torso approaches."""
+    rows = []
+    for person in range(pose.joints.shape[1]):
+        frames = torch.nonzero(pose.valid[0, person]).flatten()
+        if frames.numel() == 0:
+            continue  # a track on which no joint was seen
+        torso = pose.joints[0, person, frames][:, [1, 8, 11]].double().mean(dim=1)
+        duration_s = max(float(frames[-1] - frames[0]) / fps, 1 / fps)
+        rows.append(
+            {
+                "id": person + 1,
+                "first_frame": int(frames[0]),
+                "last_frame": int(frames[-1]),
+                "mean_range_m": round(float(torso.norm(dim=-1).mean()), 3),
+                "mean_approach_m_s": round(float(torso[0, 1] - torso[-1, 1]) / duration_s, 3),
+            }
+        )
+    return rows
+
+
+def summary_of(
+    source: "Source", scene: "RadarScene", pose: Pose, maps: RadarMaps, seed: int
+) -> dict[str, Any]:
+    """What ``summary.json`` says of every simulation."""
+    snr_db = float(maps.snr_db)
+    return {
+        "source": {"kind": source.kind, **source.about},
+        "people": people_of(pose, source.fps),
+        "frames": pose.valid.shape[2],
+        "fps": source.fps,
+        "seed": seed,
+        "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
+        **{name: None if part is None else asdict(part) for name, part in scene._asdict().items()},
+    }
+
+
+def label_of(recognizer: ActivityRecognizer | None, maps: RadarMaps) -> dict[str, Any]:
+    """The activity that the maps (without a batch dimension) show, and the probability of each; None unasked."""
+    if recognizer is None:
+        return {"label": None, "probabilities": None}
+    probabilities = recognizer(maps).softmax(-1).tolist()
+    by_name = {name: round(p, 4) for name, p in zip(ACTIVITIES, probabilities, strict=True)}
+    return {"label": max(by_name, key=by_name.__getitem__), "probabilities": by_name}
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Write ``summary.json``."""
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

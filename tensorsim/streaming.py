@@ -1,0 +1,85 @@
+"""Long films, frame by frame, and long motion, pulse by pulse: memory does not grow with their length."""
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tensorsim.data.video import VideoReader
+from tensorsim.errors import TensorsimError
+from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.types import Detections, Pose, RadarMaps
+
+
+def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
+    """A progress bar of frames."""
+    return tqdm(desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
+
+
+def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, quiet: bool = False) -> Pose:
+    """Detect and track in a first pass over the film, estimate and lift poses in a second one.
+
+    Returns:
+        The Pose of one clip (B = 1) on the CPU; equal to ``stage(video, fps)`` of the whole film.
+
+    Raises:
+        TensorsimError: the film has fewer than 2 frames.
+    """
+    interval, size = stage.detection_interval, stage.frames_per_batch
+    found: list[Detections] = []
+    count = 0
+    last = torch.empty(0)
+    with progress_bar("detect", reader.frame_count, quiet) as bar:
+        for frames in reader.chunks(size * interval):
+            index = torch.arange(count, count + frames.shape[0])
+            if bool((index % interval == 0).any()):
+                found.append(stage.detect(frames[index % interval == 0].to(device)))
+            count += frames.shape[0]
+            last = frames[-1:].clone()
+            bar.update(frames.shape[0])
+        bar.total = count
+    if count < 2:
+        raise TensorsimError(
+            f"{reader.path}: got {count} frame, expected at least 2: motion needs two moments"
+        )
+    if (count - 1) % interval:
+        found.append(stage.detect(last.to(device)))
+    whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+    observed = stage.observed_frames(stage.frames_present(1, count, None, whole.boxes.device))
+    tracks = stage.follow(whole, observed)
+
+    boxes, valid = tracks.boxes[0].transpose(0, 1), tracks.valid[0].transpose(0, 1)
+    keypoints: list[Tensor] = []
+    scores: list[Tensor] = []
+    done = 0
+    with progress_bar("pose", count, quiet) as bar:
+        for frames in reader.chunks(size):
+            stop = done + frames.shape[0]
+            k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
+            keypoints.append(k)
+            scores.append(s)
+            done = stop
+            bar.update(frames.shape[0])
+    all_keypoints = torch.cat(keypoints).transpose(0, 1).unsqueeze(0)
+    all_scores = torch.cat(scores).transpose(0, 1).unsqueeze(0)
+    pose = stage.lift(tracks, all_keypoints, all_scores, reader.height, reader.width, reader.fps)
+    return Pose(*(field.cpu() for field in pose))
+
+
+def maps_of_pose(
+    stage: PoseToDoppler, pose: Pose, fps: float, device: torch.device, quiet: bool = False
+) -> RadarMaps:
+    """Maps (on the CPU, without a batch dimension) of the first clip of ``pose``, streamed over pulses."""
+    joints, valid = pose.joints[:1].to(device), pose.valid[:1].to(device)
+    pulses = stage.resampler.pulses(joints.shape[2], fps)
+    coefficients = stage.resampler.coefficients(joints, fps)
+
+    with progress_bar("radar", pulses, quiet) as bar:
+        bar.unit = "pulse"
+
+        def source(start: int, stop: int) -> tuple[Tensor, Tensor]:
+            points, rcs = stage.scene(coefficients, valid, fps, start, stop)
+            bar.update(max(0, stop - bar.n))
+            return points[0], rcs[0]
+
+        maps = stage.simulator.stream(source, pulses)
+    return RadarMaps(*(field.cpu() for field in stage.denoise(maps)))

@@ -1,0 +1,1 @@
+"""Key points in pixels -> joints in metres."""

@@ -1,0 +1,199 @@
+"""Nearest-match lifting: 3D poses for 2D joints, from a pool of 3D poses projected along depth.
+
+Every pose of the pool is projected along depth and compared with the joints in the image after both are
+centred and brought to unit scale, as the paper does; here with a weight per joint, so that hidden joints do
+not count.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+    check_size,
+    is_exporting,
+)
+from tensorsim.types import Lifted
+from tensorsim.vision.lifting.pose_library import load_pose_library, standardise_poses
+from tensorsim.vision.lifting.pose_search import PoseSearch, normalise_weights
+from tensorsim.vision.smoothing.along_time import nearest_valid
+
+
+def fit_poses(keypoints: Tensor, weights: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Scale and translation that place poses in the image, and how well they then fit.
+
+    Args:
+        keypoints: (..., 14, 2) pixels.
+        weights: (..., 14), not negative.
+        poses: (..., 14, 3) body heights; leading dimensions broadcast.
+
+    Returns:
+        scale (...) pixels per body height, the placed joints (..., 14, 2) pixels, and the distance (...): the
+        weighted squared error over that of the best single point, 0 for a perfect fit, 1 for none.
+    """
+    w = normalise_weights(weights)[..., None]
+    projected = torch.stack([poses[..., 0], -poses[..., 2]], dim=-1)
+    centre, middle = (w * keypoints).sum(dim=-2, keepdim=True), (w * projected).sum(dim=-2, keepdim=True)
+    k, p = keypoints - centre, projected - middle
+    kk, pp = (w * k.square()).sum(dim=(-2, -1)), (w * p.square()).sum(dim=(-2, -1)).clamp(min=1e-6)
+    scale = (w * k * p).sum(dim=(-2, -1)).clamp(min=0.0) / pp
+    placed = centre + scale[..., None, None] * p
+    distance = (w * (keypoints - placed).square()).sum(dim=(-2, -1)) / kk.clamp(min=1e-12)
+    return scale, placed, distance
+
+
+def smooth_assignment(emission: Tensor, transition: Tensor) -> Tensor:
+    """Posterior of a hidden Markov chain over candidates (forward-backward in logarithms).
+
+    Args:
+        emission: (S, T, K) log-likelihood of candidate k in frame t.
+        transition: (S, T - 1, K, K) log-likelihood of going from candidate i in frame t to j in t + 1.
+
+    Returns:
+        (S, T, K) probabilities, summing to one over K (Rabiner, "A tutorial on hidden Markov models", 1989).
+        Differentiable.
+    """
+    forward = [emission[:, 0]]
+    backward = [torch.zeros_like(emission[:, 0])]
+    frames = emission.shape[1]
+    for t in range(frames - 1):
+        forward.append(
+            torch.logsumexp(forward[-1][:, :, None] + transition[:, t], dim=1) + emission[:, t + 1]
+        )
+        later = frames - 2 - t
+        onward = (backward[-1] + emission[:, later + 1])[:, None, :]
+        backward.append(torch.logsumexp(transition[:, later] + onward, dim=2))
+    backward.reverse()
+    return torch.softmax(torch.stack(forward, dim=1) + torch.stack(backward, dim=1), dim=-1)
+
+
+class NearestPoseLifter(nn.Module):
+    """3D poses for the joints of tracked people, from the nearest poses of a pool.
+
+    Each frame takes the ``neighbours`` best matches of
+    :class:`~tensorsim.vision.lifting.pose_search.PoseSearch`, weighted by how well they fit and, with
+    ``temporal`` > 0, by how well they agree with those of the frames before and after (:func:`smooth_assignment`),
+    so that depths do not flip between frames that look alike. ``neighbours=1`` is the paper's nearest match.
+
+    Args:
+        library: (L, 14, 3) poses in any unit of length (x right, y away, z up); None is the shipped pool.
+        yaws: headings at which each pose of the pool is tried; 1 for a pool that has all headings already.
+        neighbours: candidates per frame.
+        search_joints: a frame with fewer joints takes its candidates from the nearest frame with as many.
+        tolerance: relative error (square root of ``distance``) at which a candidate loses its weight.
+        temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
+            body heights and by 1 % of the size; 0 treats frames alone.
+        chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair.
+
+    Shape:
+        joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
+        :class:`tensorsim.types.Lifted`. A frame with fewer than two weighted joints takes the nearest other
+        frame. Differentiable by joints and weights through the fit and the shares of the candidates; the
+        search that finds the candidates is not.
+
+    Raises:
+        TensorsimError: other shapes, NaN, negative weights, or no frames.
+    """
+
+    def __init__(
+        self,
+        library: Tensor | None = None,
+        yaws: int = 24,
+        neighbours: int = 32,
+        search_joints: int = 8,
+        tolerance: float = 0.05,
+        temporal: float = 1.0,
+        chunk: int = 2**22,
+    ) -> None:
+        super().__init__()
+        poses = load_pose_library() if library is None else standardise_poses(library)
+        for name, value in (("yaws", yaws), ("neighbours", neighbours), ("chunk", chunk)):
+            if value < 1:
+                raise TensorsimError(f"NearestPoseLifter.{name}: got {value}, expected at least 1")
+        if neighbours > poses.shape[0] * yaws:
+            raise TensorsimError(
+                f"NearestPoseLifter.neighbours: got {neighbours}, expected at most "
+                f"{poses.shape[0] * yaws}, the library's {poses.shape[0]} poses at {yaws} headings"
+            )
+        check_positive(tolerance, "NearestPoseLifter.tolerance")
+        if not 0 <= temporal < float("inf"):
+            raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
+        self.neighbours, self.tolerance = neighbours, tolerance
+        self.temporal, self.search_joints = temporal, search_joints
+        # Per frame, at 30 frames a second: a limb that moves at 1.6 m/s, in body heights; somebody 4 m away who
+        # walks at 1.2 m/s, in relative size. Sizes that change faster than bodies can move are wrong matches.
+        self.change, self.size_change = 0.03, 0.01
+        self.search = PoseSearch(poses, yaws, neighbours, chunk)
+
+    def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
+        """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
+        layout = "(..., T, 14, 2) joints in pixels"
+        check_floating(keypoints, "keypoints")
+        check_min_rank(keypoints, 3, "keypoints", layout)
+        check_size(keypoints, -2, 14, "keypoints", layout)
+        check_size(keypoints, -1, 2, "keypoints", layout)
+        if weights.shape != keypoints.shape[:-1]:
+            raise TensorsimError(
+                f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
+            )
+        if keypoints.shape[-3] < 1:
+            raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
+        check_finite(keypoints, "keypoints")
+        check_finite(weights, "weights")
+        if not is_exporting() and bool((weights < 0).any()):
+            raise TensorsimError("weights: got negative values, expected weights >= 0")
+        shape, frames = keypoints.shape, keypoints.shape[-3]
+        tracks = keypoints[..., 0, 0, 0].numel()
+        keypoints, weights = keypoints.reshape(tracks, frames, 14, 2), weights.reshape(tracks, frames, 14)
+        seen = (weights > 0).sum(dim=-1)
+        placeable = seen >= 2
+        source = nearest_valid(placeable)
+        keypoints = keypoints.gather(1, source[..., None, None].expand_as(keypoints))
+        weights = weights.gather(1, source[..., None].expand_as(weights)).to(keypoints.dtype)
+
+        with torch.no_grad():
+            index = self.search(keypoints.flatten(0, 1), weights.flatten(0, 1))
+            index = index.reshape(tracks, frames, self.neighbours)
+            # A few joints fit many poses: such a frame chooses among those of the nearest better one.
+            known = nearest_valid(seen.gather(1, source) >= self.search_joints)
+            index = index.gather(1, known[..., None].expand_as(index))
+        poses = self.search.poses(index).to(keypoints.dtype)
+        scale, placed, distance = fit_poses(keypoints[:, :, None], weights[:, :, None], poses)
+
+        share = self._share(poses, scale, distance, placeable)
+        return Lifted(
+            depth=(share[..., None] * poses[..., 1]).sum(dim=2).reshape(shape[:-1]),
+            scale=(share * scale).sum(dim=2).reshape(shape[:-2]),
+            keypoints=(share[..., None, None] * placed).sum(dim=2).reshape(shape),
+            nearest=index[..., 0].reshape(shape[:-2]),
+            distance=distance[..., 0].reshape(shape[:-2]),
+        )
+
+    def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:
+        """Weight of each candidate, (S, T, K) summing to one; frames (S, T) not ``placeable`` say nothing."""
+        emission = -0.5 / self.tolerance**2 * distance
+        if self.temporal == 0.0 or self.neighbours == 1:
+            return torch.softmax(emission, dim=-1)
+        # What changes from frame to frame: the pose (rms over joints) and the logarithm of the size, in one unit.
+        size = (self.change / self.size_change) * scale.clamp(min=1e-6).log()[..., None]
+        state = torch.cat([poses.flatten(-2) / math.sqrt(14.0), size], dim=-1)
+        # |a - b|^2 by a matrix product keeps its digits only if a and b are small.
+        middle = state[:, :-1].mean(dim=2, keepdim=True)
+        a, b = state[:, :-1] - middle, state[:, 1:] - middle
+        product = torch.matmul(a, b.transpose(-1, -2))
+        change = a.square().sum(dim=-1)[..., None] + b.square().sum(dim=-1)[:, :, None, :] - 2.0 * product
+        transition = -0.5 * self.temporal / self.change**2 * change.clamp(min=0.0)
+        # A frame without a pose of its own has the candidates of its neighbour: it passes them on unchanged, so
+        # that empty frames before, between and after do not count as evidence.
+        same = torch.eye(self.neighbours, dtype=torch.bool, device=poses.device)
+        passed = torch.where(same, 0.0, -1e9).to(transition.dtype)
+        alone = placeable[:, :-1] & placeable[:, 1:]
+        borrowed = ~alone & (poses[:, :-1] == poses[:, 1:]).flatten(2).all(dim=-1)
+        transition = torch.where(borrowed[..., None, None], passed, transition)
+        return smooth_assignment(emission * placeable[..., None], transition)

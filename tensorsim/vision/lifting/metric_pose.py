@@ -1,0 +1,250 @@
+"""From joints in the image and their library depths to joints in the world, in metres."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import mid_hips
+from tensorsim.config import CameraConfig
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+    check_size,
+)
+from tensorsim.geometry.camera import back_project, camera_to_world
+from tensorsim.types import Lifted
+from tensorsim.vision.smoothing.along_time import (
+    fill_gaps,
+    local_linear,
+    masked_median,
+    nearest_valid,
+    robust_smooth,
+    running_quantile,
+)
+
+#: Initial distances of the original's panel by person; the paper's mode cannot do without.
+PANEL_DISTANCES_M = (4.00, 0.50)
+
+
+def lowest_ankle(joints: Tensor) -> Tensor:
+    """Height of the lower ankle (joints 10 and 13): (..., 14, 3) -> (...)."""
+    return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])
+
+
+def lowered(joints: Tensor, drop: Tensor) -> Tensor:
+    """Joints (..., 14, 3) moved down by ``drop`` (...)."""
+    return torch.cat([joints[..., :2], joints[..., 2:] - drop[..., None, None]], dim=-1)
+
+
+def paper_pose(image: Tensor, lifted: Lifted, valid: Tensor, height: Tensor, distance: Tensor) -> Tensor:
+    """Joints (..., P, T, 14, 2) of the image to the world as in the paper; see :class:`MetricPose`."""
+    v = image[..., 1]
+    alpha = height / (v.amax(dim=-1) - v.amin(dim=-1)).clamp(min=1.0)
+    root = mid_hips(image)
+    first = valid.to(torch.int64).argmax(dim=-1, keepdim=True)
+    start = root[..., 0].gather(-1, first)
+    x = alpha * (root[..., 0] - start)
+    across = alpha[..., None, None] * (image - root[..., None, :])
+    depth = alpha[..., None] * 0.2 * lifted.scale[..., None] * lifted.depth
+    away = distance[..., None] + depth
+    joints = torch.stack([x[..., None] + across[..., 0], away, -across[..., 1]], dim=-1)
+    return lowered(joints, lowest_ankle(joints))
+
+
+class MetricPose(nn.Module):
+    """Places lifted people in the world.
+
+    ``mode="camera"``: a pinhole camera. A standing person of height H at range y takes ``s = f H / y``
+    pixels, and the lifter gives s whatever the pose, so the hips are at range ``y = H (f / s - d)``, d the
+    mean depth of the joints beyond the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm.
+    Each joint lies on its line of sight at its own depth. Frames that show fewer than ten joints tell no size: they
+    take that of the others, and one whose joints would make a body of less than 0.65 of it is not believed (a leg at
+    the edge of the picture, taken for a whole person). The floor follows the lower ankle as a low running
+    quantile, so that a jump leaves it and a wrong ankle does not move it.
+
+    ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
+    joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips displaced sideways
+    by alpha times their way in the image, range constant, the lower ankle at z = 0 in every frame. Kept to
+    reproduce the published results: nobody can walk towards the radar in it, and who sits down grows.
+
+    Args:
+        camera: pinhole camera; None is the default one, at the radar.
+        person_height_m: standing heights by order of person; the last one serves all further people.
+        initial_distance_m: range of each person in its first half second, likewise by order. In the camera
+            mode it replaces the focal length, person by person. None takes the camera's focal length (in the
+            paper's mode the panel's 4.00 and 0.50 m).
+        keypoint_threshold: score from which a joint counts as seen.
+        mode: ``"camera"`` or ``"paper"``.
+        range_smoothing_s: standard deviation of the smoothing kernel of the range.
+        floor_window_s: window in which the floor is looked for; longer than people stay in the air.
+        calibrated: height and tilt of the camera are known well: people stay at the height at which it sees them.
+
+    Shape:
+        joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
+        (..., P, T) bool, image height and width in pixels, frames per second and, where the camera moves, its
+        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward) -> world joints
+        (..., P, T, 14, 3) in metres and whether each was seen (..., P, T, 14). What was not seen is filled: a
+        hidden joint from the pose that the lifter found, a frame that is invalid or not believed from the
+        nearest other one; people without any are zeros. Differentiable.
+
+    Raises:
+        TensorsimError: heights or distances that are not positive, an unknown mode, wrong shapes, NaN, or a
+            moving camera in the paper's mode.
+    """
+
+    heights: Tensor
+    distances: Tensor
+    camera_pose: Tensor
+    focal_px: float | None
+    center_px: tuple[float, float] | None
+
+    def __init__(
+        self,
+        camera: CameraConfig | None = None,
+        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        initial_distance_m: tuple[float, ...] | None = None,
+        keypoint_threshold: float = 0.3,
+        mode: str = "camera",
+        range_smoothing_s: float = 0.3,
+        floor_window_s: float = 1.5,
+        calibrated: bool = False,
+    ) -> None:
+        super().__init__()
+        if mode not in ("camera", "paper"):
+            raise TensorsimError(f"MetricPose.mode: got {mode!r}, expected 'camera' or 'paper'")
+        self.mode = mode
+        self.keypoint_threshold = keypoint_threshold
+        self.range_smoothing_s = range_smoothing_s
+        self.floor_window_s = floor_window_s
+        self.calibrated = calibrated
+        self.whole_body_joints = 10  # seen joints that make a body whole enough to tell its size
+        self.squeezed = 0.65  # of the size that whole bodies tell: below, a part was taken for a whole
+        for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
+            check_positive(getattr(self, name), f"MetricPose.{name}")
+        camera = CameraConfig() if camera is None else camera
+        self.focal_px, self.center_px = camera.focal_px, camera.center_px
+        self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
+        self.distance_gives_focal = initial_distance_m is not None
+        distances = PANEL_DISTANCES_M if initial_distance_m is None else initial_distance_m
+        for name, values in (("person_height_m", person_height_m), ("initial_distance_m", distances)):
+            if len(values) == 0:
+                raise TensorsimError(f"MetricPose.{name}: got no values, expected one per person")
+            for value in values:
+                check_positive(value, f"MetricPose.{name}")
+        self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
+        self.register_buffer("distances", torch.tensor(distances, dtype=torch.float64), persistent=False)
+        self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
+
+    def forward(
+        self,
+        keypoints: Tensor,
+        scores: Tensor,
+        lifted: Lifted,
+        valid: Tensor,
+        image_height: int,
+        image_width: int,
+        fps: float,
+        camera_pose: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Joints, scores, Lifted, valid, image size, fps, camera poses -> world joints and what was seen."""
+        layout = "(..., P, T, 14, 2) joints in pixels"
+        check_floating(keypoints, "keypoints")
+        check_min_rank(keypoints, 4, "keypoints", layout)
+        check_size(keypoints, -2, 14, "keypoints", layout)
+        check_size(keypoints, -1, 2, "keypoints", layout)
+        shape = keypoints.shape
+        for name, size, expected in (
+            ("scores", scores.shape, shape[:-1]),
+            ("lifted.depth", lifted.depth.shape, shape[:-1]),
+            ("lifted.scale", lifted.scale.shape, shape[:-2]),
+            ("lifted.keypoints", lifted.keypoints.shape, shape),
+            ("valid", valid.shape, shape[:-2]),
+        ):
+            if list(size) != list(expected):
+                raise TensorsimError(f"{name}: got shape {list(size)}, expected {list(expected)}")
+        if valid.dtype != torch.bool:
+            raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
+        if shape[-3] < 1:
+            raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
+        check_finite(keypoints, "keypoints")
+        check_finite(scores, "scores")
+        if image_height < 1 or image_width < 1:
+            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        check_positive(fps, "fps")
+
+        seen = (scores >= self.keypoint_threshold) & valid[..., None]
+        height = self._of_each(self.heights, keypoints)
+        distance = self._of_each(self.distances, keypoints)
+        if self.mode == "paper":
+            if camera_pose is not None:
+                raise TensorsimError("camera_pose: got camera poses, expected none: the paper has no camera")
+            image = torch.where(seen[..., None], keypoints, lifted.keypoints)
+            joints = paper_pose(image, lifted, valid, height, distance)
+        else:
+            pose = self.camera_pose.to(keypoints.dtype)
+            if camera_pose is not None:
+                expected_pose = list(shape[:-4])
+                expected_pose.extend([shape[-3], 3, 4])
+                if list(camera_pose.shape) != expected_pose:
+                    raise TensorsimError(
+                        f"camera_pose: got shape {list(camera_pose.shape)}, expected {expected_pose}"
+                    )
+                pose = camera_pose.to(keypoints.dtype).unsqueeze(-4)
+            center = self.center_px
+            if center is None:
+                center = ((image_width - 1) / 2, (image_height - 1) / 2)
+            focal_px = self.focal_px
+            if focal_px is None:
+                focal_px = image_width / 2 / self.half_width
+
+            # The fitted scale is that at the mean depth of the joints, not of the hips.
+            weights = scores.clamp(min=0.0)
+            weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+            beyond = (weights * lifted.depth).sum(dim=-1)
+            scale = fill_gaps(lifted.scale, valid).clamp(min=1e-3)
+            beyond = fill_gaps(beyond, valid)
+            focal = torch.full_like(scale, focal_px)
+            if self.distance_gives_focal:
+                focal = self._focal_from(distance, height, scale, beyond, valid, fps)
+            # The size of a body that is half out of the picture is a guess: those frames follow the others.
+            whole = valid & (seen.sum(dim=-1) >= self.whole_body_joints)
+            whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
+            root_range = height * robust_smooth(focal / scale - beyond, whole, self.range_smoothing_s * fps)
+            # A network that sees a leg alone may take it for a small body: such a frame says nothing.
+            body_px = focal / (root_range / height + beyond).clamp(min=1e-3)
+            valid = valid & (whole | (scale > self.squeezed * body_px))
+            seen = seen & valid[..., None]
+            # Hidden joints are where the pose has them, at the size that the other frames tell.
+            middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)
+            placed = middle + (body_px / scale)[..., None, None] * (lifted.keypoints - middle)
+            image = torch.where(seen[..., None], keypoints, placed)
+            reach = root_range[..., None] + height[..., None] * lifted.depth
+            joints = back_project(image, reach, focal, torch.tensor(center).to(image), pose)
+            if not self.calibrated:
+                joints = lowered(joints, self._floor(joints, valid, fps))
+        joints = joints.gather(-3, nearest_valid(valid)[..., None, None].expand_as(joints))
+        return joints * valid.any(dim=-1)[..., None, None, None], seen
+
+    def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
+        """A value per person, (P, 1): the last one serves all further people."""
+        person = torch.arange(like.shape[-4], device=like.device).clamp(max=values.shape[0] - 1)
+        return values.to(like.dtype)[person][:, None]
+
+    def _focal_from(
+        self, distance: Tensor, height: Tensor, scale: Tensor, beyond: Tensor, valid: Tensor, fps: float
+    ) -> Tensor:
+        """Focal length (..., P, T) that puts each person at its distance in its first half second."""
+        since = valid.to(torch.int64).cumsum(dim=-1)
+        early = valid & (since <= max(int(0.5 * fps), 1))
+        return masked_median(scale * (distance / height + beyond), early).clamp(min=1.0).expand_as(scale)
+
+    def _floor(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """Height of the floor under each person, (..., P, T)."""
+        low = fill_gaps(lowest_ankle(joints), valid)
+        window = int(self.floor_window_s * fps)
+        low = running_quantile(low, window, 0.15)
+        return local_linear(low, torch.ones_like(low), max(0.2 * window, 0.5))

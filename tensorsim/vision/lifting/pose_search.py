@@ -1,0 +1,304 @@
+"""Exact search of a large pool of poses for those whose projections fit key points best.
+
+The pool is sorted once into blocks of similar poses. A frame looks only into blocks that the triangle inequality
+does not rule out, there with matrix products in bfloat16 whose rounding error is bounded, and computes in float64
+what the bound leaves over: the answer is that of a full search, whatever the pool.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import is_exporting
+from tensorsim.vision.lifting.pose_library import all_headings, turn
+
+#: Poses of a block at most; half as many at least, in a pool that needs more than one.
+BLOCK = 8192
+#: Blocks but the last hold a multiple of this many.
+_STRIDE = 64
+
+
+def normalise_weights(weights: Tensor) -> Tensor:
+    """Weights (..., J) summing to one over the joints; all zero stays all zero."""
+    return weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+
+
+def seen_along_depth(poses: Tensor) -> Tensor:
+    """Poses (..., 14, 3) projected along depth, centred, at unit norm: (..., 28), x of all joints, then v."""
+    flat = torch.stack([poses[..., 0], -poses[..., 2]], dim=-2)
+    flat = flat - flat.mean(dim=-1, keepdim=True)
+    flat = flat.flatten(-2)
+    return flat / torch.linalg.vector_norm(flat, dim=-1, keepdim=True).clamp(min=1e-12)
+
+
+def weighted_cosine(keypoints: Tensor, weights: Tensor, poses: Tensor) -> Tensor:
+    """How well poses fit key points: the cosine between both, weighted and each about its weighted mean.
+
+    The best scale a > 0 and shift b leave ``sum_j w_j |k_j - a p_j - b|^2 = (1 - cos^2) sum_j w_j |k_j - k|^2``;
+    a pose that fits only upside down has a cosine below zero.
+
+    Args:
+        keypoints: (..., 14, 2) pixels, v down.
+        weights: (..., 14), not negative, summing to one.
+        poses: (..., 14, 3).
+
+    Returns:
+        (...), computed in float64.
+    """
+    w = weights.double()[..., None]
+    k = keypoints.double()
+    p = torch.stack([poses[..., 0], -poses[..., 2]], dim=-1).double()
+    k, p = k - (w * k).sum(dim=-2, keepdim=True), p - (w * p).sum(dim=-2, keepdim=True)
+    product = (w * k * p).sum(dim=(-2, -1))
+    size = (w * k.square()).sum(dim=(-2, -1)) * (w * p.square()).sum(dim=(-2, -1))
+    return product / size.clamp(min=1e-24).sqrt()
+
+
+def cosine_table(moment: Tensor, weights: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`weighted_cosine` of every frame with every pose by matrix products, and the poses' weighted norms.
+
+    Args:
+        moment: (N, 28) weighted key points about their weighted mean, at unit weighted norm.
+        weights: (N, 14) summing to one.
+        seen: (L, 28) from :func:`seen_along_depth`.
+
+    Returns:
+        cosines (N, L), rounded up by what float32 may lose where the seen joints lie close together, and the
+        norms (N, L).
+    """
+    x, v = seen[:, :14].t(), seen[:, 14:].t()
+    power = torch.mm(weights, x.square() + v.square())
+    spread = power - torch.mm(weights, x).square() - torch.mm(weights, v).square()
+    norm = (spread - 1e-6 * power).clamp(min=1e-9).sqrt()
+    return torch.mm(moment, seen.t()) / norm + 1e-6, norm
+
+
+def blocks_of_similar(points: Tensor, block: int) -> tuple[Tensor, list[int]]:
+    """Sort points into blocks by halving at the median of the principal axis until they are small enough.
+
+    Args:
+        points: (L, D).
+        block: points of a block at most.
+
+    Returns:
+        (L,) int64 the order of the points, and where in it the blocks start, with L at the end.
+    """
+    waiting, done, starts = [torch.arange(points.shape[0], device=points.device)], [], [0]
+    while waiting:
+        rows = waiting.pop()
+        if rows.shape[0] <= block:
+            done.append(rows)
+            starts.append(starts[-1] + rows.shape[0])
+            continue
+        sample = points[rows[:: max(rows.shape[0] // 4096, 1)]]
+        axis = torch.linalg.eigh(sample.t().cov())[1][:, -1]
+        rows = rows[torch.mv(points[rows], axis).argsort()]
+        half = (rows.shape[0] // 2 + _STRIDE - 1) // _STRIDE * _STRIDE
+        waiting += [rows[half:], rows[:half]]
+    return torch.cat(done), starts
+
+
+def at_least(score: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows (P,) and columns (P,) of the scores (N, L) that reach the threshold (N,) of their row."""
+    # Few do: the largest of every 64 rule the others out, faster than a comparison of all would.
+    largest, every = score, 1
+    while every < 64 and largest.shape[1] % 2 == 0:
+        half = largest.shape[1] // 2
+        largest, every = torch.maximum(largest[:, :half], largest[:, half:]), 2 * every
+    groups = score.unflatten(1, (every, -1))
+    place = torch.nonzero(largest >= threshold[:, None])
+    row, group = place[:, 0], place[:, 1]
+    hit = torch.nonzero(groups[row, :, group] >= threshold[row][:, None])
+    found = hit[:, 0]
+    return row[found], hit[:, 1] * groups.shape[2] + group[found]
+
+
+def best_per_frame(frame: Tensor, pose: Tensor, cosine: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Of pairs (P,) of frame and pose the ``count`` with the largest cosines per frame, best first.
+
+    Equal cosines go by the number of the pose, the lower one first.
+    """
+    order = pose.argsort()
+    order = order[torch.sort(cosine[order], stable=True, descending=True)[1]]
+    order = order[torch.sort(frame[order], stable=True)[1]]
+    frame, pose, cosine = frame[order], pose[order], cosine[order]
+    place = torch.arange(frame.shape[0], device=frame.device) - torch.searchsorted(frame, frame)
+    keep = place < count
+    return frame[keep], pose[keep], cosine[keep]
+
+
+class PoseSearch(nn.Module):
+    """The poses of a pool, at every heading, whose projections along depth fit key points best.
+
+    A pose p fits key points k with scale a > 0 and shift b by ``min sum_j w_j |k_j - a p_j - b|^2``: the largest
+    :func:`weighted_cosine` is the nearest pose. With equal weights that is the Euclidean distance between centred
+    projections of unit norm, which the paper compares.
+
+    1. The angle between a frame and any pose of a block is at least that to the centre of the block less
+       ``asin(sqrt(max w) r / |centre|)``, r the largest distance of the block's poses from it (any angle is
+       possible where that is no sine): centring shortens, and a weighted norm is at most ``sqrt(max w)`` times
+       the plain one. The best poses of the block with the nearest centre say how large the angle may be; blocks
+       beyond are left out.
+    2. In the others cosines come from matrix products. With equal weights these are in bfloat16, about the
+       centre of the block: what rounding can change is the product of small numbers, and is bounded by the
+       rounding errors' norms (Cauchy-Schwarz). With other weights they are in float32.
+    3. Poses whose upper bound reaches the least of the best are compared in float64.
+
+    Args:
+        library: (L, 14, 3) standardised poses, see :func:`tensorsim.vision.lifting.pose_library.standardise_poses`.
+        yaws: headings at which each is tried.
+        neighbours: how many to return.
+        chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair. Blocks of 8192
+            poses are its least.
+
+    Shape:
+        key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, ``pose * yaws + heading``, best
+        first; the lower index first where two fit equally well. A frame without weights gets the first poses.
+        Not differentiable.
+    """
+
+    library: Tensor
+    order: Tensor
+    centres: Tensor
+    radius: Tensor
+    rounding: Tensor
+    coarse: Tensor
+
+    def __init__(self, library: Tensor, yaws: int, neighbours: int, chunk: int) -> None:
+        super().__init__()
+        self.yaws, self.neighbours, self.chunk = yaws, neighbours, chunk
+        seen = torch.cat([seen_along_depth(all_headings(part, yaws)).float() for part in library.split(8192)])
+        self.block = max(BLOCK, 3 * neighbours)
+        order, self.starts = blocks_of_similar(seen, self.block)
+        centres, radius, rounding = [], [], []
+        coarse = torch.empty(len(seen), 32, dtype=torch.bfloat16)
+        for start, stop in zip(self.starts[:-1], self.starts[1:], strict=True):
+            points = seen[order[start:stop]]
+            centre = points.mean(dim=0)
+            offset = points - centre
+            aside = offset @ centre
+            high = aside.bfloat16()
+            one = torch.ones_like(high)
+            coarse[start:stop] = torch.cat(
+                [offset.bfloat16(), torch.stack([high, (aside - high).bfloat16(), one, one], dim=-1)], dim=-1
+            )
+            centres.append(centre)
+            radius.append(offset.norm(dim=-1).max())
+            rounding.append((offset - offset.bfloat16()).norm(dim=-1).max())
+        self.register_buffer("library", library, persistent=False)
+        self.register_buffer("order", order, persistent=False)
+        self.register_buffer("centres", torch.stack(centres), persistent=False)
+        self.register_buffer("radius", torch.stack(radius), persistent=False)
+        self.register_buffer("rounding", torch.stack(rounding), persistent=False)
+        self.register_buffer("coarse", coarse, persistent=False)
+
+    def poses(self, index: Tensor) -> Tensor:
+        """Poses (..., 14, 3) of indices (...)."""
+        base = self.library[torch.div(index, self.yaws, rounding_mode="floor")]
+        return turn(base, (index % self.yaws).to(base.dtype) * (2 * math.pi / self.yaws))
+
+    def forward(self, keypoints: Tensor, weights: Tensor) -> Tensor:
+        """Key points (N, 14, 2) and weights (N, 14) -> indices (N, neighbours)."""
+        w = normalise_weights(weights)
+        k = keypoints - (w[..., None] * keypoints).sum(dim=-2, keepdim=True)
+        size = (w[..., None] * k.square()).sum(dim=(-2, -1)).sqrt()[:, None]
+        moment = torch.cat([w * k[..., 0], w * k[..., 1]], dim=-1) / size.clamp(min=1e-12)
+        moment, w = moment.to(self.centres.dtype), w.to(self.centres.dtype)
+        if is_exporting():
+            return self._scan(moment, w)
+        index = torch.arange(self.neighbours, device=keypoints.device).repeat(keypoints.shape[0], 1)
+        tells = (moment != 0).any(dim=-1)
+        equal = (w == w[:, :1]).all(dim=-1)
+        tile = min(max(self.chunk // self.block, 1), 512)
+        for uniform in (True, False):
+            for rows in torch.nonzero(tells & (equal == uniform))[:, 0].split(tile):
+                if rows.shape[0] > 0:
+                    index[rows] = self._search(keypoints[rows], moment[rows], w[rows], uniform)
+        return index
+
+    def _search(self, keypoints: Tensor, moment: Tensor, weights: Tensor, uniform: bool) -> Tensor:
+        """Forward for frames that all have equal weights (``uniform``), or all do not."""
+        frames = keypoints.shape[0]
+        cosine, norm = cosine_table(moment, weights, self.centres)
+        reach = weights.amax(dim=-1).sqrt()[:, None] * self.radius / norm
+        slip = torch.where(reach < 1.0, torch.asin(reach.clamp(max=1.0)), math.pi)
+        bound = torch.cos((torch.acos(cosine.clamp(-1.0, 1.0)) - slip).clamp(min=0.0))
+
+        # Any poses will do for a lower bound of the best; those of the nearest block make it a good one.
+        home = cosine.argmax(dim=-1)
+        guess = torch.zeros((frames, self.neighbours), dtype=torch.int64, device=keypoints.device)
+        homes: list[int] = torch.nonzero(torch.bincount(home))[:, 0].tolist()
+        for block in homes:
+            rows = torch.nonzero(home == block)[:, 0]
+            score, _ = self._scores(block, moment[rows], weights[rows], uniform)
+            guess[rows] = self.order[self.starts[block] + score.topk(self.neighbours, dim=-1)[1]]
+        least = weighted_cosine(keypoints[:, None], weights[:, None], self.poses(guess)).amin(dim=-1)
+
+        frame = torch.empty(0, dtype=torch.int64, device=keypoints.device)
+        pose, fit = frame, least[:0]
+        new_frames, new_poses, waiting = [frame], [pose], 0
+        alive = bound >= least[:, None] - 1e-5
+        blocks: list[int] = torch.nonzero(alive.any(dim=0))[:, 0].tolist()
+        for i in range(len(blocks)):
+            block = blocks[i]
+            rows = torch.nonzero(alive[:, block])[:, 0]
+            score, slack = self._scores(block, moment[rows], weights[rows], uniform)
+            # Scores are cosines less one; they and the threshold are rounded by 2^-8 of themselves at most.
+            threshold = ((least[rows] - 1.0 - slack) * (1.0 + 2.0**-6)).to(score.dtype)
+            row, column = at_least(score, threshold)
+            new_frames.append(rows[row])
+            new_poses.append(self.order[self.starts[block] + column])
+            waiting += row.shape[0]
+            if waiting > 4096 or i == len(blocks) - 1:
+                joined, candidates = torch.cat(new_frames), torch.cat(new_poses)
+                for at in range(0, waiting, 16384):
+                    some, candidate = joined[at : at + 16384], candidates[at : at + 16384]
+                    agree = weighted_cosine(keypoints[some], weights[some], self.poses(candidate))
+                    frame, pose, fit = best_per_frame(
+                        torch.cat([frame, some]),
+                        torch.cat([pose, candidate]),
+                        torch.cat([fit, agree]),
+                        self.neighbours,
+                    )
+                worst = torch.full_like(least, -1.0)
+                full = frame[self.neighbours - 1 :] == frame[: frame.shape[0] - self.neighbours + 1]
+                first = torch.nonzero(full)[:, 0]
+                worst[frame[first]] = fit[first + self.neighbours - 1]
+                least = torch.maximum(least, worst)
+                new_frames, new_poses, waiting = [frame[:0]], [pose[:0]], 0
+        return pose.reshape(frames, self.neighbours)
+
+    def _scores(self, block: int, moment: Tensor, weights: Tensor, uniform: bool) -> tuple[Tensor, Tensor]:
+        """Cosines less one of frames with the poses of a block, and by how much they may be too low."""
+        rows = slice(self.starts[block], self.starts[block + 1])
+        if not uniform:
+            seen = seen_along_depth(self.poses(self.order[rows])).to(moment.dtype)
+            return cosine_table(moment, weights, seen)[0] - 1.0, torch.zeros_like(moment[:, 0])
+        centre = self.centres[block]
+        point = math.sqrt(14.0) * moment
+        offset = point - centre
+        # (q' + c) (x' + c) - 1 = q' x' + c x' + (q c - 1): numbers that are not small come in two parts.
+        aside = torch.mv(point, centre) - 1.0
+        short, high = offset.to(torch.bfloat16), aside.to(torch.bfloat16)
+        one = torch.ones_like(high)
+        parts = torch.stack([one, one, high, (aside - high).to(torch.bfloat16)], dim=-1)
+        # A module cast to another precision has cast what is stored too; the numbers are the same.
+        rounded = torch.cat([short, parts], dim=-1).to(self.coarse.dtype)
+        score = torch.mm(rounded, self.coarse[rows].t())
+        slack = torch.linalg.vector_norm(offset - short, dim=-1) * self.radius[block]
+        slack = slack + torch.linalg.vector_norm(short.to(offset.dtype), dim=-1) * self.rounding[block]
+        # What is left of a number in two parts, and float32 sums.
+        slack = slack + 6e-5
+        return score, slack
+
+    def _scan(self, moment: Tensor, weights: Tensor) -> Tensor:
+        """The search without looking at values, for graphs that cannot: every frame with every pose."""
+        best = torch.full((moment.shape[0], self.neighbours), -2.0, dtype=moment.dtype, device=moment.device)
+        index = torch.zeros((moment.shape[0], self.neighbours), dtype=torch.int64, device=moment.device)
+        for block in range(len(self.starts) - 1):
+            pose = self.order[self.starts[block] : self.starts[block + 1]]
+            seen = seen_along_depth(self.poses(pose)).to(moment.dtype)
+            best, at = torch.cat([best, cosine_table(moment, weights, seen)[0]], dim=-1).topk(self.neighbours)
+            index = torch.cat([index, pose.expand(moment.shape[0], -1)], dim=-1).gather(-1, at)
+        return index

@@ -1,0 +1,1 @@
+"""Images and boxes -> COCO-17 key points."""

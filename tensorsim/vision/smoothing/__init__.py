@@ -1,0 +1,1 @@
+"""Smoothing along time at video rate."""

@@ -1,0 +1,1 @@
+"""Boxes of people per frame -> tracks."""

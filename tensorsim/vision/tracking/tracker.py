@@ -1,0 +1,377 @@
+"""Global nearest neighbour tracking of people through whole clips.
+
+The state of a track is its box (centre u, centre v, width, height) and their velocities, 8 numbers, moving
+with constant velocity. Noise is stated in sizes of the box (its longer side), so that pixels do not matter,
+and alike for the four coordinates, so that they share one 2 x 2 covariance. Frame by frame: predict, assign
+detections to tracks at the least total cost, correct, confirm, delete. A clip is known whole, so the boxes
+handed out are then smoothed in both directions.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_positive,
+    check_rank,
+    check_size,
+)
+from tensorsim.types import Detections, Tracks
+from tensorsim.vision.smoothing.kalman import smooth_constant_velocity
+from tensorsim.vision.tracking.assignment import assign
+
+
+def box_overlap(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Overlap (n, m) of ``xyxy`` boxes (n, 4) and (m, 4): over their union, and over the area of ``b``."""
+    low = torch.maximum(a[:, None, :2], b[None, :, :2])
+    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
+    intersection = (high - low).clamp(min=0.0).prod(-1)
+    area_a = (a[:, 2:] - a[:, :2]).prod(-1).unsqueeze(1)
+    area_b = (b[:, 2:] - b[:, :2]).prod(-1).unsqueeze(0)
+    return intersection / (area_a + area_b - intersection), intersection / area_b
+
+
+def xyxy_to_center(boxes: Tensor) -> Tensor:
+    """``xyxy`` boxes (..., 4) as centre u, centre v, width, height."""
+    low, high = boxes[..., :2], boxes[..., 2:]
+    return torch.cat([(low + high) / 2.0, high - low], dim=-1)
+
+
+def center_to_xyxy(boxes: Tensor) -> Tensor:
+    """The inverse of :func:`xyxy_to_center`."""
+    center, half = boxes[..., :2], boxes[..., 2:] / 2.0
+    return torch.cat([center - half, center + half], dim=-1)
+
+
+class _Living(NamedTuple):
+    """The n tracks that may still be matched; ``p00, p01, p11`` is the covariance in squared sizes."""
+
+    rows: Tensor  # (n,) row of each in the table of all tracks
+    x: Tensor  # (n, 4) box as centre and sides
+    v: Tensor  # (n, 4) its velocity, per frame
+    p00: Tensor
+    p01: Tensor
+    p11: Tensor
+    history: Tensor  # (n, window) bool, hit or not in the observed frames, newest first
+    age: Tensor  # (n,) observed frames since the start
+
+
+class GNNTracker(nn.Module):
+    """Follows people through clips: which detection is whom, and a box for every frame in between.
+
+    Input: :class:`Detections` with ``boxes`` (B, T, K, 4), the rest (B, T, K), and ``observed`` (T,) or (B,
+    T) bool, false in frames in which the detector was not run: there tracks coast and no miss is counted
+    (None: it was run in every frame). Output: :class:`Tracks`, P the largest number of people in a clip,
+    possibly 0; in each clip ordered by first frame, then larger first. Association runs on the CPU in float64
+    whatever the device; the stage is not differentiable.
+
+    1. Detections count that are people (label 0), score at least ``detection_threshold`` and measure
+       ``min_box_px`` both ways.
+    2. Cost of a pair is ``(1 - IoU) + d^2 / assignment_threshold``, d the Mahalanobis distance of the
+       detection to the predicted box: IoU decides, distance where boxes do not overlap. A pair needs
+       ``d^2 <= assignment_threshold`` and centres within ``reach`` sizes (the covariance of a coasting track
+       soon spans the picture); a detection below ``start_score`` also an IoU of ``weak_iou``, lest a lost
+       person be found in a piece of furniture. Any such pair is better than none.
+    3. A detection left over, of at least ``start_score``, starts a track, unless it overlaps a better or
+       matched one by an IoU above ``duplicate_iou``, or with more than ``duplicate_part`` of its own area:
+       one person seen twice.
+    4. A track is confirmed by ``confirm_hits`` within ``confirm_window`` observed frames (else dropped) and
+       ends after ``delete_misses`` within ``delete_window``.
+    5. People are the confirmed tracks with at least ``min_hits`` detections of ``start_score`` or more (in a clip
+       with fewer observed frames: one in each): what a detector doubts most of the time is nobody. Of more than
+       ``max_tracks`` at a time the best, by sum of scores, are kept.
+    6. A person is valid from first to last detection, gaps included, and in unobserved frames next to these.
+       The boxes are Rauch-Tung-Striebel smoothed; they may reach beyond the image a little.
+
+    Args:
+        max_tracks: people at a time.
+        confirm_hits: M of the M-of-N confirmation.
+        confirm_window: N of it, observed frames.
+        delete_misses: P of the P-of-R deletion.
+        delete_window: R of it, observed frames.
+        assignment_threshold: largest squared Mahalanobis distance of a pair.
+        detection_threshold: smallest score of a detection that counts.
+        min_box_px: smallest width and height of a detection that counts.
+        start_score: score from which a detection starts a track, and is matched without overlap.
+        weak_iou: IoU with the predicted box that a detection of less needs.
+        min_hits: detections of at least ``start_score`` from which a confirmed track is a person.
+        process_noise: density of the acceleration noise, size^2 / frame^3.
+        measurement_noise: variance of a detected coordinate, size^2.
+        initial_speed: prior standard deviation of the velocities, sizes / frame.
+        reach: largest distance of a detection from the predicted centre, sizes.
+        duplicate_iou: IoU with a better detection above which one starts no track.
+        duplicate_part: part of its area inside a better detection above which one starts no track.
+
+    Raises:
+        TensorsimError: settings out of range; shapes that do not fit; boxes or scores not finite where valid.
+    """
+
+    def __init__(
+        self,
+        max_tracks: int = 5,
+        confirm_hits: int = 2,
+        confirm_window: int = 5,
+        delete_misses: int = 23,
+        delete_window: int = 23,
+        assignment_threshold: float = 150.0,
+        detection_threshold: float = 0.3,
+        min_box_px: float = 5.0,
+        start_score: float = 0.5,
+        weak_iou: float = 0.3,
+        min_hits: int = 5,
+        process_noise: float = 1e-3,
+        measurement_noise: float = 4e-4,
+        initial_speed: float = 0.05,
+        reach: float = 1.0,
+        duplicate_iou: float = 0.4,
+        duplicate_part: float = 0.9,
+    ) -> None:
+        super().__init__()
+        for name, count in (("max_tracks", max_tracks), ("min_hits", min_hits)):
+            if count < 1:
+                raise TensorsimError(f"GNNTracker.{name}: got {count}, expected at least 1")
+        if not 1 <= confirm_hits <= confirm_window:
+            raise TensorsimError(
+                f"GNNTracker.confirm_hits: got {confirm_hits} of {confirm_window}, expected M of N"
+            )
+        if not 1 <= delete_misses <= delete_window:
+            raise TensorsimError(
+                f"GNNTracker.delete_misses: got {delete_misses} of {delete_window}, expected P of R"
+            )
+        check_positive(assignment_threshold, "GNNTracker.assignment_threshold")
+        check_positive(min_box_px, "GNNTracker.min_box_px")
+        check_positive(process_noise, "GNNTracker.process_noise")
+        check_positive(measurement_noise, "GNNTracker.measurement_noise")
+        check_positive(initial_speed, "GNNTracker.initial_speed")
+        check_positive(reach, "GNNTracker.reach")
+        for name, share in (
+            ("detection_threshold", detection_threshold),
+            ("start_score", start_score),
+            ("weak_iou", weak_iou),
+            ("duplicate_iou", duplicate_iou),
+            ("duplicate_part", duplicate_part),
+        ):
+            if not 0.0 <= share <= 1.0:
+                raise TensorsimError(f"GNNTracker.{name}: got {share}, expected between 0 and 1")
+        self.max_tracks = max_tracks
+        self.confirm_hits = confirm_hits
+        self.confirm_window = confirm_window
+        self.delete_misses = delete_misses
+        self.delete_window = delete_window
+        self.assignment_threshold = float(assignment_threshold)
+        self.detection_threshold = float(detection_threshold)
+        self.min_box_px = float(min_box_px)
+        self.start_score = float(start_score)
+        self.weak_iou = float(weak_iou)
+        self.min_hits = min_hits
+        self.process_noise = float(process_noise)
+        self.measurement_noise = float(measurement_noise)
+        self.initial_speed = float(initial_speed)
+        self.reach = float(reach)
+        self.duplicate_iou = float(duplicate_iou)
+        self.duplicate_part = float(duplicate_part)
+
+    def forward(self, detections: Detections, observed: Tensor | None = None) -> Tracks:
+        """People of each clip, padded to one count: see the class."""
+        _check(detections, observed)
+        device, cpu = detections.boxes.device, torch.device("cpu")
+        clips, frames = detections.boxes.shape[0], detections.boxes.shape[1]
+        if observed is None:
+            observed = torch.ones(frames, dtype=torch.bool)
+        looked = observed.to(cpu).expand(clips, frames)
+        real = detections.valid.to(cpu)
+        boxes = torch.where(real.unsqueeze(-1), detections.boxes.detach().to(cpu, torch.float64), 0.0)
+        scores = torch.where(real, detections.scores.detach().to(cpu, torch.float64), 0.0)
+        usable = (
+            real
+            & (detections.labels == 0).to(cpu)
+            & (scores >= self.detection_threshold)
+            & (boxes[..., 2:] - boxes[..., :2] >= self.min_box_px).all(-1)
+            & looked.unsqueeze(-1)
+        )
+        tables: list[Tensor] = []
+        for b in range(clips):
+            table = self._associate(boxes[b], scores[b], usable[b], looked[b])
+            tables.append(self._people(table, boxes[b], scores[b], int(looked[b].sum())))
+        people = max([table.shape[0] for table in tables])
+        which = torch.full((clips, people, frames), -1, dtype=torch.int64)
+        for b, table in enumerate(tables):
+            which[b, : table.shape[0]] = table
+
+        matched = which >= 0
+        index = which.clamp(min=0).transpose(1, 2).unsqueeze(-1).expand(clips, frames, people, 4)
+        measured = xyxy_to_center(boxes.gather(2, index).transpose(1, 2))
+        q, r, speed = self.process_noise, self.measurement_noise, self.initial_speed
+        smooth = smooth_constant_velocity(measured, matched, q, r, speed, 1.0)
+        smooth = torch.cat([smooth[..., :2], smooth[..., 2:].clamp(min=self.min_box_px)], dim=-1)
+        valid = _presence(matched, looked)
+        tracked = center_to_xyxy(smooth) * valid.unsqueeze(-1)
+        return Tracks(tracked.to(device, detections.boxes.dtype), valid.to(device), matched.to(device))
+
+    def _associate(self, boxes: Tensor, scores: Tensor, usable: Tensor, looked: Tensor) -> Tensor:
+        """Which detection each confirmed track of one clip is in every frame (I, T), -1 where none."""
+        frames = boxes.shape[0]
+        table = torch.full((0, frames), -1, dtype=torch.int64)
+        confirmed = torch.zeros(0, dtype=torch.bool)
+        living = self._start(torch.zeros(0, dtype=torch.int64), boxes.new_zeros(0, 4))
+        for t in range(frames):
+            living = self._predict(living)
+            if not bool(looked[t]):
+                continue
+            best_first = scores[t].argsort(descending=True, stable=True)
+            index = best_first[usable[t][best_first]]
+            box, strong = boxes[t][index], scores[t][index] >= self.start_score
+            column = self._assign(living, box, strong)
+            hit = column >= 0
+            table[living.rows[hit], t] = index[column[hit]]
+            living = self._correct(living, xyxy_to_center(box), column)
+
+            recent_hits = living.history[:, : self.confirm_window].sum(-1)
+            steady = confirmed[living.rows] | (recent_hits >= self.confirm_hits)
+            confirmed[living.rows] = steady
+            hits = living.history[:, : self.delete_window].sum(-1)
+            misses = living.age.clamp(max=self.delete_window) - hits
+            alive = torch.where(steady, misses < self.delete_misses, living.age < self.confirm_window)
+
+            new = self._newcomers(box, strong, column[hit])
+            born = torch.arange(new.shape[0]) + table.shape[0]
+            table = torch.cat([table, torch.full((new.shape[0], frames), -1, dtype=torch.int64)])
+            table[born, t] = index[new]
+            at_once = torch.full((new.shape[0],), self.confirm_hits == 1, dtype=torch.bool)
+            confirmed = torch.cat([confirmed, at_once])
+            start = self._start(born, xyxy_to_center(box[new]))
+            living = _Living(
+                torch.cat([living.rows[alive], start.rows]),
+                torch.cat([living.x[alive], start.x]),
+                torch.cat([living.v[alive], start.v]),
+                torch.cat([living.p00[alive], start.p00]),
+                torch.cat([living.p01[alive], start.p01]),
+                torch.cat([living.p11[alive], start.p11]),
+                torch.cat([living.history[alive], start.history]),
+                torch.cat([living.age[alive], start.age]),
+            )
+        return table[confirmed]
+
+    def _start(self, rows: Tensor, z: Tensor) -> _Living:
+        """Tracks that begin with boxes ``z``."""
+        p00 = torch.full_like(z[:, 0], self.measurement_noise)
+        p11 = torch.full_like(z[:, 0], self.initial_speed**2)
+        history = torch.zeros(z.shape[0], max(self.confirm_window, self.delete_window), dtype=torch.bool)
+        history[:, 0] = True
+        return _Living(
+            rows, z, torch.zeros_like(z), p00, torch.zeros_like(p00), p11, history, torch.ones_like(rows)
+        )
+
+    def _predict(self, s: _Living) -> _Living:
+        """One frame ahead: the constant-velocity model of :mod:`tensorsim.vision.smoothing.kalman` with dt = 1."""
+        q = self.process_noise
+        p00, p01, p11 = s.p00 + 2.0 * s.p01 + s.p11 + q / 3.0, s.p01 + s.p11 + q / 2.0, s.p11 + q
+        return _Living(s.rows, s.x + s.v, s.v, p00, p01, p11, s.history, s.age)
+
+    def _correct(self, s: _Living, z: Tensor, column: Tensor) -> _Living:
+        """The Kalman update of matched tracks, and one more hit or miss for all."""
+        hit = column >= 0
+        gain = hit / (s.p00 + self.measurement_noise)
+        k0, k1 = gain * s.p00, gain * s.p01
+        innovation = torch.zeros_like(s.x)
+        innovation[hit] = z[column[hit]] - s.x[hit]
+        return _Living(
+            s.rows,
+            s.x + k0.unsqueeze(-1) * innovation,
+            s.v + k1.unsqueeze(-1) * innovation,
+            (1.0 - k0) * s.p00,
+            (1.0 - k0) * s.p01,
+            s.p11 - k1 * s.p01,
+            torch.cat([hit.unsqueeze(-1), s.history[:, :-1]], dim=-1),
+            s.age + 1,
+        )
+
+    def _assign(self, s: _Living, box: Tensor, strong: Tensor) -> Tensor:
+        """Detection of each living track among the boxes of a frame (n,), -1 for none."""
+        size = s.x[:, 2:].amax(-1).clamp(min=self.min_box_px)
+        offset = (xyxy_to_center(box).unsqueeze(0) - s.x.unsqueeze(1)) / size[:, None, None]
+        distance = offset.square().sum(-1) / (s.p00 + self.measurement_noise).unsqueeze(-1)
+        x = torch.cat([s.x[:, :2], s.x[:, 2:].clamp(min=self.min_box_px)], dim=-1)
+        iou, _ = box_overlap(center_to_xyxy(x), box)
+        near = torch.linalg.vector_norm(offset[..., :2], dim=-1) <= self.reach
+        allowed = near & (distance <= self.assignment_threshold) & (strong | (iou >= self.weak_iou))
+        return assign(1.0 - iou + distance / self.assignment_threshold, allowed, 2.0)
+
+    def _newcomers(self, box: Tensor, strong: Tensor, taken: Tensor) -> Tensor:
+        """Which detections of a frame, best first, start tracks."""
+        iou, part = box_overlap(box, box)
+        double = (iou > self.duplicate_iou) | (part > self.duplicate_part)
+        blocked = ~strong | double[taken].any(0)
+        new: list[int] = []
+        for j in range(box.shape[0]):
+            if not bool(blocked[j]):
+                new.append(j)
+                blocked = blocked | double[j]
+        return torch.tensor(new, dtype=torch.int64)
+
+    def _people(self, table: Tensor, boxes: Tensor, scores: Tensor, looks: int) -> Tensor:
+        """The rows of confirmed tracks that are people, in order of appearance."""
+        hit = table >= 0
+        detection = table.clamp(min=0).t()
+        found = scores.gather(1, detection).t() * hit
+        score, strong = found.sum(-1), (found >= self.start_score) & hit
+        area = (boxes[..., 2:] - boxes[..., :2]).prod(-1)
+        mean_area = (area.gather(1, detection).t() * hit).sum(-1) / hit.sum(-1)
+        crowd = torch.zeros(table.shape[1], dtype=torch.int64)
+        kept: list[int] = []
+        best_first: list[int] = score.argsort(descending=True, stable=True).tolist()
+        for i in best_first:
+            seen: list[int] = torch.nonzero(hit[i]).squeeze(-1).tolist()
+            if int(strong[i].sum()) >= min(self.min_hits, looks):
+                span = crowd[seen[0] : seen[-1] + 1]
+                if int(span.max()) < self.max_tracks:
+                    span += 1
+                    kept.append(i)
+        rows = torch.tensor(kept, dtype=torch.int64)
+        rows = rows[mean_area[rows].argsort(descending=True, stable=True)]
+        return table[rows[hit[rows].to(torch.uint8).argmax(-1).argsort(stable=True)]]
+
+
+def _presence(matched: Tensor, looked: Tensor) -> Tensor:
+    """Frames (B, P, T) of presence: between matches, and parted from them by no look in vain."""
+    looks = looked.to(torch.int64).unsqueeze(1).expand_as(matched)
+    until = looks.cumsum(-1)
+    before = until - looks
+    hits = matched.to(torch.int64)
+    first, last = hits.argmax(-1, keepdim=True), hits.cumsum(-1).argmax(-1, keepdim=True)
+    present = (before >= before.gather(-1, first)) & (until <= until.gather(-1, last))
+    return present & matched.any(-1, keepdim=True)
+
+
+def _check(detections: Detections, observed: Tensor | None) -> None:
+    """Refuse detections that do not fit together."""
+    boxes, layout = detections.boxes, "(B, T, K, 4)"
+    check_floating(boxes, "detections.boxes")
+    check_rank(boxes, 4, "detections.boxes", layout)
+    check_size(boxes, 3, 4, "detections.boxes", layout)
+    if boxes.shape[0] == 0 or boxes.shape[1] == 0:
+        raise TensorsimError(
+            f"detections.boxes: got shape {list(boxes.shape)}, expected at least one clip and frame"
+        )
+    shape, scores, labels = boxes.shape[:3], detections.scores, detections.labels
+    check_floating(scores, "detections.scores")
+    if scores.shape != shape or labels.shape != shape or detections.valid.shape != shape:
+        raise TensorsimError(
+            f"detections: got scores {list(scores.shape)}, labels {list(labels.shape)}, "
+            f"valid {list(detections.valid.shape)}, expected {list(shape)} like the boxes"
+        )
+    if detections.valid.dtype != torch.bool:
+        raise TensorsimError(f"detections.valid: got {detections.valid.dtype}, expected bool")
+    check_finite(torch.where(detections.valid.unsqueeze(-1), boxes, 0.0), "detections.boxes where valid")
+    check_finite(torch.where(detections.valid, scores, 0.0), "detections.scores where valid")
+    if observed is not None:
+        fits = observed.shape == shape[:2] or observed.shape == shape[1:2]
+        if observed.dtype != torch.bool or not fits:
+            raise TensorsimError(
+                f"observed: got {observed.dtype} of shape {list(observed.shape)}, "
+                f"expected bool of {list(shape[1:2])} or {list(shape[:2])}"
+            )

@@ -1,0 +1,156 @@
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
+from tests.stage import StageTester
+
+
+def gaussians(centres: Tensor, height: int = 64, width: int = 48, sigma: float = 2.0) -> Tensor:
+    """Maps (..., h, w) with a peak of height 1 at ``uv`` (..., 2)."""
+    u = torch.arange(width, dtype=centres.dtype) - centres[..., 0, None]
+    v = torch.arange(height, dtype=centres.dtype) - centres[..., 1, None]
+    return torch.exp(-(v[..., :, None] ** 2 + u[..., None, :] ** 2) / (2 * sigma**2))
+
+
+def noisy_maps(batch: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
+    """Two people per map and noise, peaks also at the border."""
+    generator = torch.Generator().manual_seed(3)
+    maps = torch.zeros(*batch, 5, 20, 16, dtype=torch.float64)
+    for height in (1.0, 0.6):
+        centres = torch.rand(*batch, 5, 2, generator=generator, dtype=torch.float64)
+        maps += height * gaussians(centres * torch.tensor([15.0, 19.0]), 20, 16)
+    return (maps + 0.02 * torch.rand(maps.shape, generator=generator, dtype=torch.float64)).to(dtype)
+
+
+class TestQuarter(StageTester):
+    method = "quarter"
+
+    def make(self) -> nn.Module:
+        return HeatmapDecoder(self.method)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        return (noisy_maps(batch, dtype),)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        return [
+            ((torch.zeros(48),), r"expected \(..., h, w\)"),
+            ((torch.zeros(2, 17, 0, 48),), "with pixels"),
+            ((torch.zeros(2, 17, 64, 48, dtype=torch.int64),), "floating"),
+        ]
+
+
+class TestDark(TestQuarter):
+    method = "dark"
+
+
+@pytest.mark.parametrize("method", ["dark", "quarter"])
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-3), (torch.bfloat16, 0.5)])
+def test_maps_of_another_precision_than_the_decoder(method: str, dtype: torch.dtype, atol: float) -> None:
+    decoder, maps = HeatmapDecoder(method), gaussians(torch.tensor([[10.3, 8.4], [5.0, 12.8]]), 20, 16)
+    points, scores = decoder(maps.to(dtype))
+    assert points.dtype == scores.dtype == dtype
+    torch.testing.assert_close(points.float(), decoder(maps)[0], atol=atol, rtol=0)
+
+
+def reference_quarter(heatmap: np.ndarray) -> tuple[float, float]:
+    height, width = heatmap.shape
+    y, x = np.unravel_index(np.argmax(heatmap), heatmap.shape)
+    dx = dy = 0.0
+    if 1 < x < width - 1 and y > 0:
+        dx = np.sign(heatmap[y, x + 1] - heatmap[y, x - 1])
+    if 1 < y < height - 1 and x > 0:
+        dy = np.sign(heatmap[y + 1, x] - heatmap[y - 1, x])
+    return x + 0.25 * dx, y + 0.25 * dy
+
+
+def reference_dark(heatmap: np.ndarray, kernel: int) -> tuple[float, float]:
+    height, width = heatmap.shape
+    y, x = np.unravel_index(np.argmax(heatmap), heatmap.shape)
+    border = (kernel - 1) // 2
+    padded = cv2.GaussianBlur(np.pad(heatmap, border), (kernel, kernel), 0)
+    blurred = padded[border:-border, border:-border]
+    f = np.log(np.maximum(blurred * heatmap.max() / blurred.max(), 1e-10))
+    if not (1 < x < width - 2 and 1 < y < height - 2):
+        return float(x), float(y)
+    gradient = 0.5 * np.array([f[y, x + 1] - f[y, x - 1], f[y + 1, x] - f[y - 1, x]])
+    dxx = 0.25 * (f[y, x + 2] - 2 * f[y, x] + f[y, x - 2])
+    dyy = 0.25 * (f[y + 2, x] - 2 * f[y, x] + f[y - 2, x])
+    dxy = 0.25 * (f[y + 1, x + 1] - f[y - 1, x + 1] - f[y + 1, x - 1] + f[y - 1, x - 1])
+    hessian = np.array([[dxx, dxy], [dxy, dyy]])
+    if np.linalg.det(hessian) == 0:
+        return float(x), float(y)
+    dx, dy = -np.linalg.inv(hessian) @ gradient
+    return x + dx, y + dy
+
+
+@pytest.mark.parametrize("method", ["quarter", "dark"])
+def test_equals_the_definition(method: str) -> None:
+    maps = noisy_maps((60,), torch.float64)
+    points, scores = HeatmapDecoder(method).double()(maps)
+    assert torch.equal(scores, maps.amax((-2, -1)))
+    at_border = 0
+    for heatmap, point in zip(maps.flatten(0, 1).numpy(), points.flatten(0, 1).numpy(), strict=True):
+        expected = reference_quarter(heatmap) if method == "quarter" else reference_dark(heatmap, 11)
+        np.testing.assert_allclose(point / 4, expected, atol=1e-5)
+        at_border += float(expected[0]).is_integer() or float(expected[1]).is_integer()
+    assert 10 < at_border < 290  # both sides of the gates are met
+
+
+@pytest.mark.parametrize("kernel", [13, 17])  # OpenCV has tables of its own up to 9
+def test_dark_with_other_kernels(kernel: int) -> None:
+    maps = noisy_maps((4,), torch.float64)
+    points, _ = HeatmapDecoder("dark", kernel).double()(maps)
+    expected = [reference_dark(heatmap, kernel) for heatmap in maps.flatten(0, 1).numpy()]
+    np.testing.assert_allclose(points.flatten(0, 1).numpy() / 4, expected, atol=1e-5)
+
+
+def test_map_pixel_u_v_is_crop_pixel_4u_4v() -> None:
+    crop_points = torch.tensor([[81.3, 122.9], [96.0, 128.0], [40.0, 200.4]], dtype=torch.float64)
+    maps = gaussians(crop_points / 4)
+    points, scores = HeatmapDecoder("dark").double()(maps)
+    torch.testing.assert_close(points, crop_points, rtol=0, atol=2e-2)
+    torch.testing.assert_close(scores, maps.amax((-2, -1)))
+    points, _ = HeatmapDecoder("quarter")(maps)
+    # (20.325, 30.725) -> (20, 31) moved right and up; (24, 32) has equal neighbours; (10, 50.1) moves down.
+    expected = torch.tensor([[81.0, 123.0], [96.0, 128.0], [40.0, 201.0]], dtype=torch.float64)
+    torch.testing.assert_close(points, expected)
+
+
+def test_another_stride() -> None:
+    points, _ = HeatmapDecoder("dark", stride=8)(gaussians(torch.tensor([10.0, 20.0])))
+    torch.testing.assert_close(points, torch.tensor([80.0, 160.0]), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("method", ["quarter", "dark"])
+@pytest.mark.parametrize("level", [-1.0, 0.0])
+def test_maps_without_a_peak_give_finite_points_and_tell_by_the_score(method: str, level: float) -> None:
+    points, scores = HeatmapDecoder(method)(torch.full((2, 17, 64, 48), level))
+    assert bool((points == 0).all())
+    assert bool((scores == level).all())
+
+
+def test_no_maps() -> None:
+    for method in ("quarter", "dark"):
+        points, scores = HeatmapDecoder(method)(torch.zeros(0, 17, 64, 48))
+        assert points.shape == (0, 17, 2)
+        assert scores.shape == (0, 17)
+
+
+def test_dark_moves_with_its_map() -> None:
+    # d point / d centre is the identity in crop pixels.
+    centre = torch.tensor([20.2, 30.1], dtype=torch.float64, requires_grad=True)
+    decoder = HeatmapDecoder("dark").double()
+    jacobian = torch.autograd.functional.jacobian(lambda c: decoder(gaussians(c))[0] / 4, centre)
+    torch.testing.assert_close(jacobian, torch.eye(2, dtype=torch.float64), rtol=0, atol=1e-2)
+
+
+def test_constructor_refuses() -> None:
+    for arguments in ({"method": "udp"}, {"kernel_size": 10}, {"kernel_size": -1}, {"stride": 0}):
+        with pytest.raises(TensorsimError, match="HeatmapDecoder: got"):
+            HeatmapDecoder(**arguments)

@@ -1,0 +1,224 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
+from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
+from tests.stage import StageTester, assert_same
+
+#: COCO's constants of the object keypoint similarity: twice the annotators' standard deviation, nose first.
+OKS_KAPPA = 2 * np.array(
+    [26, 25, 25, 35, 35, 79, 79, 72, 72, 62, 62, 107, 107, 87, 87, 89, 89], dtype=np.float64
+)
+OKS_KAPPA /= 1000
+SWAPS = [(1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)]
+
+
+class Brightness(nn.Module):
+    """Heat map pixel (u, v) is the brightness of crop pixel (4u, 4v), times a gain for each keypoint."""
+
+    def forward(self, crops: Tensor) -> Tensor:
+        gain = torch.linspace(0.5, 1, 17, dtype=crops.dtype, device=crops.device)
+        return crops.mean(1, keepdim=True)[..., ::4, ::4] * gain.view(17, 1, 1)
+
+
+class Counter(nn.Module):
+    """Notes how many crops come at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: list[int] = []
+
+    def forward(self, crops: Tensor) -> Tensor:
+        self.counts.append(len(crops))
+        return crops.new_ones(len(crops), 17, 64, 48)
+
+
+def blob(points: Tensor, width: int = 320, height: int = 240, sigma: float = 9.0) -> Tensor:
+    """Grey images (B, 3, H, W) with a bright spot at ``uv`` (B, 2) each."""
+    u = torch.arange(width, dtype=points.dtype) - points[:, 0, None]
+    v = torch.arange(height, dtype=points.dtype) - points[:, 1, None]
+    spot = torch.exp(-(v[:, :, None] ** 2 + u[:, None, :] ** 2) / (2 * sigma**2))
+    return spot.unsqueeze(1).repeat(1, 3, 1, 1)
+
+
+class TestTopDownPose(StageTester):
+    batched_arguments = (0, 1, 2)
+    gradient_arguments = (0, 1)
+    batch_shapes = ((3,),)
+    exports = False  # how many boxes are valid is known at run time only
+
+    def make(self) -> nn.Module:
+        return TopDownPose(Brightness(), crop_size=(64, 48), crops_per_batch=2)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        points = torch.tensor([[40.0, 31.0], [61.0, 45.0], [70.0, 25.0]], dtype=dtype)[: batch[0]]
+        images = blob(points, 110, 80)
+        low = torch.tensor([-17.3, -21.4], dtype=dtype)
+        boxes = torch.stack(
+            [torch.cat([points + low * s, points - 1.1 * low * s], -1) for s in (1, 1.3, 2)], 1
+        )
+        valid = torch.tensor([[True, False, True], [False, True, False], [True, True, True]])[: batch[0]]
+        return images, boxes, valid
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        images, boxes, valid = self.inputs((3,), torch.float32)
+        return [
+            ((images[0], boxes, valid), "images: got shape"),
+            ((images[:, :1], boxes, valid), "images: got shape"),
+            ((images * float("nan"), boxes, valid), "NaN"),
+            ((images, boxes[0], valid), "boxes: got shape"),
+            ((images, boxes[..., :3], valid), "boxes: got shape"),
+            ((images[:2], boxes, valid), "boxes for 3 images, expected for 2"),
+            ((images, boxes * float("inf"), valid), "finite"),
+            ((images, boxes * 0, valid), "without area"),
+            ((images, boxes.long(), valid), "boxes: got dtype torch.int64"),
+            ((images, boxes, valid.float()), "expected bool of shape"),
+            ((images, boxes, valid[:, :2]), r"expected bool of shape \[3, 3\]"),
+        ]
+
+
+class TestFlipTest(StageTester):
+    batch_shapes = ((3,),)
+
+    def make(self) -> nn.Module:
+        return FlipTest(Brightness())
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        return (torch.rand(*batch, 3, 32, 64, dtype=dtype, generator=torch.Generator().manual_seed(0)),)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        return []  # its network refuses
+
+
+class TestWithHRNet(TestTopDownPose):
+    """The whole of it, the flip test too, as it goes into a scripted graph."""
+
+    def make(self) -> nn.Module:
+        torch.manual_seed(0)
+        network = HRNet(HRNetConfig(width=4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4), (64, 32))
+        return TopDownPose(network, decode="quarter", flip_test=True).eval()
+
+
+@pytest.mark.parametrize("decode", ["dark", "quarter"])
+@pytest.mark.parametrize("flip_test", [False, True])
+@pytest.mark.parametrize("image_type", ["float", "uint8"])
+def test_points_come_back_to_their_image_pixels(decode: str, flip_test: bool, image_type: str) -> None:
+    points = torch.tensor([[150.3, 101.2], [97.0, 140.6]])
+    images = blob(points)
+    if image_type == "uint8":
+        images = (images * 255).round().to(torch.uint8)
+    boxes = torch.tensor([[100.0, 20, 220, 200], [50, 100, 210, 190]])
+    boxes = torch.stack([boxes, boxes.flip(0)], 1)
+    valid = torch.tensor([[True, True], [True, False]])
+    keypoints, scores = TopDownPose(Brightness(), decode, flip_test)(images, boxes, valid)
+    # Quarter steps leave up to 1/4 heat-map pixel of up to 4.2 image pixels; the flip test, which averages
+    # crop pixels 4u and 4u - 1, moves points by 1/8 heat-map pixel.
+    tolerance = {"dark": 0.1, "quarter": 1.3}[decode] + (0.6 if flip_test else 0)
+    for frame, person in valid.nonzero().tolist():
+        error = keypoints[frame, person] - points[frame]
+        assert float(error.abs().max()) < tolerance
+        assert float(scores[frame, person, -1]) == pytest.approx(1, abs=0.1)
+    assert not keypoints[1, 1].any()
+    assert not scores[1, 1].any()
+
+
+def test_flip_test_turns_back_swaps_sides_and_moves_one_pixel() -> None:
+    crops = torch.rand(2, 3, 32, 64)
+    grey, gain = crops.mean(1, keepdim=True), torch.linspace(0.5, 1, 17).view(17, 1, 1)
+    swapped = gain.clone()
+    for left, right in SWAPS:
+        swapped[left], swapped[right] = gain[right], gain[left]
+    shifted = grey[..., ::4, 3::4]  # the map of the mirrored crop, turned back: pixel 4u + 3 at u
+    shifted = torch.cat([shifted[..., :1], shifted[..., :-1]], -1)
+    expected = (grey[..., ::4, ::4] * gain + shifted * swapped) / 2
+    torch.testing.assert_close(FlipTest(Brightness())(crops), expected)
+
+
+def test_network_sees_valid_boxes_only_and_a_few_at_once() -> None:
+    network = Counter()
+    valid = torch.rand(6, 4) < 0.6
+    boxes = torch.where(valid.unsqueeze(-1), torch.tensor([10.0, 10, 50, 90]), torch.tensor(float("nan")))
+    keypoints, _ = TopDownPose(network, crops_per_batch=5)(torch.rand(6, 3, 100, 100), boxes, valid)
+    count = int(valid.sum())
+    assert network.counts == [5] * (count // 5) + [count % 5] * (count % 5 > 0)
+    assert bool(keypoints.isfinite().all())
+
+
+def test_nobody() -> None:
+    pose = TopDownPose(Brightness())
+    for module in (pose, torch.jit.script(pose)):
+        images = torch.rand(2, 3, 50, 60)
+        for people in (0, 3):
+            keypoints, scores = module(
+                images, torch.zeros(2, people, 4), torch.zeros(2, people, dtype=torch.bool)
+            )
+            assert keypoints.shape == (2, people, 17, 2)
+            assert scores.shape == (2, people, 17)
+            assert not keypoints.any()
+            assert not scores.any()
+
+
+def test_scripted_takes_other_clips() -> None:
+    tester = TestWithHRNet()
+    pose = tester.make()
+    scripted = torch.jit.script(pose)
+    boxes = torch.tensor([10.0, 20, 60, 90]) + 5 * torch.rand(7, 5, 4)
+    valid = torch.rand(7, 5) < 0.5
+    images = torch.randint(256, (7, 3, 90, 150), dtype=torch.uint8)
+    with torch.no_grad():
+        assert_same(scripted(images, boxes, valid), pose(images, boxes, valid), atol=1e-6)
+
+
+def test_crop_size_comes_from_the_network() -> None:
+    assert TopDownPose(HRNet(HRNetConfig(4, 1, (1, 1, 1), 1, 4), (128, 96))).crop.height == 128
+    assert TopDownPose(Brightness()).crop.width == 192
+    assert TopDownPose(Brightness(), crop_size=(64, 32)).crop.width == 32
+
+
+def test_constructor_refuses() -> None:
+    with pytest.raises(TensorsimError, match="crops_per_batch"):
+        TopDownPose(Brightness(), crops_per_batch=0)
+    with pytest.raises(TensorsimError, match="expected 'dark' or 'quarter'"):
+        TopDownPose(Brightness(), decode="udp")
+    with pytest.raises(TensorsimError, match="padding"):
+        TopDownPose(Brightness(), padding=-1.0)
+
+
+def mean_oks(data: Path, **options: Any) -> float:
+    """Mean object keypoint similarity over the people of the pictures that are annotated well."""
+    annotations = json.loads((data / "coco" / "test_coco.json").read_text())
+    pose = TopDownPose(OnnxHeatmaps(data / "weights" / "simplepose_coco17_256x192.onnx"), **options)
+    similarities = []
+    for image in annotations["images"]:
+        bgr = cv2.imread(str(data / "coco" / "images" / image["file_name"]))
+        rgb = torch.from_numpy(bgr[..., ::-1].copy()).permute(2, 0, 1).unsqueeze(0)
+        people = [
+            p for p in annotations["annotations"] if p["image_id"] == image["id"] and p["num_keypoints"]
+        ]
+        x, y, w, h = torch.tensor([p["bbox"] for p in people]).unbind(-1)
+        boxes = torch.stack([x, y, x + w, y + h], -1).unsqueeze(0)
+        keypoints, _ = pose(rgb, boxes, torch.ones(1, len(people), dtype=torch.bool))
+        for person, found in zip(people, keypoints[0].double().numpy(), strict=True):
+            truth = np.array(person["keypoints"], dtype=np.float64).reshape(17, 3)
+            distance2 = ((found - truth[:, :2]) ** 2).sum(-1)
+            similarity = np.exp(-distance2 / (2 * person["area"] * OKS_KAPPA**2))
+            similarities.append(similarity[truth[:, 2] > 0].mean())
+    assert len(similarities) == 12
+    return float(np.mean(similarities))
+
+
+def test_real_people(shared_data: Path) -> None:
+    dark, quarter = mean_oks(shared_data), mean_oks(shared_data, decode="quarter")
+    assert dark > 0.79
+    assert quarter > 0.77
+    assert dark > quarter  # why it is the default
+    assert mean_oks(shared_data, flip_test=True) > dark

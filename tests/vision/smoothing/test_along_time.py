@@ -1,0 +1,80 @@
+"""Filters along tracks, against NumPy."""
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.vision.smoothing.along_time import (
+    brief_gaps,
+    fill_gaps,
+    local_linear,
+    masked_median,
+    robust_smooth,
+    running_quantile,
+)
+
+
+def test_local_linear_is_weighted_least_squares_at_every_frame() -> None:
+    generator = np.random.default_rng(0)
+    x, w = generator.standard_normal(40), generator.uniform(0.1, 1.0, 40)
+    sigma, t = 3.0, np.arange(40)
+    expected = []
+    for centre in t:
+        kernel = w * np.exp(-0.5 * ((t - centre) / sigma) ** 2) * (np.abs(t - centre) <= 13)
+        a = np.stack([np.ones(40), t - centre], axis=1)
+        root = np.sqrt(kernel)
+        expected.append(np.linalg.lstsq(root[:, None] * a, root * x, rcond=None)[0][0])
+    actual = local_linear(torch.tensor(x), torch.tensor(w), sigma)
+    np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("sigma", [0.01, 1.0, 9.0, 100.0])
+def test_straight_lines_stay(sigma: float) -> None:
+    line = 4.0 + 0.05 * torch.arange(50, dtype=torch.float64)
+    torch.testing.assert_close(local_linear(line, torch.ones_like(line), sigma), line, atol=1e-4, rtol=0)
+    valid = torch.rand(50) > 0.3
+    valid[20:26] = False
+    smooth = robust_smooth(torch.where(valid, line, torch.zeros_like(line)), valid, max(sigma, 3.0))
+    torch.testing.assert_close(smooth[valid], line[valid], atol=2e-2, rtol=0)
+
+
+def test_outliers_do_not_bend_it() -> None:
+    line = 4.0 + 0.05 * torch.arange(60, dtype=torch.float64)
+    noisy = line + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noisy[[10, 11, 30, 31, 32, 50]] += 2.0
+    everything = torch.ones(60, dtype=torch.bool)
+    assert float((robust_smooth(noisy, everything, 6.0) - line).abs().max()) < 0.05
+    assert float((robust_smooth(noisy, everything, 6.0, rounds=0) - line).abs().max()) > 0.3
+
+
+def test_single_frames_and_nothing_valid_are_finite() -> None:
+    one = torch.tensor([[3.0]])
+    torch.testing.assert_close(robust_smooth(one, torch.tensor([[True]]), 5.0), one)
+    assert bool(robust_smooth(torch.randn(2, 9), torch.zeros(2, 9, dtype=torch.bool), 3.0).isfinite().all())
+    torch.testing.assert_close(running_quantile(one, 45, 0.2), one)
+
+
+def test_running_quantile_is_numpys_nearest_rank() -> None:
+    x = np.random.default_rng(0).standard_normal((2, 30))
+    expected = np.empty_like(x)
+    for t in range(30):
+        inside = np.sort(x[:, max(t - 4, 0) : t + 5], axis=1)
+        expected[:, t] = inside[:, round(0.3 * (inside.shape[1] - 1))]
+    np.testing.assert_array_equal(running_quantile(torch.tensor(x), 9, 0.3).numpy(), expected)
+    np.testing.assert_array_equal(running_quantile(torch.tensor(x), 200, 0.0)[:, 3].numpy(), x.min(axis=1))
+
+
+def test_median_and_gaps_look_at_valid_frames_only() -> None:
+    x = torch.tensor([[9.0, 1.0, 2.0, 7.0, 3.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
+    valid = torch.tensor([[False, True, True, False, True], [False] * 5])
+    assert masked_median(x, valid).tolist() == [[2.0], [0.0]]
+    assert fill_gaps(x, valid)[0].tolist() == [1.0, 1.0, 2.0, 2.0, 3.0]
+
+
+def test_brief_gaps_lie_between_seen_frames() -> None:
+    rows = ("..x.x...x..x.", ".............", "xxxxxxxxxxxxx")
+    brief = ("...b.....bb..", ".............", ".............")
+    seen = torch.tensor([[c == "x" for c in row] for row in rows])
+    expected = torch.tensor([[c == "b" for c in row] for row in brief])
+    assert torch.equal(brief_gaps(seen, 2), expected)
+    assert not brief_gaps(seen, 0).any()
