@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
-from tensorsim.config import ACTIVITIES
+from tensorsim.config import ACTIVITIES, SimulationConfig
 from tensorsim.data.video import write_video
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
@@ -20,7 +20,6 @@ from tensorsim.streaming import maps_of_pose, progress_bar
 from tensorsim.types import Pose, RadarMaps
 
 if TYPE_CHECKING:
-    from tensorsim.radar.presets import RadarScene
     from tensorsim.sources import Source
 
 
@@ -228,19 +227,19 @@ def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
     return rows
 
 
-def summary_of(
-    source: "Source", scene: "RadarScene", pose: Pose, maps: RadarMaps, seed: int
-) -> dict[str, Any]:
-    """What ``summary.json`` says of every simulation."""
+def summary_of(source: "Source", config: SimulationConfig, pose: Pose, maps: RadarMaps) -> dict[str, Any]:
+    """What ``summary.json`` says of every simulation; ``config`` is read by :meth:`SimulationConfig.from_yaml`."""
     snr_db = float(maps.snr_db)
+    document = config.to_document()
     return {
         "source": {"kind": source.kind, **source.about},
         "people": people_of(pose, source.fps),
         "frames": pose.valid.shape[2],
         "fps": source.fps,
-        "seed": seed,
+        "seed": config.seed,
         "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
-        **{name: None if part is None else asdict(part) for name, part in scene._asdict().items()},
+        **{part: document["scene"][part] for part in ("radar", "wall", "floor")},
+        "config": document,
     }
 
 

@@ -16,7 +16,7 @@ import torch
 import tensorsim as ts
 from tensorsim import cli, streaming
 from tensorsim.commands import simulate
-from tensorsim.commands.options import RadarOptions
+from tensorsim.commands.options import RadarOptions, load_recognizer
 from tensorsim.data.video import VideoReader
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.presets import PRESETS
@@ -113,11 +113,11 @@ def test_simulate_writes_everything(
 
 def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
     """The file's radar replaces the scene's, its wall too; the scene's wall stays where the file has none."""
-    options = RadarOptions(scene="through-wall", radar="cw-24ghz")
-    assert options.radar_scene() == (PRESETS["cw-24ghz"].radar, ts.WallConfig(), None)
-    assert RadarOptions(radar="cw-24ghz").radar_scene().wall is None
-    assert RadarOptions(radar="through-wall").radar_scene() == PRESETS["through-wall"]
-    assert RadarOptions().radar_scene() == PRESETS["free-space"]
+    scene = RadarOptions(scene="through-wall", radar="cw-24ghz").configuration().scene
+    assert scene == ts.SceneConfig(PRESETS["cw-24ghz"].radar, ts.WallConfig())
+    assert RadarOptions(radar="cw-24ghz").configuration().scene.wall is None
+    assert RadarOptions(radar="through-wall").configuration().scene == PRESETS["through-wall"]
+    assert RadarOptions().configuration().scene == PRESETS["free-space"]
 
     file = tmp_path / "my.yaml"
     file.write_text(
@@ -128,7 +128,7 @@ def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> 
     assert summary["radar"]["carrier_hz"] == 3e9
     assert summary["wall"]["loss_tangent"] == 0.01
     assert summary["floor"]["relative_permittivity"] == 5.24
-    assert summary["config"]["radar"] == str(file)
+    assert summary["options"]["radar"] == str(file)
     maps = np.load(tmp_path / "out" / "maps.npz")
     assert maps["range_time"].shape == (200, 500)
     assert maps["range_m"][1] == pytest.approx(0.29979, abs=1e-5)
@@ -282,6 +282,6 @@ def test_one_line_says_what_is_wrong(
 def test_a_classifier_of_other_classes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "five.safetensors"
     save_weights(ts.recognition.SPGNet(5), path, {"network": "SPGNet", "size": "32"})
-    options = RadarOptions(classifier=str(path))
+    config = RadarOptions(classifier=str(path)).configuration()
     with pytest.raises(ts.TensorsimError, match=r"--classifier: .* 5 classes, expected the 12 activities"):
-        options.recognizer(options.radar_scene())
+        load_recognizer(config)

@@ -1,17 +1,18 @@
 """``tensorsim demo``: a person whose motion is known is filmed, and the film's maps are compared with the true ones."""
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions
+from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer
 from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from tensorsim.config import SimulationConfig
     from tensorsim.render.renderer import RenderedVideo
     from tensorsim.types import Pose
 
@@ -50,40 +51,38 @@ class Demo(NetworkOptions, RadarOptions):
         if not 0.5 <= self.duration <= 60:
             raise TensorsimError(f"--duration: got {self.duration}, expected seconds from 0.5 to 60")
         detector, pose_network = default_networks(self.detector, self.pose)
-        scene = self.radar_scene()
-        recognizer = self.recognizer(scene)
+        config = self._film_configuration(detector, pose_network)
+        recognizer = load_recognizer(config)
 
         import numpy as np
         import torch
 
         from tensorsim import results
-        from tensorsim.config import ACTIVITIES
+        from tensorsim.config import ACTIVITIES, SmoothingConfig
         from tensorsim.data.video import VideoReader, write_video
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
         from tensorsim.geometry.framing import camera_on
         from tensorsim.motion.activities import ActivityGenerator
         from tensorsim.motion.people import PeopleConfig
-        from tensorsim.pipeline import VideoToPose
+        from tensorsim.pipeline import PoseToDoppler, VideoToPose
         from tensorsim.render.renderer import PersonRenderer
         from tensorsim.sources import drawn_by, film_source
         from tensorsim.streaming import maps_of_pose
-        from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
-            networks = load_networks(detector, pose_network, self.flip_test)
-            maps_stage = self.pose_to_doppler(scene, self.duration).to(device).eval()
-            true_stage = (
-                replace(self, motion="smooth").pose_to_doppler(scene, self.duration).to(device).eval()
-            )
+            networks = load_networks(detector, pose_network, config.pose.flip_test)
+            maps_stage = PoseToDoppler.from_config(config).to(device)
+            # The true motion is known at many moments: it needs no smoothing.
+            true_stage = PoseToDoppler.from_config(config.replace(smoothing=SmoothingConfig())).to(device)
             frames = round(self.duration * FILM_FPS)
             motion = ActivityGenerator(
                 PeopleConfig(start_range_m=(NEAR_M, FAR_M), keep_range_m=(NEAR_M, FAR_M))
             )
             truth = motion.generate(
                 activity,
-                seed=self.seed,
+                seed=config.seed,
                 duration_s=frames / FILM_FPS,
                 rate_hz=FILM_FPS * MOMENTS_PER_FRAME,
             )
@@ -92,19 +91,15 @@ class Demo(NetworkOptions, RadarOptions):
             if not self.quiet:
                 print(f"rendering {frames} frames of {ACTIVITIES[activity]} ...", file=sys.stderr)
             film = PersonRenderer(camera, HEIGHT, WIDTH)(
-                truth.joints[:, ::MOMENTS_PER_FRAME], self.seed, valid=truth.valid[:, ::MOMENTS_PER_FRAME]
+                truth.joints[:, ::MOMENTS_PER_FRAME], config.seed, valid=truth.valid[:, ::MOMENTS_PER_FRAME]
             )
-            people = VideoToPose(
-                *networks,
-                person_height_m=(height_m,),
-                camera=camera,
-                smoother=KalmanSmoother(mode="forward" if self.motion == "paper" else "rts"),
-            )
+            config = config.replace(pose__person_height_m=(height_m,), pose__camera=camera)
+            people = VideoToPose.from_config(config, *networks).to(device)
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
-                source = film_source(VideoReader(folder / "film.mp4"), people.to(device).eval(), device)
-                pose, maps = results.simulate(source, maps_stage, folder, self.seed, device, self.quiet)
-                torch.manual_seed(self.seed)
+                source = film_source(VideoReader(folder / "film.mp4"), people, device)
+                pose, maps = results.simulate(source, maps_stage, folder, config.seed, device, self.quiet)
+                torch.manual_seed(config.seed)
                 true_maps = maps_of_pose(
                     true_stage,
                     true_pose(truth.joints, truth.valid),
@@ -126,13 +121,13 @@ class Demo(NetworkOptions, RadarOptions):
                 label = results.label_of(recognizer, maps)
                 summary = (
                     label
-                    | results.summary_of(source, scene, pose, maps, self.seed)
+                    | results.summary_of(source, config, pose, maps)
                     | {
                         "activity": ACTIVITIES[activity],
                         "person_height_m": round(height_m, 4),
                         **drawn_by(camera, (HEIGHT, WIDTH)),
                         "film_against_truth": likeness | joint_errors(pose, film),
-                        "config": self.described() | {"detector": str(detector), "pose": str(pose_network)},
+                        "options": self.described(),
                         "warnings": messages,
                     }
                 )
@@ -145,6 +140,13 @@ class Demo(NetworkOptions, RadarOptions):
             f"{self.out}: {ACTIVITIES[activity]}, {people_found} people found; Doppler-time map from the film "
             f"against that of the true motion: PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']}"
         )
+
+    def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":
+        """The configuration for a film of the demonstration, with the files of its networks."""
+        config = at_display_rate(self.configuration(), self.duration)
+        if not self.flip_test:
+            config = config.replace(pose__flip_test=False)
+        return config.replace(tracking__detector=str(detector), pose__network=str(pose_network))
 
 
 def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":

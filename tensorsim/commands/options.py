@@ -1,5 +1,6 @@
-"""Options of the radar that several commands share, and the stage that they describe."""
+"""Options that describe a simulation; each changes a field of its :class:`~tensorsim.SimulationConfig`."""
 
+import dataclasses
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -7,18 +8,28 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.errors import TensorsimError
 
 if TYPE_CHECKING:
-    from torch import nn
-
-    from tensorsim.pipeline import PoseToDoppler
-    from tensorsim.radar.presets import RadarScene
+    from tensorsim.config import SimulationConfig
     from tensorsim.recognition import ActivityRecognizer
 
 #: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
 FULL_RATE_PULSES = 1 << 17
 DISPLAY_RATE_HZ = 256.0
+
+#: The field of the configuration that an option sets.
+FIELDS = {
+    "body": "scene__body",
+    "integration": "processing__integration",
+    "wall_paths": "scene__wall_paths",
+    "multipath": "scene__multipath",
+    "snr": "scene__snr_db",
+    "denoiser": "processing__denoiser",
+    "classifier": "classifier",
+    "seed": "seed",
+} | PANEL_FIELDS
 
 
 def check_seed(seed: int, option: str = "--seed") -> None:
@@ -28,39 +39,44 @@ def check_seed(seed: int, option: str = "--seed") -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RadarOptions:
-    """How people's joints become maps."""
+class RadarOptions(PanelOptions):
+    """How people's joints become maps. Options without a value keep that of the configuration."""
 
-    scene: Literal["free-space", "through-wall"] = "free-space"
-    """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None
+    """Configuration of a run: a YAML file with fields of SimulationConfig, or the summary.json of an earlier run. Other
+    options change it."""
+    paper: bool = False
+    """The literal formulas of the paper everywhere (SimulationConfig.paper)."""
+    scene: Literal["free-space", "through-wall"] | None = None
+    """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath. Default: free-space."""
     radar: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, free-space, through-wall) or a YAML file with fields of
     RadarConfig; a wall that it comes with replaces the scene's, a floor adds its reflections."""
-    body: Literal["joints", "limbs", "version1"] = "joints"
+    body: Literal["joints", "limbs", "version1"] | None = None
     """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
-    cross section follows the aspect, or the 13 points of the original's first version."""
-    motion: Literal["smooth", "paper"] = "smooth"
+    cross section follows the aspect, or the 13 points of the original's first version. Default: joints."""
+    motion: Literal["smooth", "paper"] | None = None
     """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay."""
-    integration: Literal["noncoherent", "paper"] = "noncoherent"
-    """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler."""
-    wall_paths: Literal["series", "paper"] = "series"
-    """Bounces inside the wall: complete to first order, or the paper's."""
+    integration: Literal["noncoherent", "paper"] | None = None
+    """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler. Default: noncoherent."""
+    wall_paths: Literal["series", "paper"] | None = None
+    """Bounces inside the wall: complete to first order, or the paper's. Default: series."""
     multipath: bool | None = None
     """Wall bounces; default on behind a wall."""
     leakage: bool = False
     """Direct signal from transmitter to receiver."""
     wall_echo: bool = False
     """Static mirror reflection of the wall."""
-    snr: float = 50.0
-    """Signal-to-noise ratio in dB of the people's echo, per IF sample."""
+    snr: float | None = None
+    """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
     denoiser: str | None = None
     """DnCNN weights (.pth or .safetensors, or a name such as dncnn-radar-maps) to clean the shown maps."""
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
-    seed: int = 0
-    """Seed of everything that is random."""
+    seed: int | None = None
+    """Seed of everything that is random. Default: 0."""
     device: str = "auto"
     """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
     quiet: bool = False
@@ -68,23 +84,58 @@ class RadarOptions:
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
-        check_seed(self.seed)
-        if not math.isfinite(self.snr):
+        if self.seed is not None:
+            check_seed(self.seed)
+        if self.snr is not None and not math.isfinite(self.snr):
             raise TensorsimError(f"--snr: got {self.snr}, expected a finite number of dB")
         if out.exists() and not out.is_dir():
             raise TensorsimError(f"--out: {out} is a file, expected a folder")
 
     def described(self) -> dict[str, Any]:
-        """The options as ``summary.json`` has them."""
-        return {name: str(v) if isinstance(v, Path) else v for name, v in asdict(self).items()}
+        """The options that were given, as ``summary.json`` has them."""
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        return {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in asdict(self).items()
+            if value != defaults[name]
+        }
 
-    def radar_scene(self) -> "RadarScene":
-        """The radar and what surrounds it."""
-        from tensorsim.radar.presets import PRESETS, RadarScene, radar_scene
+    def configuration(self) -> "SimulationConfig":
+        """The configuration of the run: that of ``--config``, with the other options in place of its fields.
 
-        scene = PRESETS[self.scene]
+        Raises:
+            TensorsimError: a file that cannot be read, or values out of range.
+        """
+        from tensorsim.config import SimulationConfig, SmoothingConfig
+
+        config = SimulationConfig() if self.config is None else SimulationConfig.from_yaml(self.config)
+        config = self._with_scene(config)
+        if self.paper:
+            config = SimulationConfig.paper(config)
+        if self.motion is not None:
+            smoothing = SimulationConfig.paper().smoothing if self.motion == "paper" else SmoothingConfig()
+            config = config.replace(smoothing=smoothing)
+        for switch in ("leakage", "wall_echo"):
+            if getattr(self, switch):
+                config = config.replace(**{f"scene__{switch}": True})
+        for option, field in FIELDS.items():
+            value = getattr(self, option)
+            if value is not None:
+                try:
+                    config = config.replace(**{field: value})
+                except TensorsimError as error:
+                    raise TensorsimError(f"--{option.replace('_', '-')}: {error}") from None
+        return config
+
+    def _with_scene(self, config: "SimulationConfig") -> "SimulationConfig":
+        """The configuration with the radar, wall and floor that ``--scene`` and ``--radar`` name."""
+        from tensorsim.radar.presets import PRESETS, radar_scene
+
+        if self.scene is not None:
+            preset = PRESETS[self.scene]
+            config = config.replace(scene__radar=preset.radar, scene__wall=preset.wall)
         if self.radar is None:
-            return scene
+            return config
         try:
             chosen = radar_scene(self.radar)
         except TensorsimError as error:
@@ -94,65 +145,36 @@ class RadarOptions:
                 f"--radar: {self.radar} has several antennas, expected one transmitter and one receiver: the maps "
                 "of this command have no antenna dimension"
             )
-        return RadarScene(chosen.radar, chosen.wall if chosen.wall is not None else scene.wall, chosen.floor)
+        wall = chosen.wall if chosen.wall is not None else config.scene.wall
+        return config.replace(scene__radar=chosen.radar, scene__wall=wall, scene__floor=chosen.floor)
 
-    def pose_to_doppler(self, scene: "RadarScene", length_s: float) -> "PoseToDoppler":
-        """The stage from joints to maps, for people over about this many seconds."""
-        from tensorsim.enhance.dncnn import MapDenoiser
-        from tensorsim.motion.resample import PoseResampler
-        from tensorsim.motion.savgol import SavitzkyGolay
-        from tensorsim.pipeline import PoseToDoppler
-        from tensorsim.radar.simulator import RadarSimulator
 
-        radar, wall, floor = scene
-        behind_wall = wall is not None
-        simulator = RadarSimulator(
-            radar,
-            wall,
-            multipath=behind_wall if self.multipath is None else self.multipath,
-            leakage=self.leakage,
-            wall_echo=self.wall_echo,
-            wall_paths=self.wall_paths,
-            floor=floor,
-            snr_db=self.snr,
-            integration=self.integration,
-            display_rate_hz=DISPLAY_RATE_HZ if length_s * radar.prf_hz > FULL_RATE_PULSES else None,
+def at_display_rate(config: "SimulationConfig", length_s: float) -> "SimulationConfig":
+    """The configuration for motion of about this many seconds: range-time maps of long motion at a display rate."""
+    long = length_s * config.scene.radar.prf_hz > FULL_RATE_PULSES
+    if config.processing.display_rate_hz is None and long:
+        return config.replace(processing__display_rate_hz=DISPLAY_RATE_HZ)
+    return config
+
+
+def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
+    """The classifier of the maps of this radar; None if no label is wanted.
+
+    Raises:
+        TensorsimError: weights that are not there, of another network, or of other classes.
+    """
+    from tensorsim.config import ACTIVITIES
+    from tensorsim.recognition import ActivityRecognizer
+
+    if config.classifier == "none":
+        return None
+    try:
+        recognizer = ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier)
+    except TensorsimError as error:
+        raise TensorsimError(f"--classifier: {error}") from None
+    if recognizer.network.num_classes != len(ACTIVITIES):
+        raise TensorsimError(
+            f"--classifier: {config.classifier} tells {recognizer.network.num_classes} classes, expected the "
+            f"{len(ACTIVITIES)} activities"
         )
-        resampler, pulse_smoother = None, None
-        if self.motion == "paper":
-            # The panel's smoothing ratio of 0.25, read as a quarter of a second of pulses.
-            window = round(0.25 * radar.prf_hz) // 2 * 2 + 1
-            resampler = PoseResampler(radar.prf_hz, method="linear")
-            pulse_smoother = SavitzkyGolay(window, 3)
-        return PoseToDoppler(
-            simulator,
-            resampler=resampler,
-            pulse_smoother=pulse_smoother,
-            scatterers=self._scatterers(scene),
-            denoiser=None if self.denoiser is None else MapDenoiser.from_pretrained(self.denoiser),
-        )
-
-    def recognizer(self, scene: "RadarScene") -> "ActivityRecognizer | None":
-        """What tells the activity from the maps of this radar; None if it is not wanted."""
-        from tensorsim.config import ACTIVITIES
-        from tensorsim.recognition import ActivityRecognizer
-
-        if self.classifier == "none":
-            return None
-        try:
-            recognizer = ActivityRecognizer.from_pretrained(scene.radar, self.classifier)
-        except TensorsimError as error:
-            raise TensorsimError(f"--classifier: {error}") from None
-        if recognizer.network.num_classes != len(ACTIVITIES):
-            raise TensorsimError(
-                f"--classifier: {self.classifier} tells {recognizer.network.num_classes} classes, expected the "
-                f"{len(ACTIVITIES)} activities"
-            )
-        return recognizer
-
-    def _scatterers(self, scene: "RadarScene") -> "nn.Module":
-        from tensorsim.motion import Body13Scatterers, JointScatterers, LimbScatterers
-
-        if self.body == "limbs":
-            return LimbScatterers(scene.radar.tx_positions_m[0], scene.radar.rx_positions_m[0])
-        return JointScatterers() if self.body == "joints" else Body13Scatterers()
+    return recognizer

@@ -9,18 +9,29 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions
+from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer
 from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
     import torch
 
-    from tensorsim.pipeline import VideoToPose
+    from tensorsim.config import SimulationConfig
     from tensorsim.sources import Source
 
 #: Options that say something of some kinds of source only.
 _MEANT_FOR = {
     "detector": ("video",),
+    "min_detection_size": ("video",),
+    "detection_interval": ("video",),
+    "max_tracks": ("video",),
+    "confirmation_hits": ("video",),
+    "confirmation_window": ("video",),
+    "deletion_misses": ("video",),
+    "deletion_window": ("video",),
+    "assignment_threshold": ("video",),
+    "process_noise": ("video",),
+    "measurement_noise": ("video",),
+    "keypoint_threshold": ("video", "keypoints"),
     "pose": ("video",),
     "flip_test": ("video",),
     "person_height": ("video", "keypoints"),
@@ -45,16 +56,16 @@ class Simulate(NetworkOptions, RadarOptions):
     keypoints of a video as .json, or a folder with one per frame."""
     out: Path
     """Folder for the results; its files appear together, when all are complete."""
-    person_height: tuple[float, ...] = (1.80, 1.70)
-    """Body heights in metres in order of appearance; the last one serves the rest."""
+    person_height: tuple[float, ...] | None = None
+    """Body heights in metres in order of appearance; the last one serves the rest. Default: 1.80 1.70."""
     initial_distance: tuple[float, ...] | None = None
     """Distances of the people in metres when they first appear. Of a video they calibrate the focal length; captured
     motion is moved so that the first person starts there (default: where the file has it, if in front of the
     radar)."""
-    camera_fov: float = 60.0
-    """Horizontal field of view of the camera in degrees, when no initial distance is given."""
-    position: Literal["camera", "paper"] = "camera"
-    """Camera model, or the paper's pixel displacement (no motion along the optical axis)."""
+    camera_fov: float | None = None
+    """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: 60."""
+    position: Literal["camera", "paper"] | None = None
+    """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
     library: Path | None = None
     """Pool of poses for the lifting to 3D, as `tensorsim library build` writes it. Default: the shipped one."""
     fps: float | None = None
@@ -81,6 +92,7 @@ class Simulate(NetworkOptions, RadarOptions):
         from tensorsim import results
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
+        from tensorsim.pipeline import PoseToDoppler
         from tensorsim.sources import KINDS, kind_of
 
         kind = kind_of(self.source)
@@ -90,30 +102,39 @@ class Simulate(NetworkOptions, RadarOptions):
                 meant = " or ".join(KINDS[k] for k in _MEANT_FOR[field.name])
                 name = field.name.replace("_", "-")
                 raise TensorsimError(f"--{name}: got it for {KINDS[kind]}, expected it for {meant} only")
-        scene = self.radar_scene()
-        recognizer = self.recognizer(scene)
+        config = self.configuration()
+        recognizer = load_recognizer(config)
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
-            source, networks = self._source(kind, device)
+            source, config = self._source(kind, config, device)
             length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
-            stage = self.pose_to_doppler(scene, length_s).to(device).eval()
+            config = at_display_rate(config, length_s)
+            stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps = results.simulate(source, stage, folder, self.seed, device, self.quiet)
+                pose, maps = results.simulate(source, stage, folder, config.seed, device, self.quiet)
                 results.write_maps(folder, maps, results.axes_of(stage, maps))
                 label = results.label_of(recognizer, maps)
-                summary = (
-                    label
-                    | results.summary_of(source, scene, pose, maps, self.seed)
-                    | {
-                        "config": self.described() | networks,
-                        "warnings": messages,
-                    }
-                )
-                results.write_summary(folder, summary)
+                summary = label | results.summary_of(source, config, pose, maps)
+                results.write_summary(folder, summary | {"options": self.described(), "warnings": messages})
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""
         print(f"{self.out}: {int(pose.valid[0].any(1).sum())} people in {pose.valid.shape[2]} frames{shown}")
+
+    def configuration(self) -> "SimulationConfig":
+        """The configuration with the options that say how people are found."""
+        config = super().configuration()
+        camera_fov = None if self.camera_fov is None else math.radians(self.camera_fov)
+        for field, value in (
+            ("pose__person_height_m", self.person_height),
+            ("pose__initial_distance_m", self.initial_distance),
+            ("pose__camera__horizontal_fov_rad", camera_fov),
+            ("pose__position", self.position),
+            ("pose__library", None if self.library is None else str(self.library)),
+        ):
+            if value is not None:
+                config = config.replace(**{field: value})
+        return config if self.flip_test else config.replace(pose__flip_test=False)
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
@@ -128,17 +149,22 @@ class Simulate(NetworkOptions, RadarOptions):
             ):
                 unit = "pixels" if name == "image-size" else "metres"
                 raise TensorsimError(f"--{name}: got {values}, expected positive numbers of {unit}")
-        if not 0 < self.camera_fov < 180:
+        if self.camera_fov is not None and not 0 < self.camera_fov < 180:
             raise TensorsimError(f"--camera-fov: got {self.camera_fov}, expected degrees between 0 and 180")
         if not math.isfinite(self.heading):
             raise TensorsimError(f"--heading: got {self.heading}, expected a finite number of degrees")
-        if self.position == "paper" and self.initial_distance is None:
+        if self.position == "paper" and self.initial_distance is None and self.config is None:
             raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
 
-    def _source(self, kind: str, device: "torch.device") -> "tuple[Source, dict[str, str]]":
-        """The people of this kind of source, and the files of the networks that find them."""
+    def _source(
+        self, kind: str, config: "SimulationConfig", device: "torch.device"
+    ) -> "tuple[Source, SimulationConfig]":
+        """The people of this kind of source; the configuration with the files of the networks that find them."""
+        from torch import nn
+
         from tensorsim import sources
         from tensorsim.data.video import VideoReader
+        from tensorsim.pipeline import VideoToPose
 
         cut = sources.Cut(self.start, self.end, self.stride)
         if kind == "motion":
@@ -149,41 +175,18 @@ class Simulate(NetworkOptions, RadarOptions):
                 )
             start_m = None if self.initial_distance is None else self.initial_distance[0]
             turn = math.radians(self.heading)
-            return sources.motion_source(self.source, self.clip, self.fps, turn, start_m, cut), {}
+            return sources.motion_source(self.source, self.clip, self.fps, turn, start_m, cut), config
         if kind == "keypoints":
             size = None if self.image_size is None else (self.image_size[1], self.image_size[0])
-            stage = self._video_to_pose(None, None)
-            return sources.keypoint_source(self.source, stage, self.fps, size, cut), {}
-        detector, pose = default_networks(self.detector, self.pose)
+            stage = VideoToPose.from_config(config, nn.Identity(), nn.Identity())
+            return sources.keypoint_source(self.source, stage, self.fps, size, cut), config
+        detector, pose = default_networks(
+            self.detector or config.tracking.detector, self.pose or config.pose.network
+        )
+        config = config.replace(tracking__detector=str(detector), pose__network=str(pose))
         reader = VideoReader(
             self.source, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
         )
-        stage = self._video_to_pose(*load_networks(detector, pose, self.flip_test)).to(device).eval()
-        files = {"detector": str(detector), "pose": str(pose)}
-        return sources.film_source(reader, stage, device), files
-
-    def _video_to_pose(
-        self, detector: "torch.nn.Module | None", pose: "torch.nn.Module | None"
-    ) -> "VideoToPose":
-        """The stage from frames, or without networks from keypoints, to joints in the world."""
-        from torch import nn
-
-        from tensorsim.config import CameraConfig
-        from tensorsim.pipeline import VideoToPose
-        from tensorsim.vision.lifting.lifter import NearestPoseLifter
-        from tensorsim.vision.lifting.metric_pose import MetricPose
-        from tensorsim.vision.lifting.pose_library import load_pose_library
-        from tensorsim.vision.smoothing.kalman import KalmanSmoother
-
-        return VideoToPose(
-            nn.Identity() if detector is None else detector,
-            nn.Identity() if pose is None else pose,
-            lifter=None if self.library is None else NearestPoseLifter(load_pose_library(self.library)),
-            metric_pose=MetricPose(
-                CameraConfig(horizontal_fov_rad=math.radians(self.camera_fov)),
-                person_height_m=self.person_height,
-                initial_distance_m=self.initial_distance,
-                mode=self.position,
-            ),
-            smoother=KalmanSmoother(mode="forward" if self.motion == "paper" else "rts"),
-        )
+        networks = load_networks(detector, pose, config.pose.flip_test)
+        stage = VideoToPose.from_config(config, *networks).to(device)
+        return sources.film_source(reader, stage, device), config

@@ -1,22 +1,19 @@
 """The ways from a clip to its maps that are compared: whole pipelines, and pipelines with one true stage."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
+from tensorsim.config import ProcessingConfig, SceneConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import Clip
 from tensorsim.evaluation.films import CAMERA, FPS, Filmed, Observed, project, true_keypoints
 from tensorsim.evaluation.scores import Maps
-from tensorsim.motion.resample import PoseResampler
-from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import visibility_fade
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
-from tensorsim.radar.presets import RadarScene
-from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
@@ -25,6 +22,8 @@ from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
 #: Columns per second of range-time maps that have more pulses than that.
 DISPLAY_RATE_HZ = 256.0
+#: The configuration of the pipeline by whether it is the literal paper.
+CONFIGS = {False: SimulationConfig(), True: SimulationConfig.paper()}
 #: Variance in m^2 of joints from exact keypoints.
 EXACT_NOISE = 1e-6
 #: Stages in their order; the first two have a say from a film on only, the next three from keypoints on.
@@ -120,11 +119,11 @@ class Pipelines:
         scenes: by name.
     """
 
-    def __init__(self, scenes: dict[str, RadarScene]) -> None:
+    def __init__(self, scenes: dict[str, SceneConfig]) -> None:
         self.scenes = scenes
         self.lifters = {
-            False: NearestPoseLifter().eval(),
-            True: NearestPoseLifter(neighbours=1, temporal=0.0).eval(),
+            paper: NearestPoseLifter(neighbours=config.pose.neighbours, temporal=config.pose.temporal).eval()
+            for paper, config in CONFIGS.items()
         }
         self.radars = {
             (name, paper): _pose_to_doppler(scene, paper)
@@ -224,7 +223,7 @@ class Pipelines:
             CAMERA,
             (clip.height_m,),
             distance,
-            mode="paper" if setting.paper else "camera",
+            mode=CONFIGS[setting.paper].pose.position,
             calibrated=_is_exact(setting),
         )
         if setting.paper:
@@ -270,27 +269,14 @@ def _is_exact(setting: Setting) -> bool:
 
 
 def _smoother(setting: Setting, truth: Tensor) -> nn.Module:
-    smoother: nn.Module = KalmanSmoother(mode="forward" if setting.paper else "rts")
+    smoother: nn.Module = KalmanSmoother(mode=CONFIGS[setting.paper].smoothing.mode)
     if _is_exact(setting):
         smoother = KalmanSmoother(measurement_noise=EXACT_NOISE)
     return _TrueSmoothing(smoother, truth) if setting.true_stage == "smoothing" else smoother
 
 
-def _pose_to_doppler(scene: RadarScene, paper: bool) -> PoseToDoppler:
+def _pose_to_doppler(scene: SceneConfig, paper: bool) -> PoseToDoppler:
     """Free of noise: it would be the same in all maps."""
-    radar, wall, _ = scene
-    simulator = RadarSimulator(
-        radar,
-        wall=wall,
-        multipath=wall is not None,
-        wall_paths="paper" if paper else "series",
-        integration="paper" if paper else "noncoherent",
-        snr_db=None,
-        display_rate_hz=DISPLAY_RATE_HZ if radar.prf_hz > DISPLAY_RATE_HZ else None,
-    )
-    if not paper:
-        return PoseToDoppler(simulator).eval()
-    window = round(0.25 * radar.prf_hz) // 2 * 2 + 1  # the panel's smoothing ratio, as a share of a second
-    return PoseToDoppler(
-        simulator, PoseResampler(radar.prf_hz, method="linear"), SavitzkyGolay(window, 3)
-    ).eval()
+    rate_hz = DISPLAY_RATE_HZ if scene.radar.prf_hz > DISPLAY_RATE_HZ else None
+    config = SimulationConfig(replace(scene, snr_db=None), ProcessingConfig(display_rate_hz=rate_hz))
+    return PoseToDoppler.from_config(SimulationConfig.paper(config) if paper else config)

@@ -1,11 +1,11 @@
 """Scatterers -> echo -> maps."""
 
+from tensorsim.config import SceneConfig as RadarScene
 from tensorsim.radar.analysis import metrics
 from tensorsim.radar.analysis.gait import BulkDopplerCompensation, CadenceVelocityDiagram
 from tensorsim.radar.analysis.gait_parameters import GaitEstimator, GaitParameters
 from tensorsim.radar.presets import (
     PRESETS,
-    RadarScene,
     load_radar_yaml,
     load_scene_yaml,
     radar_scene,

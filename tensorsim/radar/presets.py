@@ -15,31 +15,15 @@ named keeps its default::
     floor: {}
 """
 
-import dataclasses
-import difflib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
-from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, WallConfig
+from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, SceneConfig, WallConfig
+from tensorsim.config.documents import from_document, suggestion, to_document
+from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
 
-
-class RadarScene(NamedTuple):
-    """A radar, the wall before it, and the floor below.
-
-    Attributes:
-        radar: the radar.
-        wall: the wall; None is free space.
-        floor: the floor; None is one that does not reflect.
-    """
-
-    radar: RadarConfig
-    wall: WallConfig | None = None
-    floor: FloorConfig | None = None
-
-
-#: The parts of a scene beside the radar: sections of a file by name.
+#: The parts of a scene that a file describes beside the radar.
 _SECTIONS: dict[str, type] = {"wall": WallConfig, "floor": FloorConfig}
 
 
@@ -48,12 +32,12 @@ _SECTIONS: dict[str, type] = {"wall": WallConfig, "floor": FloorConfig}
 #: of the parts, whose numbers stand beside them, and the guides of the boards; check them where it matters. The
 #: simulated pulses are evenly spaced, without pauses between frames, and the samples complex; the swept band is all
 #: sampled, where a real chirp loses some at its ends.
-PRESETS: dict[str, RadarScene] = {
+PRESETS: dict[str, SceneConfig] = {
     # The two scenes of the paper's control panel.
-    "free-space": RadarScene(RadarConfig.free_space()),
-    "through-wall": RadarScene(RadarConfig.through_wall(), WallConfig()),
+    "free-space": SceneConfig(RadarConfig.free_space()),
+    "through-wall": SceneConfig(RadarConfig.through_wall(), WallConfig()),
     # Texas Instruments AWR1642 (SWRS203) on its BOOST board: 76 to 81 GHz.
-    "ti-awr1642": RadarScene(
+    "ti-awr1642": SceneConfig(
         RadarConfig(
             carrier_hz=77e9,  # D: start of the 4 GHz band
             bandwidth_hz=4e9,  # D: widest sweep
@@ -67,7 +51,7 @@ PRESETS: dict[str, RadarScene] = {
         )
     ),
     # Texas Instruments AWR1843 (SWRS222) on its BOOST board: 76 to 81 GHz.
-    "ti-awr1843": RadarScene(
+    "ti-awr1843": SceneConfig(
         RadarConfig(
             carrier_hz=77e9,  # D: start of the 4 GHz band
             bandwidth_hz=4e9,  # D: widest sweep
@@ -81,7 +65,7 @@ PRESETS: dict[str, RadarScene] = {
         )
     ),
     # Texas Instruments IWR6843 (SWRS219) on its ISK board: 60 to 64 GHz.
-    "ti-iwr6843": RadarScene(
+    "ti-iwr6843": SceneConfig(
         RadarConfig(
             carrier_hz=60e9,  # D: start of the 4 GHz band
             bandwidth_hz=4e9,  # D: widest sweep
@@ -96,7 +80,7 @@ PRESETS: dict[str, RadarScene] = {
     ),
     # Infineon BGT60TR13C (data sheet 2.4.9): antennas in the package, one transmitter, three receivers in an L; here
     # the corner one.
-    "infineon-bgt60tr13c": RadarScene(
+    "infineon-bgt60tr13c": SceneConfig(
         RadarConfig(
             carrier_hz=58e9,  # D: 58 to 63.5 GHz
             bandwidth_hz=5.5e9,  # D: widest sweep
@@ -110,7 +94,7 @@ PRESETS: dict[str, RadarScene] = {
         )
     ),
     # Infineon BGT24MTR12 with patch arrays, as on its Position2Go board: the 24 GHz ISM band.
-    "infineon-bgt24mtr12": RadarScene(
+    "infineon-bgt24mtr12": SceneConfig(
         RadarConfig(
             carrier_hz=24e9,  # D: 24.0 to 24.25 GHz
             bandwidth_hz=250e6,  # D: all of the band, range bins of 0.6 m
@@ -124,7 +108,7 @@ PRESETS: dict[str, RadarScene] = {
         )
     ),
     # A continuous-wave Doppler sensor at 24 GHz, 160 Hz per m/s: a sweep so narrow that all is in one range bin.
-    "cw-24ghz": RadarScene(
+    "cw-24ghz": SceneConfig(
         RadarConfig(
             carrier_hz=24e9 - 0.5e6,  # D: the centre of the sweep at 24 GHz
             bandwidth_hz=1e6,  # T: range bins of 150 m
@@ -144,7 +128,7 @@ _HALF_79_GHZ = SPEED_OF_LIGHT_M_S / 79e9 / 2
 
 PRESETS |= {
     # D: four receivers half a wavelength apart, the two outer transmitters two wavelengths: a virtual row of eight.
-    "ti-awr1843-array": RadarScene(
+    "ti-awr1843-array": SceneConfig(
         replace(
             PRESETS["ti-awr1843"].radar,
             tx_m=tuple((-0.01 + 4 * k * _HALF_79_GHZ, 0.0, 1.0) for k in range(2)),
@@ -152,7 +136,7 @@ PRESETS |= {
         )
     ),
     # D: the corner of the L, its neighbours 2.5 mm beside and above it (which is up depends on the mounting).
-    "infineon-bgt60tr13c-array": RadarScene(
+    "infineon-bgt60tr13c-array": SceneConfig(
         replace(
             PRESETS["infineon-bgt60tr13c"].radar,
             rx_m=((0.0025, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0025, 0.0, 1.0025)),
@@ -161,7 +145,7 @@ PRESETS |= {
 }
 
 
-def radar_scene(name_or_path: str) -> RadarScene:
+def radar_scene(name_or_path: str) -> SceneConfig:
     """The preset of this name, or the scene of this YAML file.
 
     Raises:
@@ -173,7 +157,7 @@ def radar_scene(name_or_path: str) -> RadarScene:
         return load_scene_yaml(name_or_path)
     raise TensorsimError(
         f"radar: got {name_or_path!r}, which is no file, expected one or a preset"
-        f"{_suggestion(name_or_path, list(PRESETS))} ({', '.join(PRESETS)})"
+        f"{suggestion(name_or_path, list(PRESETS))} ({', '.join(PRESETS)})"
     )
 
 
@@ -182,7 +166,7 @@ def load_radar_yaml(path: str | Path) -> RadarConfig:
     return load_scene_yaml(path).radar
 
 
-def load_scene_yaml(path: str | Path) -> RadarScene:
+def load_scene_yaml(path: str | Path) -> SceneConfig:
     """The radar of a YAML file, and its wall and floor if the file has sections ``wall`` and ``floor``.
 
     The fields of the radar may also stand in a section ``radar``. Numbers may be written as in Python: unlike
@@ -192,28 +176,16 @@ def load_scene_yaml(path: str | Path) -> RadarScene:
         TensorsimError: no such file, no YAML, an unknown or repeated key, a value of the wrong type, or one that
             the configuration refuses; the message names file and key.
     """
-    import yaml
-
-    try:
-        document = yaml.load(Path(path).read_text(encoding="utf-8"), _unique_keys_loader())
-    except OSError as error:
-        raise TensorsimError(f"{path}: {error.strerror}") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise TensorsimError(f"{path}: not valid YAML: {error}") from None
-    document = _mapping(f"{path}", document)
-    sections = {
-        name: _mapping(f"{path}: {name}", document.pop(name))
-        for name in ("radar", *_SECTIONS)
-        if name in document
-    }
+    document = read_yaml(path)
+    sections = {name: document.pop(name) for name in ("radar", *_SECTIONS) if name in document}
     fields = sections.pop("radar", document)
     if fields is not document and document:
         raise TensorsimError(
             f"{path}: got {', '.join(map(str, document))} beside the section radar, expected them in it"
         )
-    radar = _build(f"{path}", RadarConfig, fields, ["radar", *_SECTIONS])
-    parts = {name: _build(f"{path}: {name}", _SECTIONS[name], part, []) for name, part in sections.items()}
-    return RadarScene(radar, **parts)
+    radar = from_document(f"{path}", RadarConfig, fields, ("radar", *_SECTIONS))
+    parts = {name: from_document(f"{path}: {name}", _SECTIONS[name], part) for name, part in sections.items()}
+    return SceneConfig(radar, **parts)
 
 
 def save_radar_yaml(
@@ -222,76 +194,8 @@ def save_radar_yaml(
     """Write a file from which :func:`load_scene_yaml` reads the same scene."""
     import yaml
 
-    document = _plain(dataclasses.asdict(radar))
+    document = to_document(radar)
     for name, part in (("wall", wall), ("floor", floor)):
         if part is not None:
-            document[name] = _plain(dataclasses.asdict(part))
+            document[name] = to_document(part)
     Path(path).write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-
-
-def _unique_keys_loader() -> type:
-    """YAML's safe loader, which would take the last of two equal keys, made to refuse them."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            keys = [str(key.value) for key, _ in node.value]
-            twice = sorted({key for key in keys if keys.count(key) > 1})
-            if twice:
-                raise yaml.YAMLError(f"twice the key {', '.join(twice)}")
-            return super().construct_mapping(node, deep)
-
-    return Loader
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists, as deep as they go: YAML's safe form has no tuples."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
-
-
-def _mapping(where: str, value: Any) -> dict[Any, Any]:
-    if not isinstance(value, dict):
-        raise TensorsimError(f"{where}: got {value!r}, expected keys with values")
-    return dict(value)
-
-
-def _suggestion(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name.lower(), known, n=1)
-    return f", perhaps {close[0]!r}" if close else ""
-
-
-def _build(where: str, config: type, values: dict[Any, Any], sections: list[str]) -> Any:
-    """A configuration of this dataclass from YAML's values."""
-    defaults = {field.name: field.default for field in dataclasses.fields(config)}
-    for key in values:
-        if key not in defaults:
-            raise TensorsimError(
-                f"{where}: got the key {key!r}, expected one of {', '.join([*defaults, *sections])}"
-                f"{_suggestion(str(key), [*defaults, *sections])}"
-            )
-    converted = {key: _like(f"{where}: {key}", value, defaults[key]) for key, value in values.items()}
-    try:
-        return config(**converted)
-    except TensorsimError as error:
-        raise TensorsimError(f"{where}: {error}") from None
-
-
-def _like(where: str, value: Any, default: Any) -> Any:
-    """A value of YAML in the type of a field's default: (nested) tuples of numbers, or a number.
-
-    Where the default is None, a number or none.
-    """
-    if default is None and value is None:
-        return None
-    if isinstance(default, tuple):
-        if not isinstance(value, list):
-            raise TensorsimError(f"{where}: got {value!r}, expected a list of numbers")
-        return tuple(_like(where, item, default if isinstance(item, list) else 0.0) for item in value)
-    try:
-        if isinstance(value, (int, float, str)) and not isinstance(value, bool):
-            return float(value)
-    except ValueError:
-        pass
-    raise TensorsimError(f"{where}: got {value!r}, expected a number")

@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.config import RadarConfig, WallConfig
-from tensorsim.errors import TensorsimError, check_positive, is_exporting
+from tensorsim.config import ProcessingConfig, RadarConfig, SceneConfig, WallConfig
+from tensorsim.config.processing import Mti
+from tensorsim.errors import TensorsimError, is_exporting
 from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.radar.options import configured, echo_of, refuse_conflicts
 from tensorsim.radar.processing.ambiguity import SpeedCheck, check_unambiguous
 from tensorsim.radar.processing.columns import Columns, block_rms, join_pulses
 from tensorsim.radar.processing.doppler import DopplerTimeMap
@@ -65,32 +67,20 @@ class RadarSimulator(nn.Module):
     that map alone, for data sets: fastest with ``engine="range-bins"``, few ``near_bins`` and a ``range_gate_m``.
 
     Args:
-        radar: the radar.
+        radar: the radar, or a whole :class:`~tensorsim.SceneConfig`.
         wall: a wall in the scene.
-        scene: all other arguments of an :class:`~tensorsim.radar.EchoSynthesizer`, by name: ``multipath``,
-            ``leakage``, ``wall_echo``, ``incidence``, ``floor``, ...
-        echo: a ready one, in place of the wall and the scene.
-        engine: ``"time"`` makes the IF and transforms it; ``"range-bins"`` makes the bins in closed form, see
-            :class:`~tensorsim.radar.RangeBinSynthesizer`. The maps are the same.
-        near_bins: for ``"range-bins"``: only bins within this many of each path. Faster; its error is
-            ``simulator.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann).
-        range_gate_m: (nearest, farthest) metres: the maps have these bins only. One number is the width of a
-            gate that follows the targets after the moving target indicator, see
-            :class:`~tensorsim.radar.FollowingGate`. None keeps all bins.
-        snr_db, noise_reference: see :class:`~tensorsim.radar.ReceiverNoise`; a scene without echo gets
-            the noise of one with a target of 1 m^2 at 3 m in free space. ``"absolute"`` takes the bandwidth
-            from the sample rate.
-        noise_figure_db, transmit_power_w: for ``noise_reference="absolute"``.
-        range_window: see :class:`~tensorsim.radar.RangeProfile`.
-        mti: the method of a :class:`~tensorsim.radar.MovingTargetIndicator`, or a ready one.
-        window_s, overlap, integration: see :class:`~tensorsim.radar.DopplerTimeMap`.
-        doppler: a ready one; the three arguments above then have no effect.
-        ridge_count: see :class:`~tensorsim.radar.RidgeExtractor`.
-        ridges: a ready one, in place of ``ridge_count``.
-        pulse_chunk: pulses worked on at a time, over all clips of a batch. Noise is drawn for a few chunks at
-            once, so with one seed another chunk is another realisation.
-        display_rate_hz: reduce the two range-time maps to about this many columns per second, each the root
-            of the mean power of its pulses; None keeps every pulse.
+        processing: how the signal becomes maps; None: the defaults, with ``options``.
+        antenna, learnable: see :class:`~tensorsim.radar.EchoSynthesizer`.
+        echo: an :class:`~tensorsim.radar.EchoSynthesizer` in place of one made from the scene.
+        mti: the method of a :class:`~tensorsim.radar.MovingTargetIndicator`, or a module of that class.
+        doppler, ridges: modules in place of those made from ``processing``.
+        **options: fields of :class:`~tensorsim.SceneConfig` (beside a radar) and of
+            :class:`~tensorsim.ProcessingConfig` by name: ``multipath=True``, ``snr_db=20.0``, ``ridge_count=1``, ...
+            Here ``multipath`` is off unless it is asked for.
+
+    A scene without echo gets the noise of one with a target of 1 m^2 at 3 m in free space. With ``near_bins`` the
+    relative error is ``simulator.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann). Noise is drawn
+    for a few chunks of pulses at a time, so with one seed another ``pulse_chunk`` is another realisation.
 
     Shapes: positions (..., M, S, 3) m, rcs (..., S), (..., M, S) or (S,) m^2 ->
     :class:`~tensorsim.types.RadarMaps` in float32, or float64 after ``.double()``. Differentiable but for
@@ -107,71 +97,62 @@ class RadarSimulator(nn.Module):
 
     def __init__(
         self,
-        radar: RadarConfig,
+        radar: RadarConfig | SceneConfig,
         wall: WallConfig | None = None,
         *,
-        snr_db: float | None = 50.0,
-        noise_reference: str = "echo",
-        noise_figure_db: float = 10.0,
-        transmit_power_w: float = 0.01,
-        range_window: str | None = "hamming",
-        mti: str | MovingTargetIndicator = "two-pulse",
-        window_s: float = 0.1,
-        overlap: float = 0.9,
-        integration: str = "noncoherent",
-        ridge_count: int = 3,
-        pulse_chunk: int = 1024,
-        display_rate_hz: float | None = None,
-        engine: str = "time",
-        near_bins: int | None = None,
-        range_gate_m: tuple[float, float] | float | None = None,
+        processing: ProcessingConfig | None = None,
+        antenna: nn.Module | None = None,
+        learnable: tuple[str, ...] = (),
         echo: EchoSynthesizer | None = None,
+        mti: Mti | MovingTargetIndicator | None = None,
         doppler: DopplerTimeMap | None = None,
         ridges: RidgeExtractor | None = None,
-        **scene: Any,
+        **options: Any,
     ) -> None:
         super().__init__()
+        if isinstance(mti, str):
+            options["mti"] = mti
+        scene, processing = configured(radar, wall, processing, options)
+        ready: dict[str, nn.Module | None] = {"echo": echo, "doppler": doppler, "ridges": ridges}
+        refuse_conflicts(ready, options, wall, antenna, learnable)
+        radar = scene.radar
         if radar.has_array:
             raise TensorsimError(
                 "radar: got several antennas, expected one transmitter and one receiver; for an array call the "
                 "EchoSynthesizer and the stages after it, and AngleMapper for the angles"
             )
-        if engine not in ("time", "range-bins"):
-            raise TensorsimError(f"engine: got {engine!r}, expected 'time' or 'range-bins'")
-        if near_bins is not None and engine == "time":
-            raise TensorsimError(f"near_bins: got {near_bins} with the engine 'time', expected 'range-bins'")
-        if echo is not None and (wall is not None or scene):
-            given = sorted(scene) + ["wall"] * (wall is not None)
-            raise TensorsimError(f"echo: got a ready one and {', '.join(given)}, expected one or the other")
-        self.echo = echo or EchoSynthesizer(radar, wall, pulse_chunk=pulse_chunk, **scene)
+        self.echo = echo or echo_of(scene, processing.pulse_chunk, antenna, learnable)
         self.noise = ReceiverNoise(
-            snr_db,
-            noise_reference,
+            scene.snr_db,
+            scene.noise_reference,
             empty_power=(self.echo.paths.scale / 3.0**2) ** 2,
             bandwidth_hz=radar.sample_rate_hz,
-            noise_figure_db=noise_figure_db,
-            transmit_power_w=transmit_power_w,
+            noise_figure_db=scene.noise_figure_db,
+            transmit_power_w=scene.transmit_power_w,
         )
-        fixed = None if isinstance(range_gate_m, float | int) else range_gate_m
-        self.range_profile = RangeProfile(radar, range_window, fixed)
-        total = noise_reference == "total"
+        gate_m = processing.range_gate_m
+        fixed = None if isinstance(gate_m, float | int) else gate_m
+        self.range_profile = RangeProfile(radar, processing.range_window, fixed)
+        total = scene.noise_reference == "total"
         self.engine: nn.Module = TimeEngine(self.echo, self.range_profile, total)
-        if engine == "range-bins":
-            self.engine = RangeBinEngine(RangeBinSynthesizer(self.echo, self.range_profile, near_bins), total)
+        if processing.engine == "range-bins":
+            bins = RangeBinSynthesizer(self.echo, self.range_profile, processing.near_bins)
+            self.engine = RangeBinEngine(bins, total)
         self.profile_noise = ProfileNoise(self.range_profile.window)
         self.gate: nn.Module | None = None
-        if isinstance(range_gate_m, float | int):
-            self.gate = FollowingGate(radar, self.range_profile.range_m, range_gate_m)
-        self.mti = MovingTargetIndicator(mti) if isinstance(mti, str) else mti
-        self.doppler = doppler or DopplerTimeMap(radar, window_s, overlap, integration)
-        self.ridges = ridges or RidgeExtractor(ridge_count)
-        self.pulse_chunk = pulse_chunk
+        if isinstance(gate_m, float | int):
+            self.gate = FollowingGate(radar, self.range_profile.range_m, gate_m)
+        self.mti = mti if isinstance(mti, MovingTargetIndicator) else MovingTargetIndicator(processing.mti)
+        self.doppler = doppler or DopplerTimeMap(
+            radar, processing.window_s, processing.overlap, processing.integration
+        )
+        self.ridges = ridges or RidgeExtractor(processing.ridge_count)
+        self.pulse_chunk = processing.pulse_chunk
         # Chunks in a piece: few, so that the allocator reuses their memory; not few, since pieces overlap.
         self.piece_chunks = 8
         self.range_time_block = 1
-        if display_rate_hz is not None:
-            check_positive(display_rate_hz, "display_rate_hz")
-            self.range_time_block = max(1, round(radar.prf_hz / display_rate_hz))
+        if processing.display_rate_hz is not None:
+            self.range_time_block = max(1, round(radar.prf_hz / processing.display_rate_hz))
         self.min_pulses = self.doppler.length + self.mti.lost_pulses
         self.radar = radar
 

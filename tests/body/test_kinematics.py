@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tensorsim.body import kinematics
+from tensorsim.body import proportions, skeleton
 from tensorsim.body.kinematics import BodyPose, forward_kinematics, rest_on_floor, rotation
 from tensorsim.body.skeleton import mirror
 from tensorsim.config import JOINTS
@@ -97,13 +97,13 @@ def test_rotations_are_scipys() -> None:
 def test_bone_lengths_do_not_depend_on_the_pose() -> None:
     joints = sample_poses(400, seed=3)
     for a, b, length in (
-        ("right_hip", "right_knee", kinematics.THIGH),
-        ("left_knee", "left_ankle", kinematics.SHANK),
-        ("left_shoulder", "left_elbow", kinematics.UPPER_ARM),
-        ("right_elbow", "right_wrist", kinematics.FOREARM),
-        ("right_shoulder", "left_shoulder", 2 * kinematics.HALF_SHOULDERS),
-        ("right_hip", "left_hip", 2 * kinematics.HALF_HIPS),
-        ("neck", "head", math.hypot(kinematics.NOSE_FORWARD, kinematics.NOSE_UP)),
+        ("right_hip", "right_knee", proportions.THIGH),
+        ("left_knee", "left_ankle", proportions.SHANK),
+        ("left_shoulder", "left_elbow", proportions.UPPER_ARM),
+        ("right_elbow", "right_wrist", proportions.FOREARM),
+        ("right_shoulder", "left_shoulder", 2 * proportions.HALF_SHOULDERS),
+        ("right_hip", "left_hip", 2 * proportions.HALF_HIPS),
+        ("neck", "head", math.hypot(proportions.NOSE_FORWARD, proportions.NOSE_UP)),
     ):
         measured = (at(joints, a) - at(joints, b)).norm(dim=-1)
         torch.testing.assert_close(measured, torch.full_like(measured, length), atol=1e-9, rtol=0)
@@ -127,7 +127,7 @@ def test_gradients_against_finite_differences() -> None:
 def test_a_lying_body_rests_on_its_flesh() -> None:
     lying = standing(lean=torch.tensor(RIGHT_ANGLE, dtype=torch.float64))
     joints = rest_on_floor(lying, 1.8)
-    assert float(joints[..., 2].min()) == pytest.approx(1.8 * kinematics.FLESH)
+    assert float(joints[..., 2].min()) == pytest.approx(1.8 * proportions.FLESH)
 
 
 def test_mirror_swaps_sides_and_undoes_itself() -> None:
@@ -160,7 +160,7 @@ def test_sampler_repeats_by_seed_and_covers_what_people_do() -> None:
 )
 def test_coco_key_points_refuse_other_shapes(joints: Tensor) -> None:
     with pytest.raises(TensorsimError, match="joints: got"):
-        kinematics.body_to_coco(joints)
+        skeleton.body_to_coco(joints)
 
 
 def test_sampler_refuses_too_few() -> None:

@@ -43,7 +43,7 @@ def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
     summary = json.loads((out / "summary.json").read_text())
     assert summary["source"]["kind"] == "motion"
     assert summary["frames"] == 45
-    assert summary["config"]["detector"] is None
+    assert summary["config"]["tracking"]["detector"] is None
 
     simulator = ts.radar.RadarSimulator(
         ts.RadarConfig.through_wall(), ts.WallConfig(), multipath=True, snr_db=None
@@ -135,7 +135,7 @@ def test_a_body_has_its_scatterers(walk: np.ndarray) -> None:
     scenes = {}
     for body, count in (("joints", 14), ("limbs", 36), ("version1", 13)):
         options = RadarOptions(body=body, scene="through-wall")  # type: ignore[arg-type]
-        stage = options.pose_to_doppler(options.radar_scene(), 1.5)
+        stage = ts.PoseToDoppler.from_config(options.configuration())
         points, rcs = stage.scene(stage.resampler.coefficients(joints, FPS), valid, FPS, 0, 100)
         assert points.shape == (1, 100, count, 3)
         scenes[body] = points[0, 0], rcs[0, 0]

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.skeleton import coco_to_body, mid_hips
-from tensorsim.config import ACTIVITIES, RadarConfig
+from tensorsim.config import ACTIVITIES, RadarConfig, SceneConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation import films, report, settings, truth
 from tensorsim.evaluation.clips import ActivityClip, activity_clips, captured_clips
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, project, true_keypoints
 from tensorsim.evaluation.scores import MAPS, Maps, compare, mean_maps
 from tensorsim.evaluation.settings import STAGES, Pipelines, Setting, true_lifting
-from tensorsim.radar.presets import PRESETS, RadarScene
+from tensorsim.radar.presets import PRESETS
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tests.film import RectangleDetector, StandingPose
 
@@ -335,7 +335,7 @@ def test_bad_requests_are_refused(tmp_path: Path, tmp_path_factory: pytest.TempP
 def test_motion_that_a_radar_cannot_follow_is_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slow = RadarScene(RadarConfig.through_wall(prf_hz=16.0))
+    slow = SceneConfig(RadarConfig.through_wall(prf_hz=16.0))
     monkeypatch.setitem(PRESETS, SCENE, slow)
     loop = truth.TruthLoop(tmp_path, 1, ("walking",), scenes=(SCENE,), sources=("a",), stages=False)
     with pytest.warns(UserWarning, match="S8 Walking 0, through-wall: left out"):
@@ -394,7 +394,7 @@ def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
 ) -> None:
     from tensorsim.commands.evaluate_truth import EvaluateTruth
 
-    monkeypatch.setitem(PRESETS, SCENE, RadarScene(RadarConfig.through_wall(prf_hz=16.0)))
+    monkeypatch.setitem(PRESETS, SCENE, SceneConfig(RadarConfig.through_wall(prf_hz=16.0)))
     EvaluateTruth(
         tmp_path / "out", 1, ("walking",), scenes=("through-wall",), settings=("a",), stages=False, quiet=True
     ).run()

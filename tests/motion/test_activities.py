@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import quad, solve_ivp
 from torch import Tensor
 
-from tensorsim.body import kinematics
+from tensorsim.body import proportions
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.proportions import Proportions
 from tensorsim.body.skeleton import body_to_coco, coco_to_body, mirror
@@ -74,8 +74,8 @@ def test_bones_keep_their_length() -> None:
 def test_nobody_sinks_or_floats() -> None:
     lowest = crowd().joints[..., 2].amin(dim=-1)
     assert float(lowest.min()) > 0
-    ankle_height = kinematics.ANKLE_HEIGHT * crowd().people.height_m[:, None]
-    clearance = kinematics.FLESH * crowd().people.height_m[:, None]
+    ankle_height = proportions.ANKLE_HEIGHT * crowd().people.height_m[:, None]
+    clearance = proportions.FLESH * crowd().people.height_m[:, None]
     assert float((lowest - ankle_height).min()) > -0.015
     assert float((lowest - clearance).max()) < 0.03  # between heel strike and heel off both ankles are up
 
@@ -114,13 +114,13 @@ def test_feet_on_their_way_are_in_the_air() -> None:
     joints, height = crowd().joints, crowd().people.height_m[:, None]
     for name in ("right_ankle", "left_ankle"):
         v = velocity(at(joints, name))
-        low = (at(joints, name)[:, 1:, 2] - kinematics.ANKLE_HEIGHT * height).abs() < 0.006
+        low = (at(joints, name)[:, 1:, 2] - proportions.ANKLE_HEIGHT * height).abs() < 0.006
         scuffs = v[..., :2].norm(dim=-1) * (low & (v[..., 2].abs() < 0.05))
         assert float(scuffs.max()) < 0.7
         # People who walk do lift their feet.
         walking = (
             at(joints, name)[crowd().activity == 7][..., 2]
-            - kinematics.ANKLE_HEIGHT * height[crowd().activity == 7]
+            - proportions.ANKLE_HEIGHT * height[crowd().activity == 7]
         )
         assert float(walking.amax(dim=-1).min()) > 0.1
 
@@ -355,7 +355,7 @@ def test_people_follow_their_distributions() -> None:
     assert math.pi / 6 - 0.01 < float(turned.abs().max()) <= math.pi / 6
     assert people.factor.shape == (4000, VARIED_NUMBERS)
     assert 0.149 < float((people.factor - 1).abs().max()) <= 0.15
-    thigh = torch.as_tensor(people.proportions.thigh) / kinematics.THIGH
+    thigh = torch.as_tensor(people.proportions.thigh) / proportions.THIGH
     assert float(thigh.std()) == pytest.approx(0.03, abs=0.003)
     shoulders = torch.as_tensor(people.proportions.half_shoulders)
     assert float(shoulders[people.female].mean()) < float(shoulders[~people.female].mean())

@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, WallConfig
+from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, SceneConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import (
     PRESETS,
-    RadarScene,
     load_radar_yaml,
     load_scene_yaml,
     radar_scene,
@@ -52,8 +51,8 @@ def test_presets_stay_within_the_data_sheet(name: str) -> None:
 
 
 def test_the_papers_scenes() -> None:
-    assert PRESETS["free-space"] == RadarScene(RadarConfig.free_space())
-    assert PRESETS["through-wall"] == RadarScene(RadarConfig.through_wall(), WallConfig())
+    assert PRESETS["free-space"] == SceneConfig(RadarConfig.free_space())
+    assert PRESETS["through-wall"] == SceneConfig(RadarConfig.through_wall(), WallConfig())
 
 
 def test_cw_sensor_has_160_hz_per_metre_per_second_and_one_range_bin() -> None:
@@ -104,7 +103,8 @@ def test_fields_wall_and_defaults(tmp_path: Path) -> None:
           size_m: [3, 0.1, 2.5]
         """,
     )
-    radar, wall, floor = load_scene_yaml(path)
+    scene = load_scene_yaml(path)
+    radar, wall, floor = scene.radar, scene.wall, scene.floor
     assert floor is None
     assert radar == RadarConfig(24e9, 250e6, 256e-6, 2000.0, 250e3, rx_m=(0.02, 0.0, 1.0))
     assert wall == WallConfig(relative_permittivity=4.5, size_m=(3.0, 0.1, 2.5))
@@ -115,13 +115,13 @@ def test_fields_wall_and_defaults(tmp_path: Path) -> None:
 
 def test_a_radar_section_is_the_same(tmp_path: Path) -> None:
     scene = load_scene_yaml(written(tmp_path, "radar: {prf_hz: 4096}\nwall: {}\n"))
-    assert scene == RadarScene(RadarConfig(prf_hz=4096.0), WallConfig())
+    assert scene == SceneConfig(RadarConfig(prf_hz=4096.0), WallConfig())
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_round_trip(name: str, tmp_path: Path) -> None:
     path = tmp_path / "radar.yaml"
-    save_radar_yaml(path, *PRESETS[name])
+    save_radar_yaml(path, PRESETS[name].radar, PRESETS[name].wall, PRESETS[name].floor)
     assert load_scene_yaml(path) == PRESETS[name]
     assert radar_scene(str(path)) == radar_scene(name) == PRESETS[name]
 
@@ -129,14 +129,14 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
 def test_round_trip_of_numbers_that_decimals_do_not_hold(tmp_path: Path) -> None:
     radar = RadarConfig(carrier_hz=77e9 / 3, tx_m=(1 / 3, 0.1, 2 / 7), chirp_s=1e-4 / 3)
     save_radar_yaml(tmp_path / "r.yaml", radar, WallConfig(loss_tangent=1 / 7))
-    assert load_scene_yaml(tmp_path / "r.yaml") == RadarScene(radar, WallConfig(loss_tangent=1 / 7))
+    assert load_scene_yaml(tmp_path / "r.yaml") == SceneConfig(radar, WallConfig(loss_tangent=1 / 7))
 
 
 def test_floor_section(tmp_path: Path) -> None:
     scene = load_scene_yaml(written(tmp_path, "wall: {}\nfloor: {reflection: -5e-1}\nprf_hz: 4096\n"))
-    assert scene == RadarScene(RadarConfig(prf_hz=4096.0), WallConfig(), FloorConfig(reflection=-0.5))
+    assert scene == SceneConfig(RadarConfig(prf_hz=4096.0), WallConfig(), FloorConfig(reflection=-0.5))
     scene = load_scene_yaml(written(tmp_path, "floor: {reflection: null, relative_permittivity: 3}\n"))
-    assert scene == RadarScene(RadarConfig(), None, FloorConfig(relative_permittivity=3.0))
+    assert scene == SceneConfig(RadarConfig(), None, FloorConfig(relative_permittivity=3.0))
 
 
 def test_several_receivers_become_tuples(tmp_path: Path) -> None:
@@ -197,11 +197,11 @@ def test_refuses_what_is_no_text_and_no_file(tmp_path: Path) -> None:
 
 def test_every_field_can_be_set_from_a_file(tmp_path: Path) -> None:
     """Also those that come later."""
-    scene = RadarScene(RadarConfig(), WallConfig(), FloorConfig())
-    save_radar_yaml(tmp_path / "all.yaml", *scene)
+    scene = SceneConfig(RadarConfig(), WallConfig(), FloorConfig())
+    save_radar_yaml(tmp_path / "all.yaml", scene.radar, scene.wall, scene.floor)
     assert load_scene_yaml(tmp_path / "all.yaml") == scene
     text = (tmp_path / "all.yaml").read_text()
-    for config in scene:
+    for config in (RadarConfig, WallConfig, FloorConfig):
         assert all(f"{field.name}:" in text for field in dataclasses.fields(config))
 
 

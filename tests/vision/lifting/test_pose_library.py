@@ -9,7 +9,7 @@ import torch
 import tyro
 from safetensors.torch import load_file, save_file
 
-from tensorsim.body import kinematics
+from tensorsim.body import proportions
 from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.commands.library import BuildLibrary
 from tensorsim.config import JOINTS
@@ -112,10 +112,10 @@ def test_shipped_library_is_made_of_human_bodies() -> None:
     knee, ankle = poses[:, JOINTS.index("left_knee")], poses[:, JOINTS.index("left_ankle")]
     shank = (knee - ankle).norm(dim=-1)
     assert (
-        0.9 * kinematics.SHANK
+        0.9 * proportions.SHANK
         < float(shank.quantile(0.05))
         < float(shank.quantile(0.95))
-        < 1.1 * kinematics.SHANK
+        < 1.1 * proportions.SHANK
     )
 
 

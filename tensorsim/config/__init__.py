@@ -1,0 +1,34 @@
+"""Frozen configurations: one dataclass per concern, joined in :class:`SimulationConfig`.
+
+Every default is that of the control panel of the original application (RadHARSimulator V2), or the physically correct
+form where the paper's is not; :meth:`SimulationConfig.paper` is the literal paper.
+"""
+
+from tensorsim.config.camera import CameraConfig
+from tensorsim.config.checks import Vector
+from tensorsim.config.names import ACTIVITIES, COCO_KEYPOINTS, JOINT_RCS_M2, JOINTS
+from tensorsim.config.people import PoseConfig, SmoothingConfig, TrackerConfig
+from tensorsim.config.processing import ProcessingConfig
+from tensorsim.config.radar import SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.config.scene import SceneConfig
+from tensorsim.config.simulation import SimulationConfig
+from tensorsim.config.surroundings import FloorConfig, WallConfig
+
+__all__ = [
+    "ACTIVITIES",
+    "COCO_KEYPOINTS",
+    "JOINTS",
+    "JOINT_RCS_M2",
+    "SPEED_OF_LIGHT_M_S",
+    "CameraConfig",
+    "FloorConfig",
+    "PoseConfig",
+    "ProcessingConfig",
+    "RadarConfig",
+    "SceneConfig",
+    "SimulationConfig",
+    "SmoothingConfig",
+    "TrackerConfig",
+    "Vector",
+    "WallConfig",
+]

@@ -1,0 +1,73 @@
+"""Checks that the configurations share."""
+
+import math
+from numbers import Real
+from typing import Any, get_args
+
+from tensorsim.errors import TensorsimError
+
+Vector = tuple[float, float, float]
+
+
+def is_finite(value: Any) -> bool:
+    """Whether this is a real number other than NaN and infinity."""
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def require_positive(owner: str, **values: float) -> None:
+    """Refuse values that are not positive finite numbers."""
+    for name, value in values.items():
+        if not (is_finite(value) and value > 0):
+            raise TensorsimError(f"{owner}.{name}: got {value!r}, expected a positive finite number")
+
+
+def require_dielectric(owner: str, relative_permittivity: float, loss_tangent: float) -> None:
+    """Refuse a permittivity below 1 or a negative loss tangent."""
+    for name, value, least in (
+        ("relative_permittivity", relative_permittivity, 1),
+        ("loss_tangent", loss_tangent, 0),
+    ):
+        if not (is_finite(value) and value >= least):
+            raise TensorsimError(f"{owner}.{name}: got {value}, expected a finite number >= {least}")
+
+
+def as_positions(value: Any) -> Any:
+    """Arrays and lists as tuples, so that a configuration is hashable; a tuple of numbers stays as it is."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return tuple(as_positions(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+def listed(positions: Any) -> tuple[Vector, ...]:
+    """One position, or several, as several."""
+    several = isinstance(positions, tuple) and len(positions) > 0 and isinstance(positions[0], tuple)
+    return positions if several else (positions,)
+
+
+def require_vector(owner: str, **values: Vector) -> None:
+    """Refuse values that are not three finite numbers."""
+    for name, value in values.items():
+        if not (isinstance(value, tuple) and len(value) == 3 and all(is_finite(v) for v in value)):
+            raise TensorsimError(
+                f"{owner}.{name}: got {value!r}, expected three finite numbers (x, y, z) in metres"
+            )
+
+
+def require_choices(config: Any, **choices: Any) -> None:
+    """Refuse fields of a configuration that are not one of the values of their ``Literal`` type."""
+    for name, literal in choices.items():
+        value, allowed = getattr(config, name), get_args(literal)
+        if value not in allowed:
+            listed_values = ", ".join(repr(choice) for choice in allowed)
+            raise TensorsimError(
+                f"{type(config).__name__}.{name}: got {value!r}, expected one of {listed_values}"
+            )
+
+
+def require_counts(config: Any, *names: str) -> None:
+    """Refuse fields of a configuration that are not integers of at least 1."""
+    for name in names:
+        value = getattr(config, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise TensorsimError(
+                f"{type(config).__name__}.{name}: got {value!r}, expected an integer of at least 1"
+            )

@@ -1,0 +1,106 @@
+"""Configurations from and to plain documents (mappings, lists, numbers), as YAML holds them."""
+
+import dataclasses
+import difflib
+import types
+import typing
+from typing import Any
+
+from tensorsim.errors import TensorsimError
+
+
+def to_document(value: Any) -> Any:
+    """A configuration as mappings, lists, numbers and strings."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_document(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    return [to_document(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+def from_document(where: str, config: type, document: Any, more_keys: tuple[str, ...] = ()) -> Any:
+    """A configuration of this dataclass from a mapping; fields that are missing keep their default.
+
+    Args:
+        where: begins the message of an error, e.g. file and section.
+        config: a dataclass.
+        document: a mapping, its keys the fields; numbers may be strings such as ``77e9``, which YAML 1.1 reads so.
+        more_keys: keys that are allowed elsewhere, for the message.
+
+    Raises:
+        TensorsimError: an unknown key, a value of the wrong type, or one that the configuration refuses.
+    """
+    if not isinstance(document, dict):
+        raise TensorsimError(f"{where}: got {document!r}, expected keys with values")
+    hints = typing.get_type_hints(config)
+    values = {}
+    for key, value in document.items():
+        if key not in hints:
+            known = [*hints, *more_keys]
+            raise TensorsimError(
+                f"{where}: got the key {key!r}, expected one of {', '.join(known)}{suggestion(str(key), known)}"
+            )
+        values[key] = _convert(f"{where}: {key}", value, hints[key])
+    try:
+        return config(**values)
+    except TensorsimError as error:
+        raise TensorsimError(f"{where}: {error}") from None
+
+
+def suggestion(name: str, known: list[str]) -> str:
+    """``, perhaps 'x'`` where one of the known names is close to this one; else nothing."""
+    close = difflib.get_close_matches(name.lower(), known, n=1)
+    return f", perhaps {close[0]!r}" if close else ""
+
+
+def _convert(where: str, value: Any, hint: Any) -> Any:
+    """A value of a document in the type of a field."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(where, value, arguments)
+    if dataclasses.is_dataclass(hint):
+        return from_document(where, typing.cast(type, hint), value)
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise TensorsimError(f"{where}: got {value!r}, expected a list of numbers")
+        # The configuration checks the length.
+        return tuple(_convert(where, item, arguments[0]) for item in value)
+    if origin is typing.Literal:
+        return value  # the configuration checks its choices
+    if hint in (bool, str):
+        if isinstance(value, hint):
+            return value
+        raise TensorsimError(
+            f"{where}: got {value!r}, expected {'true or false' if hint is bool else 'text'}"
+        )
+    number = _number(value)
+    if number is None:
+        raise TensorsimError(f"{where}: got {value!r}, expected a number")
+    if hint is int:
+        if not number.is_integer():
+            raise TensorsimError(f"{where}: got {value!r}, expected a whole number")
+        return int(number)
+    return number
+
+
+def _convert_union(where: str, value: Any, kinds: tuple[Any, ...]) -> Any:
+    if value is None and type(None) in kinds:
+        return None
+    # A list of lists is for a tuple of tuples, where the field takes one as well as a plain tuple.
+    nested = isinstance(value, list) and any(isinstance(item, list) for item in value)
+    fitting = [
+        kind
+        for kind in kinds
+        if kind is not type(None)
+        and (typing.get_origin(kind) is tuple) == isinstance(value, list)
+        and (typing.get_origin((*typing.get_args(kind), None)[0]) is tuple) == nested
+    ]
+    if not fitting:
+        lists = all(typing.get_origin(kind) is tuple for kind in kinds)
+        raise TensorsimError(f"{where}: got {value!r}, expected a {'list of numbers' if lists else 'number'}")
+    return _convert(where, value, fitting[0])
+
+
+def _number(value: Any) -> float | None:
+    try:
+        return None if isinstance(value, bool) or not isinstance(value, (int, float, str)) else float(value)
+    except (ValueError, OverflowError):
+        return None

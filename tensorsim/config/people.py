@@ -1,0 +1,156 @@
+"""From frames to smooth motion: tracking, pose and its place in the world, smoothing."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tensorsim.config.camera import CameraConfig
+from tensorsim.config.checks import require_choices, require_counts, require_positive
+from tensorsim.errors import TensorsimError
+
+Position = Literal["camera", "paper"]
+Resampling = Literal["spline", "linear"]
+SmoothingMode = Literal["rts", "forward"]
+
+#: Body weights of the panel in kg, at which its cross sections hold.
+PANEL_WEIGHTS_KG = (84.24, 75.00)
+#: Initial distances of the panel in metres; the paper's position cannot do without.
+PANEL_DISTANCES_M = (4.00, 0.50)
+#: Body surface grows with this power of the weight (Du Bois and Du Bois, Arch. Intern. Med. 17, 1916).
+WEIGHT_EXPONENT = 0.425
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """Detection and tracking; see :class:`tensorsim.vision.GNNTracker`.
+
+    Attributes:
+        detector: name or file of the detector's weights; None is the shipped network.
+        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2).
+        min_box_px: smallest width and height of a detection in pixels (panel: minimum detection size, 5 x 5).
+        max_tracks: people at a time (panel: maximum number of tracks, 5).
+        confirm_hits: detections that confirm a track (panel: confirmation threshold, 2 of 5) ...
+        confirm_window: ... within so many frames in which the detector ran.
+        delete_misses: misses that end a track (panel: deletion threshold, 23 of 23) ...
+        delete_window: ... within so many frames in which the detector ran.
+        assignment_threshold: largest squared Mahalanobis distance of an assignment (panel: 150).
+        process_noise: density of the acceleration noise of a box, size^2 / frame^3 (panel: process noise, 0.001).
+        measurement_noise: variance of a detected coordinate, size^2 (panel: Kalman measurement noise, 0.01).
+
+    Raises:
+        TensorsimError: numbers out of range.
+    """
+
+    detector: str | None = None
+    detection_interval: int = 2
+    min_box_px: float = 5.0
+    max_tracks: int = 5
+    confirm_hits: int = 2
+    confirm_window: int = 5
+    delete_misses: int = 23
+    delete_window: int = 23
+    assignment_threshold: float = 150.0
+    process_noise: float = 1e-3
+    measurement_noise: float = 4e-4
+
+    def __post_init__(self) -> None:
+        require_counts(
+            self,
+            "detection_interval",
+            "max_tracks",
+            "confirm_hits",
+            "confirm_window",
+            "delete_misses",
+            "delete_window",
+        )
+        require_positive(
+            "TrackerConfig",
+            assignment_threshold=self.assignment_threshold,
+            process_noise=self.process_noise,
+            measurement_noise=self.measurement_noise,
+        )
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """Key points, lifting to 3D and position in the world.
+
+    Attributes:
+        network: name or file of the pose network's weights; None is the shipped network.
+        flip_test: average the network's answer with that for the mirror image.
+        keypoint_threshold: score from which a key point counts as seen (panel: key point threshold, 0.3).
+        person_height_m: body heights by order of appearance; the last serves all others (panel: 1.80, 1.70 m).
+        person_weight_kg: body weights likewise (panel: 84.24, 75.00 kg). Cross sections scale with the body surface,
+            ``(weight / panel weight)^0.425``.
+        initial_distance_m: distances of the people when they appear, which calibrate the focal length (panel:
+            4.00, 0.50 m); None takes the camera's focal length.
+        camera: pinhole camera.
+        position: ``"camera"`` (pinhole camera) or ``"paper"`` (increments of pixels times metres per pixel).
+        library: file of the pose library; None is the shipped one.
+        neighbours: poses of the library that are averaged per frame; 1 is the paper's nearest match.
+        temporal: weight of the change between frames in the choice of poses; 0 matches each frame alone.
+        fewest_joints: joints of the 14 that a frame needs to count.
+
+    Raises:
+        TensorsimError: numbers out of range or an unknown choice.
+    """
+
+    network: str | None = None
+    flip_test: bool = True
+    keypoint_threshold: float = 0.3
+    person_height_m: tuple[float, ...] = (1.80, 1.70)
+    person_weight_kg: tuple[float, ...] = PANEL_WEIGHTS_KG
+    initial_distance_m: tuple[float, ...] | None = None
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    position: Position = "camera"
+    library: str | None = None
+    neighbours: int = 32
+    temporal: float = 1.0
+    fewest_joints: int = 5
+
+    def __post_init__(self) -> None:
+        require_choices(self, position=Position)
+        require_counts(self, "neighbours", "fewest_joints")
+        require_positive("PoseConfig", keypoint_threshold=self.keypoint_threshold)
+        for name in ("person_height_m", "person_weight_kg", "initial_distance_m"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if len(values) == 0:
+                raise TensorsimError(f"PoseConfig.{name}: got no values, expected one per person")
+            for value in values:
+                require_positive("PoseConfig", **{name: value})
+
+    def rcs_scale(self, person: int) -> float:
+        """Factor on the cross sections of this person, by weight."""
+        weight = self.person_weight_kg[min(person, len(self.person_weight_kg) - 1)]
+        panel = PANEL_WEIGHTS_KG[min(person, len(PANEL_WEIGHTS_KG) - 1)]
+        return (weight / panel) ** WEIGHT_EXPONENT
+
+
+@dataclass(frozen=True)
+class SmoothingConfig:
+    """Smoothing at video rate and interpolation to the pulse rate.
+
+    Attributes:
+        mode: ``"rts"`` smooths in both directions; ``"forward"`` is the paper's Kalman filter, which lags.
+        brief_gap_s: a joint that is hidden for at most so many seconds is predicted by the smoother.
+        resampling: ``"spline"`` (twice differentiable) or ``"linear"``, the paper's.
+        smoothing_ratio: length of a Savitzky-Golay filter at pulse rate in seconds (panel: smoothing ratio, 0.25);
+            None leaves it out.
+        polynomial_order: of the Savitzky-Golay filter.
+
+    Raises:
+        TensorsimError: numbers out of range or an unknown choice.
+    """
+
+    mode: SmoothingMode = "rts"
+    brief_gap_s: float = 0.25
+    resampling: Resampling = "spline"
+    smoothing_ratio: float | None = None
+    polynomial_order: int = 3
+
+    def __post_init__(self) -> None:
+        require_choices(self, mode=SmoothingMode, resampling=Resampling)
+        require_counts(self, "polynomial_order")
+        if self.smoothing_ratio is not None:
+            require_positive("SmoothingConfig", smoothing_ratio=self.smoothing_ratio)

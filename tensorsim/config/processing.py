@@ -1,0 +1,65 @@
+"""From the intermediate-frequency signal to maps."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from tensorsim.config.checks import require_choices, require_counts, require_positive
+from tensorsim.errors import TensorsimError
+
+RangeWindow = Literal["hamming", "hann", "blackman"]
+Mti = Literal["two-pulse", "n-pulse", "mean", "high-pass"]
+Integration = Literal["noncoherent", "coherent", "paper"]
+Engine = Literal["time", "range-bins"]
+
+
+@dataclass(frozen=True)
+class ProcessingConfig:
+    """How the radar's signal becomes maps.
+
+    Attributes:
+        range_window: window over fast time; None is rectangular.
+        mti: moving target indicator, see :class:`tensorsim.radar.MovingTargetIndicator`.
+        window_s: length of the STFT window in seconds (panel: STFT window, 0.1 s).
+        overlap: shared part of neighbouring STFT windows (panel: overlap, 0.9).
+        integration: sum over range bins, see :class:`tensorsim.radar.DopplerTimeMap`.
+        ridge_count: ridges of the Doppler-time map (panel: 3).
+        denoiser: name or file of DnCNN weights that clean the maps (panel: denoiser on/off); None is off.
+        display_rate_hz: columns per second of the range-time maps; None keeps every pulse.
+        engine: ``"time"`` synthesises the signal and transforms it; ``"range-bins"`` computes the range bins in
+            closed form.
+        near_bins: with ``engine="range-bins"``, bins on each side of a path that are computed; None is all.
+        range_gate_m: (nearest, farthest) metres of the bins that are used, or the half width in metres of a gate
+            that follows the people; None uses all bins.
+        pulse_chunk: pulses that are worked on at a time; bounds memory.
+
+    Raises:
+        TensorsimError: an unknown choice, or numbers out of range.
+    """
+
+    range_window: RangeWindow | None = "hamming"
+    mti: Mti = "two-pulse"
+    window_s: float = 0.1
+    overlap: float = 0.9
+    integration: Integration = "noncoherent"
+    ridge_count: int = 3
+    denoiser: str | None = None
+    display_rate_hz: float | None = None
+    engine: Engine = "time"
+    near_bins: int | None = None
+    range_gate_m: tuple[float, float] | float | None = None
+    pulse_chunk: int = 1024
+
+    def __post_init__(self) -> None:
+        require_choices(self, mti=Mti, integration=Integration)
+        if self.engine not in ("time", "range-bins"):
+            raise TensorsimError(f"engine: got {self.engine!r}, expected 'time' or 'range-bins'")
+        require_counts(self, "ridge_count", "pulse_chunk")
+        require_positive("ProcessingConfig", window_s=self.window_s)
+        if not 0 <= self.overlap < 1:
+            raise TensorsimError(f"overlap: got {self.overlap}, expected a number in [0, 1)")
+        if self.display_rate_hz is not None:
+            require_positive("ProcessingConfig", display_rate_hz=self.display_rate_hz)
+        if self.near_bins is not None and self.engine == "time":
+            raise TensorsimError(
+                f"near_bins: got {self.near_bins} with the engine 'time', expected 'range-bins'"
+            )

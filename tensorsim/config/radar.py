@@ -1,0 +1,126 @@
+"""The radar: waveform, sampling, antennas."""
+
+from dataclasses import dataclass, replace
+
+from tensorsim.config.checks import Vector, as_positions, is_finite, listed, require_positive, require_vector
+from tensorsim.errors import TensorsimError
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+
+
+@dataclass(frozen=True)
+class RadarConfig:
+    """An FMCW radar. World frame: x right, y range, z height, metres.
+
+    The chirp sweeps upwards from ``carrier_hz``, the **start** of the sweep: ``f(t) = fc + (B / T) t``.
+    Defaults are the free-space preset of the original's panel.
+
+    ``tx_m`` and ``rx_m`` are one position (x, y, z) each, or K and A of them: ``((x, y, z), ...)`` or anything
+    of shape (A, 3). Several give the echo an antenna dimension of K * A channels, transmitter by transmitter.
+    Transmitters fire in turn (time division): number k at ``k / (K PRF)`` after the start of a pulse interval.
+
+    Raises:
+        TensorsimError: a frequency or duration that is not positive, a position without three finite numbers,
+            or K chirps that do not fit a pulse interval.
+    """
+
+    carrier_hz: float = 77e9
+    bandwidth_hz: float = 4e9
+    chirp_s: float = 40e-6
+    prf_hz: float = 8192.0
+    sample_rate_hz: float = 10e6
+    tx_m: Vector | tuple[Vector, ...] = (-0.1, 0.0, 1.5)
+    rx_m: Vector | tuple[Vector, ...] = (0.1, 0.0, 1.5)
+    antenna_gain_dbi: float = 10.0
+    isolation_db: float = 20.0
+
+    def __post_init__(self) -> None:
+        require_positive(
+            "RadarConfig",
+            carrier_hz=self.carrier_hz,
+            bandwidth_hz=self.bandwidth_hz,
+            chirp_s=self.chirp_s,
+            prf_hz=self.prf_hz,
+            sample_rate_hz=self.sample_rate_hz,
+        )
+        for name in ("tx_m", "rx_m"):
+            object.__setattr__(self, name, as_positions(getattr(self, name)))
+        for tx in self.tx_positions_m:
+            require_vector("RadarConfig", tx_m=tx)
+        for rx in self.rx_positions_m:
+            require_vector("RadarConfig", rx_m=rx)
+        for name in ("antenna_gain_dbi", "isolation_db"):
+            if not is_finite(getattr(self, name)):
+                raise TensorsimError(
+                    f"RadarConfig.{name}: got {getattr(self, name)!r}, expected a finite number of dB"
+                )
+        if self.samples_per_chirp < 2:
+            raise TensorsimError(
+                f"RadarConfig: {self.sample_rate_hz} Hz over a chirp of {self.chirp_s} s gives "
+                f"{self.samples_per_chirp} samples, expected at least 2"
+            )
+        turns = len(self.tx_positions_m)
+        if self.chirp_s * self.prf_hz * turns > 1.0:
+            chirps = (
+                f"a chirp of {self.chirp_s} s does"
+                if turns == 1
+                else f"{turns} chirps of {self.chirp_s} s do"
+            )
+            raise TensorsimError(
+                f"RadarConfig: {chirps} not fit the pulse interval {1.0 / self.prf_hz} s of prf_hz {self.prf_hz}"
+            )
+
+    @classmethod
+    def free_space(cls, **overrides: float | Vector) -> "RadarConfig":
+        """The panel's free-space radar: 77 GHz, 4 GHz of bandwidth, PRF 8192 Hz."""
+        return replace(cls(), **overrides)  # type: ignore[arg-type]
+
+    @classmethod
+    def through_wall(cls, **overrides: float | Vector) -> "RadarConfig":
+        """The panel's through-wall radar: 2 GHz, 1 GHz of bandwidth, PRF 128 Hz."""
+        return replace(cls(carrier_hz=2e9, bandwidth_hz=1e9, prf_hz=128.0), **overrides)  # type: ignore[arg-type]
+
+    @property
+    def tx_positions_m(self) -> tuple[Vector, ...]:
+        """Every transmitter, also where there is one."""
+        return listed(self.tx_m)
+
+    @property
+    def rx_positions_m(self) -> tuple[Vector, ...]:
+        """Every receiver, also where there is one."""
+        return listed(self.rx_m)
+
+    @property
+    def has_array(self) -> bool:
+        """Whether the echo has an antenna dimension: ``tx_m`` or ``rx_m`` is a list of positions."""
+        return self.tx_positions_m != (self.tx_m,) or self.rx_positions_m != (self.rx_m,)
+
+    @property
+    def slope_hz_per_s(self) -> float:
+        """Chirp slope mu = B / T."""
+        return self.bandwidth_hz / self.chirp_s
+
+    @property
+    def samples_per_chirp(self) -> int:
+        """N = round(fs T)."""
+        return round(self.sample_rate_hz * self.chirp_s)
+
+    @property
+    def wavelength_m(self) -> float:
+        """c / fc, the wavelength of the amplitude (radar equation)."""
+        return SPEED_OF_LIGHT_M_S / self.carrier_hz
+
+    @property
+    def doppler_wavelength_m(self) -> float:
+        """c / (fc + B/2): Doppler of a range bin scales with the centre of the sweep."""
+        return SPEED_OF_LIGHT_M_S / (self.carrier_hz + self.bandwidth_hz / 2)
+
+    @property
+    def range_resolution_m(self) -> float:
+        """Spacing of range bins, c / (2B)."""
+        return SPEED_OF_LIGHT_M_S / (2 * self.bandwidth_hz)
+
+    @property
+    def unambiguous_speed_m_s(self) -> float:
+        """Largest radial speed without Doppler aliasing, lambda PRF / 4 (7.8 m/s and 3.8 m/s in the presets)."""
+        return self.doppler_wavelength_m * self.prf_hz / 4

@@ -1,0 +1,94 @@
+"""What the radar looks at: the radar itself, wall, floor, propagation paths, scatterers of the body, noise."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tensorsim.config.checks import is_finite, require_choices, require_positive
+from tensorsim.config.radar import RadarConfig
+from tensorsim.config.surroundings import FloorConfig, WallConfig
+from tensorsim.errors import TensorsimError
+
+WallPaths = Literal["series", "paper"]
+Incidence = Literal["normal", "oblique", "airy"]
+Polarization = Literal["te", "tm"]
+NoiseReference = Literal["echo", "total", "absolute"]
+Body = Literal["joints", "limbs", "version1"]
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """The radar and its surroundings.
+
+    Attributes:
+        radar: the radar (panel: RADAR group).
+        wall: the wall (panel: WALL group); None is free space.
+        floor: a reflecting floor; None is a floor that does not reflect.
+        multipath: propagation paths by way of the wall; None: on where there is a wall.
+        direct: the path straight to the scatterer and back.
+        leakage: direct signal from transmitter to receiver (panel: isolation).
+        wall_echo: static specular reflection of the wall.
+        wall_paths: bounces inside the wall, complete to first order (``"series"``) or as in the paper.
+        incidence: ``"normal"``, ``"oblique"`` (refraction, Fresnel) or ``"airy"`` (closed slab per frequency).
+        polarization: ``"te"`` or ``"tm"`` at the wall.
+        bounces: largest number of pairs of bounces inside the wall on each leg.
+        paths: names of propagation paths in place of the switches above, see :class:`tensorsim.radar.EchoSynthesizer`.
+        body: scatterers of a person: the 14 joints, 36 points along the limbs, or the 13 points of the original's
+            first version.
+        snr_db: signal-to-noise ratio per IF sample in dB (panel: SNR, 50 dB); None is free of noise.
+        noise_reference: signal power that ``snr_db`` refers to, see :class:`tensorsim.radar.ReceiverNoise`.
+        noise_figure_db: noise figure of the receiver for ``noise_reference="absolute"``.
+        transmit_power_w: transmit power for ``noise_reference="absolute"``.
+
+    Raises:
+        TensorsimError: an unknown choice, or numbers out of range.
+    """
+
+    radar: RadarConfig = field(default_factory=RadarConfig)
+    wall: WallConfig | None = None
+    floor: FloorConfig | None = None
+    multipath: bool | None = None
+    direct: bool = True
+    leakage: bool = False
+    wall_echo: bool = False
+    wall_paths: WallPaths = "series"
+    incidence: Incidence = "normal"
+    polarization: Polarization = "te"
+    bounces: int = 1
+    paths: tuple[str, ...] | None = None
+    body: Body = "joints"
+    snr_db: float | None = 50.0
+    noise_reference: NoiseReference = "echo"
+    noise_figure_db: float = 10.0
+    transmit_power_w: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, kind in (("radar", RadarConfig), ("wall", WallConfig), ("floor", FloorConfig)):
+            part = getattr(self, name)
+            if not (isinstance(part, kind) or (part is None and name != "radar")):
+                raise TensorsimError(f"SceneConfig.{name}: got {part!r}, expected a {kind.__name__}")
+        require_choices(
+            self,
+            wall_paths=WallPaths,
+            incidence=Incidence,
+            polarization=Polarization,
+            body=Body,
+            noise_reference=NoiseReference,
+        )
+        switched = [name for name in ("multipath", "leakage", "wall_echo") if getattr(self, name)]
+        switched += ["direct"] * (not self.direct)
+        if self.paths is not None and switched:
+            raise TensorsimError(
+                f"SceneConfig.paths: got names of paths and {', '.join(switched)}, expected one or the other"
+            )
+        if self.bounces < 0:
+            raise TensorsimError(f"SceneConfig.bounces: got {self.bounces}, expected at least 0")
+        if self.snr_db is not None and not is_finite(self.snr_db):
+            raise TensorsimError(f"SceneConfig.snr_db: got {self.snr_db!r}, expected a finite number of dB")
+        require_positive("SceneConfig", transmit_power_w=self.transmit_power_w)
+
+    @property
+    def has_multipath(self) -> bool:
+        """``multipath``; where it is None, whether there is a wall (and no list of ``paths``)."""
+        if self.multipath is None:
+            return self.wall is not None and self.paths is None
+        return self.multipath

@@ -1,0 +1,61 @@
+"""Walls and floors."""
+
+from dataclasses import dataclass
+
+from tensorsim.config.checks import Vector, as_positions, is_finite, require_dielectric, require_vector
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class WallConfig:
+    """A homogeneous slab normal to y.
+
+    The default centre puts the near face of the panel's wall on the antenna plane. (The paper's centre
+    (-0.1, 0, 1.5) has the antennas inside the slab; the simulator then moves it here, with a warning.)
+
+    Raises:
+        TensorsimError: a size or permittivity that is not physical.
+    """
+
+    center_m: Vector = (-0.1, 0.12, 1.5)
+    size_m: Vector = (5.0, 0.24, 2.5)
+    relative_permittivity: float = 6.0
+    loss_tangent: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name in ("center_m", "size_m"):
+            object.__setattr__(self, name, as_positions(getattr(self, name)))
+        require_vector("WallConfig", center_m=self.center_m, size_m=self.size_m)
+        if self.size_m[0] <= 0 or self.size_m[1] < 0 or self.size_m[2] <= 0:
+            raise TensorsimError(
+                f"WallConfig.size_m: got {self.size_m}, expected positive width and height and thickness >= 0"
+            )
+        require_dielectric("WallConfig", self.relative_permittivity, self.loss_tangent)
+
+    @property
+    def refractive_index(self) -> complex:
+        """n = sqrt(eps_r (1 - j tan d)) = n' - j n''."""
+        return (self.relative_permittivity * (1 - 1j * self.loss_tangent)) ** 0.5
+
+
+@dataclass(frozen=True)
+class FloorConfig:
+    """A smooth floor, the plane z = 0, that reflects.
+
+    Attributes:
+        relative_permittivity: of the material; the default is concrete (ITU-R P.2040-3, table 3).
+        loss_tangent: of the material.
+        reflection: a constant reflection coefficient in place of Fresnel's, for a floor that was measured.
+
+    Raises:
+        TensorsimError: numbers that are not physical.
+    """
+
+    relative_permittivity: float = 5.24
+    loss_tangent: float = 0.03
+    reflection: float | None = None
+
+    def __post_init__(self) -> None:
+        require_dielectric("FloorConfig", self.relative_permittivity, self.loss_tangent)
+        if self.reflection is not None and not (is_finite(self.reflection) and -1 <= self.reflection <= 1):
+            raise TensorsimError(f"FloorConfig.reflection: got {self.reflection}, expected between -1 and 1")

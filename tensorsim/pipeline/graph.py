@@ -1,0 +1,258 @@
+"""The whole graph: video -> maps, and video -> label."""
+
+import os
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import CameraConfig, RadarConfig, SceneConfig, SimulationConfig, WallConfig
+from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.pipeline.maps import PoseToDoppler
+from tensorsim.pipeline.networks import pretrained_pose
+from tensorsim.pipeline.pose import VideoToPose
+from tensorsim.radar.presets import radar_scene
+from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.recognition.recognizer import ActivityRecognizer
+from tensorsim.types import RadarMaps, Recognition, Simulation
+from tensorsim.vision.detection.rtmdet import RTMDet
+
+
+class VideoToDoppler(nn.Module):
+    """Video -> people, joints, echo and maps, as one graph.
+
+    Args:
+        detector, pose: the two networks, see :class:`VideoToPose`.
+        radar: a radar, or the name of a preset (``tensorsim.radar.PRESETS``), whose wall and floor come with it;
+            default the panel's free-space radar.
+        wall: a slab between or behind; see :class:`tensorsim.radar.EchoSynthesizer`.
+        multipath, leakage, wall_echo: paths of the scene beyond the direct one.
+        snr_db: signal-to-noise ratio per IF sample of the targets' echo; None is free of noise. The noise is drawn
+            from torch's global generator (``torch.manual_seed``).
+        person_height_m, initial_distance_m, camera, detection_interval: see :class:`VideoToPose`.
+        denoiser: see :class:`PoseToDoppler`.
+        video_to_pose, pose_to_doppler: whole replacements; the arguments above that configure them are then unused.
+
+    Example:
+        >>> sim = ts.VideoToDoppler(detector, pose, radar=ts.RadarConfig.free_space())
+        >>> out = sim(video, fps)  # video (B, T, 3, H, W) -> Simulation
+    """
+
+    def __init__(
+        self,
+        detector: nn.Module | None = None,
+        pose: nn.Module | None = None,
+        radar: RadarConfig | str | None = None,
+        wall: WallConfig | None = None,
+        multipath: bool = False,
+        leakage: bool = False,
+        wall_echo: bool = False,
+        snr_db: float | None = 50.0,
+        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        initial_distance_m: tuple[float, ...] | None = None,
+        camera: CameraConfig | None = None,
+        detection_interval: int = 2,
+        denoiser: nn.Module | None = None,
+        video_to_pose: VideoToPose | None = None,
+        pose_to_doppler: PoseToDoppler | None = None,
+    ) -> None:
+        super().__init__()
+        if video_to_pose is None:
+            if detector is None or pose is None:
+                raise TensorsimError(
+                    "VideoToDoppler: got no detector or no pose network, expected both, or video_to_pose; "
+                    "VideoToDoppler.from_pretrained() takes the shipped ones"
+                )
+            video_to_pose = VideoToPose(
+                detector,
+                pose,
+                person_height_m=person_height_m,
+                initial_distance_m=initial_distance_m,
+                camera=camera,
+                detection_interval=detection_interval,
+            )
+        self.video_to_pose = video_to_pose
+        if pose_to_doppler is None:
+            scene = as_scene(radar, wall)
+            scene = replace(scene, multipath=multipath, leakage=leakage, wall_echo=wall_echo, snr_db=snr_db)
+            pose_to_doppler = PoseToDoppler(RadarSimulator(scene), denoiser=denoiser)
+        self.pose_to_doppler = pose_to_doppler
+
+    @classmethod
+    def from_config(
+        cls, config: SimulationConfig, detector: nn.Module | None = None, pose: nn.Module | None = None
+    ) -> "VideoToDoppler":
+        """The graph that a configuration describes, in evaluation mode.
+
+        Args:
+            config: the configuration.
+            detector, pose: networks in place of those that it names.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network.
+
+        Example:
+            >>> sim = ts.VideoToDoppler.from_config(ts.SimulationConfig.through_wall())
+        """
+        return cls(
+            video_to_pose=VideoToPose.from_config(config, detector, pose),
+            pose_to_doppler=PoseToDoppler.from_config(config),
+        ).eval()
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        detector: str | os.PathLike[str] | None = None,
+        pose: str | os.PathLike[str] | None = None,
+        flip_test: bool = True,
+        **options: Any,
+    ) -> "VideoToDoppler":
+        """The whole with trained networks, in evaluation mode.
+
+        Args:
+            detector, pose: paths or names of ``tensorsim models list``; None: the shipped weights.
+            flip_test: see :func:`pretrained_pose`.
+            **options: further arguments of the constructor.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network.
+        """
+        return cls(RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test), **options).eval()
+
+    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Simulation:
+        """Simulate what the radar sees of clips.
+
+        Args:
+            video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
+            fps: frames per second.
+            lengths: (B,) frames of each clip when the shorter ones are padded.
+
+        Raises:
+            TensorsimError: see :class:`VideoToPose` and :class:`PoseToDoppler`.
+        """
+        pose = self.video_to_pose(video, fps, lengths)
+        if not torch.jit.is_scripting():
+            warn_of_empty_clips(pose.valid)
+        maps = self.pose_to_doppler(pose.joints, pose.valid, fps)
+        return Simulation(
+            pose.boxes,
+            pose.keypoints,
+            pose.keypoint_scores,
+            pose.joints,
+            pose.valid,
+            maps.range_time,
+            maps.range_time_mti,
+            maps.doppler_time,
+            maps.ridges,
+            maps.ridge_magnitudes,
+            maps.snr_db,
+        )
+
+
+class VideoToActivity(nn.Module):
+    """Video -> maps -> activity, as one graph: :class:`VideoToDoppler` and a recognizer of its maps.
+
+    A clip shows one activity of about four seconds, as the recognizer was trained on; its people are one scene.
+
+    Args:
+        video_to_doppler: frames to maps.
+        recognizer: :class:`RadarMaps` -> logits (B, classes); see :class:`tensorsim.recognition.ActivityRecognizer`.
+
+    Example:
+        >>> sim = ts.VideoToActivity.from_pretrained()
+        >>> label = ts.ACTIVITIES[int(sim(video, fps).logits[0].argmax())]
+    """
+
+    def __init__(self, video_to_doppler: VideoToDoppler, recognizer: nn.Module) -> None:
+        super().__init__()
+        self.video_to_doppler = video_to_doppler
+        self.recognizer = recognizer
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        detector: str | os.PathLike[str] | None = None,
+        pose: str | os.PathLike[str] | None = None,
+        classifier: str | os.PathLike[str] | None = None,
+        radar: RadarConfig | str | None = None,
+        **options: Any,
+    ) -> "VideoToActivity":
+        """The whole with trained networks, in evaluation mode.
+
+        Args:
+            detector, pose, classifier: paths or names of ``tensorsim models list``; None: the shipped weights.
+            radar, **options: further arguments of :class:`VideoToDoppler`.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network.
+        """
+        whole = VideoToDoppler.from_pretrained(detector, pose, radar=radar, **options)
+        radar = whole.pose_to_doppler.simulator.radar
+        return cls(whole, ActivityRecognizer.from_pretrained(radar, classifier)).eval()
+
+    @classmethod
+    def from_config(cls, config: SimulationConfig) -> "VideoToActivity":
+        """The graph that a configuration describes, in evaluation mode.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network, or ``classifier="none"``.
+        """
+        if config.classifier == "none":
+            raise TensorsimError("VideoToActivity: got the classifier 'none', expected weights")
+        return cls(
+            VideoToDoppler.from_config(config),
+            ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier),
+        ).eval()
+
+    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Recognition:
+        """Clips (B, T, 3, H, W) to people, maps and logits; arguments and errors of :class:`VideoToDoppler`."""
+        found = self.video_to_doppler(video, fps, lengths)
+        logits = self.recognizer(
+            RadarMaps(
+                found.range_time,
+                found.range_time_mti,
+                found.doppler_time,
+                found.ridges,
+                found.ridge_magnitudes,
+                found.snr_db,
+            )
+        )
+        return Recognition(
+            found.boxes,
+            found.keypoints,
+            found.keypoint_scores,
+            found.joints,
+            found.valid,
+            found.range_time,
+            found.range_time_mti,
+            found.doppler_time,
+            found.ridges,
+            found.ridge_magnitudes,
+            found.snr_db,
+            logits,
+        )
+
+
+def as_scene(radar: RadarConfig | str | None, wall: WallConfig | None) -> SceneConfig:
+    """The scene of a radar, or of a preset by name, and a wall.
+
+    Raises:
+        TensorsimError: an unknown name, or something that is not a radar or a wall.
+    """
+    if isinstance(radar, str):
+        scene = radar_scene(radar)
+        return scene if wall is None else replace(scene, wall=wall)
+    return SceneConfig(RadarConfig.free_space() if radar is None else radar, wall)
+
+
+def warn_of_empty_clips(valid: Tensor) -> None:
+    """Say which clips have no person (``valid`` (B, P, T)); their maps show the empty scene."""
+    empty = torch.nonzero(~valid.flatten(1).any(dim=1)).flatten().tolist()
+    if empty:
+        warnings.warn(
+            f"no person found in clip {', '.join(map(str, empty))} of {valid.shape[0]}: its maps show the empty scene",
+            TensorsimWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,134 @@
+"""Joints at video rate -> maps of the radar."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import SimulationConfig
+from tensorsim.enhance.dncnn import MapDenoiser
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.body13 import Body13Scatterers
+from tensorsim.motion.limb_scatterers import LimbScatterers
+from tensorsim.motion.resample import PoseResampler
+from tensorsim.motion.savgol import SavitzkyGolay
+from tensorsim.motion.scatterers import JointScatterers, visibility_fade
+from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.types import RadarMaps
+
+
+class PoseToDoppler(nn.Module):
+    """Joints at video rate -> maps of the radar: resample to the pulse rate, place scatterers, simulate.
+
+    Several people of a clip are one scene: their scatterers are summed in one echo.
+
+    Args:
+        simulator: scatterers -> maps.
+        resampler: video rate -> pulse rate; default the C2 spline at the PRF of the simulator's radar.
+        pulse_smoother: optional filter along the pulses; the paper's is linear resampling and Savitzky-Golay.
+        scatterers: joints -> scatterers; default one point per joint with the panel's RCS.
+        denoiser: optional module on magnitude maps (..., H, W), e.g. ``tensorsim.enhance.MapDenoiser``. It cleans
+            the shown maps; the Doppler-time map is computed from data that was not denoised.
+        rcs_scale: factor on the cross sections by person; the last one serves the rest.
+    """
+
+    rcs_scale: Tensor
+
+    def __init__(
+        self,
+        simulator: RadarSimulator,
+        resampler: PoseResampler | None = None,
+        pulse_smoother: SavitzkyGolay | None = None,
+        scatterers: nn.Module | None = None,
+        denoiser: nn.Module | None = None,
+        rcs_scale: tuple[float, ...] = (1.0,),
+    ) -> None:
+        super().__init__()
+        self.simulator = simulator
+        self.resampler = resampler if resampler is not None else PoseResampler(simulator.radar.prf_hz)
+        # Pulses beside a piece of motion that the filter needs to give the same values as on the whole.
+        self.halo = 0 if pulse_smoother is None else pulse_smoother.window
+        self.pulse_smoother = pulse_smoother if pulse_smoother is not None else nn.Identity()
+        self.scatterers = scatterers if scatterers is not None else JointScatterers()
+        self.denoises = denoiser is not None
+        self.denoiser = denoiser if denoiser is not None else nn.Identity()
+        if len(rcs_scale) == 0 or not all(scale > 0 for scale in rcs_scale):
+            raise TensorsimError(f"rcs_scale: got {rcs_scale}, expected positive factors, one per person")
+        self.register_buffer("rcs_scale", torch.tensor(rcs_scale, dtype=torch.float64), persistent=False)
+
+    @classmethod
+    def from_config(cls, config: SimulationConfig) -> "PoseToDoppler":
+        """The stage that ``scene``, ``processing`` and ``smoothing`` of a configuration describe, in evaluation mode.
+
+        Raises:
+            TensorsimError: weights of the denoiser that are not there or of another network.
+        """
+        scene, processing, smoothing = config.scene, config.processing, config.smoothing
+        prf_hz = scene.radar.prf_hz
+        pulse_smoother = None
+        if smoothing.smoothing_ratio is not None:
+            window = round(smoothing.smoothing_ratio * prf_hz) // 2 * 2 + 1
+            pulse_smoother = SavitzkyGolay(window, smoothing.polynomial_order)
+        bodies: dict[str, Callable[[], nn.Module]] = {
+            "joints": JointScatterers,
+            "limbs": lambda: LimbScatterers(scene.radar.tx_positions_m[0], scene.radar.rx_positions_m[0]),
+            "version1": Body13Scatterers,
+        }
+        denoiser = None if processing.denoiser is None else MapDenoiser.from_pretrained(processing.denoiser)
+        people = len(config.pose.person_weight_kg)
+        return cls(
+            RadarSimulator(scene, processing=processing),
+            PoseResampler(prf_hz, method=smoothing.resampling),
+            pulse_smoother,
+            bodies[scene.body](),
+            denoiser,
+            tuple(config.pose.rcs_scale(person) for person in range(people)),
+        ).eval()
+
+    def forward(self, joints: Tensor, valid: Tensor, fps: float) -> RadarMaps:
+        """Joints (B, P, T, 14, 3) in metres and their validity (B, P, T) -> maps of B scenes.
+
+        Raises:
+            TensorsimError: wrong shapes, fewer than 2 frames, fps not positive, motion too fast for the PRF.
+        """
+        coefficients = self.resampler.coefficients(joints, fps)
+        pulses = self.resampler.pulses(joints.shape[2], fps)
+        points, rcs = self.scene(coefficients, valid, fps, 0, pulses)
+        return self.denoise(self.simulator(points, rcs))
+
+    def scene(
+        self, coefficients: Tensor, valid: Tensor, fps: float, start: int, stop: int
+    ) -> tuple[Tensor, Tensor]:
+        """Scatterers (B, M, S, 3) and their RCS (B, M, S) in pulses ``start`` to ``stop`` of the motion.
+
+        Args:
+            coefficients: of the resampler, for joints (B, P, T, 14, 3).
+            valid: (B, P, T) bool.
+            fps: frames per second.
+            start, stop: half-open range of pulses.
+        """
+        pulses = self.resampler.pulses(valid.shape[2], fps)
+        first, last = max(0, start - self.halo), min(pulses, stop + self.halo)
+        positions = self.pulse_smoother(self.resampler.evaluate(coefficients, fps, first, last))
+        positions = positions[:, :, start - first : stop - first]
+        presence = visibility_fade(valid, fps, self.resampler.prf_hz, start, stop)
+        # Scatterers scale cross sections with the square of the presence.
+        person = torch.arange(valid.shape[1], device=valid.device).clamp(max=self.rcs_scale.shape[0] - 1)
+        presence = presence * self.rcs_scale[person].sqrt().unsqueeze(-1)
+        points, rcs = self.scatterers(positions, presence)
+        return points, rcs
+
+    def denoise(self, maps: RadarMaps) -> RadarMaps:
+        """Clean the processed maps and take the ridges again, if there is a denoiser."""
+        if not self.denoises:
+            return maps
+        doppler_time = self.denoiser(maps.doppler_time)
+        ridges = self.simulator.ridges(doppler_time)
+        return RadarMaps(
+            maps.range_time,
+            self.denoiser(maps.range_time_mti),
+            doppler_time,
+            ridges.indices,
+            ridges.magnitudes,
+            maps.snr_db,
+        )

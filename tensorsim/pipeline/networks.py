@@ -1,0 +1,43 @@
+"""Pose networks as the pipeline takes them."""
+
+import inspect
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from tensorsim.vision.pose2d.cpm import CPM
+from tensorsim.vision.pose2d.hrnet import HRNet
+from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.topdown import TopDownPose
+
+
+def top_down(pose: nn.Module, flip_test: bool = True) -> nn.Module:
+    """A heat-map network as a stage (frames, boxes, valid) -> (key points, scores); such a stage stays as it is."""
+    forward: Any = pose.forward
+    if isinstance(pose, torch.jit.ScriptModule):
+        arguments = len(forward.schema.arguments) - 1
+    else:
+        arguments = len(inspect.signature(forward).parameters)
+    return pose if arguments == 3 else TopDownPose(pose, flip_test=flip_test)
+
+
+def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: bool = True) -> TopDownPose:
+    """Pose estimation with the network of a file or name: ``.onnx`` in ONNX Runtime; others are CPM or HRNet.
+
+    Args:
+        source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
+        flip_test: average with the mirror image, as published accuracies are measured: better, at twice the cost.
+
+    Raises:
+        TensorsimError: no such file or name, or weights of another network.
+    """
+    if source is not None and Path(source).suffix == ".onnx":
+        network: nn.Module = OnnxHeatmaps(source)
+    elif source is not None and "cpm" in Path(source).name:
+        network = CPM.from_pretrained(source)
+    else:
+        network = HRNet.from_pretrained(source)
+    return TopDownPose(network, flip_test=flip_test)

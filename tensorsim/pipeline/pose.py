@@ -1,0 +1,264 @@
+"""Video -> people with smooth 3D joints: detection, tracking, 2D pose, lifting, position, smoothing."""
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import coco_to_body
+from tensorsim.config import CameraConfig, SimulationConfig
+from tensorsim.errors import TensorsimError, check_positive, check_rank, check_size
+from tensorsim.pipeline.networks import pretrained_pose, top_down
+from tensorsim.types import Detections, Pose, Tracks
+from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.smoothing.along_time import brief_gaps
+from tensorsim.vision.smoothing.kalman import KalmanSmoother
+from tensorsim.vision.tracking.tracker import GNNTracker
+
+
+class VideoToPose(nn.Module):
+    """Video -> people with metric 3D joints.
+
+    Detects in every ``detection_interval``-th frame and in the last one, tracks, estimates COCO-17 keypoints in
+    every frame, lifts them to 3D, places them in the world and smooths them.
+
+    Args:
+        detector: images -> :class:`~tensorsim.types.Detections`, e.g. :class:`tensorsim.vision.RTMDet`.
+        pose: crops -> heat maps, e.g. :class:`tensorsim.vision.HRNet`, which is asked about the mirror image as well;
+            or a module (frames, boxes, valid) -> (key points, scores), e.g. :class:`tensorsim.vision.TopDownPose`.
+        person_height_m: body heights in metres by person (order of appearance); the last one serves the rest.
+        initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
+        camera: where the camera stands and its focal length.
+        keypoint_threshold: score from which a keypoint counts as seen.
+        detection_interval: run the detector on every n-th frame (panel: 2).
+        fewest_joints: of the 14, in a frame that says anything of the pose.
+        brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
+        frames_per_batch: frames that go through a network at once; bounds memory.
+        tracker, lifter, metric_pose, smoother: replacements of the default stages.
+        bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
+            keypoints that are exact; None leaves it out.
+
+    Raises:
+        TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1.
+    """
+
+    def __init__(
+        self,
+        detector: nn.Module,
+        pose: nn.Module,
+        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        initial_distance_m: tuple[float, ...] | None = None,
+        camera: CameraConfig | None = None,
+        keypoint_threshold: float = 0.3,
+        detection_interval: int = 2,
+        fewest_joints: int = 5,
+        brief_gap_s: float = 0.25,
+        frames_per_batch: int = 8,
+        tracker: nn.Module | None = None,
+        lifter: nn.Module | None = None,
+        metric_pose: nn.Module | None = None,
+        smoother: nn.Module | None = None,
+        bone_fit: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        for name, value in (
+            ("detection_interval", detection_interval),
+            ("frames_per_batch", frames_per_batch),
+        ):
+            if value < 1:
+                raise TensorsimError(f"{name}: got {value}, expected at least 1")
+        self.detector = detector
+        self.pose = top_down(pose)
+        self.tracker = tracker if tracker is not None else GNNTracker()
+        self.lifter = lifter if lifter is not None else NearestPoseLifter()
+        self.metric_pose = (
+            metric_pose
+            if metric_pose is not None
+            else MetricPose(camera, person_height_m, initial_distance_m, keypoint_threshold)
+        )
+        self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
+        self.smoother = smoother if smoother is not None else KalmanSmoother()
+        self.keypoint_threshold = keypoint_threshold
+        self.detection_interval = detection_interval
+        self.fewest_joints = fewest_joints
+        self.brief_gap_s = brief_gap_s
+        self.frames_per_batch = frames_per_batch
+
+    @classmethod
+    def from_config(
+        cls, config: SimulationConfig, detector: nn.Module | None = None, pose: nn.Module | None = None
+    ) -> "VideoToPose":
+        """The stage that a configuration describes, in evaluation mode.
+
+        Args:
+            config: its ``tracking``, ``pose`` and ``smoothing``.
+            detector, pose: networks in place of those that the configuration names.
+
+        Raises:
+            TensorsimError: weights that are not there or of another network.
+        """
+        tracking, people, smoothing = config.tracking, config.pose, config.smoothing
+        if detector is None:
+            detector = RTMDet.from_pretrained(tracking.detector)
+        if pose is None:
+            pose = pretrained_pose(people.network, people.flip_test)
+        library = None if people.library is None else load_pose_library(people.library)
+        return cls(
+            detector,
+            top_down(pose, people.flip_test),
+            keypoint_threshold=people.keypoint_threshold,
+            detection_interval=tracking.detection_interval,
+            fewest_joints=people.fewest_joints,
+            brief_gap_s=smoothing.brief_gap_s,
+            tracker=GNNTracker(
+                max_tracks=tracking.max_tracks,
+                confirm_hits=tracking.confirm_hits,
+                confirm_window=tracking.confirm_window,
+                delete_misses=tracking.delete_misses,
+                delete_window=tracking.delete_window,
+                assignment_threshold=tracking.assignment_threshold,
+                min_box_px=tracking.min_box_px,
+                process_noise=tracking.process_noise,
+                measurement_noise=tracking.measurement_noise,
+            ),
+            lifter=NearestPoseLifter(library, neighbours=people.neighbours, temporal=people.temporal),
+            metric_pose=MetricPose(
+                people.camera,
+                people.person_height_m,
+                people.initial_distance_m,
+                people.keypoint_threshold,
+                mode=people.position,
+            ),
+            smoother=KalmanSmoother(mode=smoothing.mode),
+        ).eval()
+
+    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Pose:
+        """Estimate the people of whole clips.
+
+        Args:
+            video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
+            fps: frames per second.
+            lengths: (B,) frames of each clip when the shorter ones are padded; None takes all T.
+
+        Raises:
+            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive.
+        """
+        check_rank(video, 5, "video", "(B, T, 3, H, W)")
+        check_size(video, 2, 3, "video", "(B, T, 3, H, W)")
+        check_positive(fps, "fps")
+        b, t, height, width = video.shape[0], video.shape[1], video.shape[3], video.shape[4]
+        if b == 0 or t < 2:
+            raise TensorsimError(
+                f"video: got shape {list(video.shape)}, expected at least 1 clip of at least 2 frames"
+            )
+        present = self.frames_present(b, t, lengths, video.device)
+        observed = self.observed_frames(present)
+
+        frames = video.flatten(0, 1)
+        detections = self.detect(frames[observed.flatten()])
+        tracks = self.follow(detections, observed)
+
+        people = tracks.valid.shape[1]
+        boxes = tracks.boxes.transpose(1, 2).reshape(b * t, people, 4)
+        valid = tracks.valid.transpose(1, 2).reshape(b * t, people)
+        keypoints, scores = self.estimate(frames, boxes, valid)
+        keypoints = keypoints.reshape(b, t, people, 17, 2).transpose(1, 2)
+        scores = scores.reshape(b, t, people, 17).transpose(1, 2)
+        return self.lift(tracks, keypoints, scores, height, width, fps)
+
+    def frames_present(self, clips: int, frames: int, lengths: Tensor | None, device: torch.device) -> Tensor:
+        """(B, T) bool: the frames that belong to a clip rather than to its padding."""
+        index = torch.arange(frames, device=device)
+        if lengths is None:
+            return (index >= 0).expand(clips, frames)
+        check_rank(lengths, 1, "lengths", "(B,)")
+        if lengths.shape[0] != clips or bool((lengths < 1).any()) or bool((lengths > frames).any()):
+            counts: list[int] = lengths.tolist()
+            raise TensorsimError(f"lengths: got {counts}, expected {clips} counts from 1 to {frames}")
+        return index < lengths.to(device).unsqueeze(-1)
+
+    def observed_frames(self, present: Tensor) -> Tensor:
+        """(B, T) bool: frames in which the detector runs, every n-th and the last of each clip."""
+        index = torch.arange(present.shape[-1], device=present.device)
+        last = present.sum(dim=-1, keepdim=True) - 1
+        return present & ((index % self.detection_interval == 0) | (index == last))
+
+    def detect(self, frames: Tensor) -> Detections:
+        """Detect in frames (n, 3, H, W), ``frames_per_batch`` at a time."""
+        boxes: list[Tensor] = []
+        scores: list[Tensor] = []
+        labels: list[Tensor] = []
+        valid: list[Tensor] = []
+        for start in range(0, frames.shape[0], self.frames_per_batch):
+            found = self.detector(frames[start : start + self.frames_per_batch])
+            boxes.append(found.boxes)
+            scores.append(found.scores)
+            labels.append(found.labels)
+            valid.append(found.valid)
+        return Detections(torch.cat(boxes), torch.cat(scores), torch.cat(labels), torch.cat(valid))
+
+    def follow(self, detections: Detections, observed: Tensor) -> Tracks:
+        """Track the detections (n, K) of the ``observed`` frames (B, T), n = observed.sum(), in row-major order."""
+        clips, frames = observed.shape[0], observed.shape[1]
+        index = torch.nonzero(observed.flatten()).squeeze(-1)
+        count = detections.boxes.shape[1]
+        boxes = detections.boxes.new_zeros(clips * frames, count, 4)
+        scores = detections.scores.new_zeros(clips * frames, count)
+        labels = detections.labels.new_zeros(clips * frames, count)
+        valid = detections.valid.new_zeros(clips * frames, count)
+        boxes[index] = detections.boxes
+        scores[index] = detections.scores
+        labels[index] = detections.labels
+        valid[index] = detections.valid
+        whole = Detections(
+            boxes.unflatten(0, [clips, frames]),
+            scores.unflatten(0, [clips, frames]),
+            labels.unflatten(0, [clips, frames]),
+            valid.unflatten(0, [clips, frames]),
+        )
+        tracks = self.tracker(whole, observed)
+        # The last frame of a clip is observed, so what follows the last observed frame is padding.
+        within = (observed.flip(-1).cumsum(-1).flip(-1) > 0).unsqueeze(1)
+        return Tracks(tracks.boxes * within.unsqueeze(-1), tracks.valid & within, tracks.matched & within)
+
+    def estimate(self, frames: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints (n, P, 17, 2) and scores (n, P, 17) of boxes (n, P, 4) in frames (n, 3, H, W)."""
+        keypoints: list[Tensor] = []
+        scores: list[Tensor] = []
+        for start in range(0, frames.shape[0], self.frames_per_batch):
+            stop = start + self.frames_per_batch
+            k, s = self.pose(frames[start:stop], boxes[start:stop], valid[start:stop])
+            keypoints.append(k)
+            scores.append(s)
+        return torch.cat(keypoints), torch.cat(scores)
+
+    def lift(
+        self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
+    ) -> Pose:
+        """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
+        body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
+        # Joints below the threshold have no say in the match: the network guesses what it cannot see.
+        trusted = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
+        body_scores = body_scores * trusted
+        # A foot alone at the edge of the picture does not tell a pose: such frames of a track coast.
+        told = tracks.valid & (trusted.sum(dim=-1) >= self.fewest_joints)
+        told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
+        lifted = self.lifter(body, body_scores)
+        joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
+        told = told & seen.any(dim=-1)  # less the frames that it does not believe
+        joints = self.bone_fit(joints, seen & told.unsqueeze(-1), fps)
+        # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
+        # the pose that was found stands in for it, as long as the person is in the scene.
+        in_scene = told.unsqueeze(-1).expand_as(seen)
+        coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
+        joints = self.smoother(joints, in_scene & ~coasting, fps)
+        # Nobody is where no frame of a track shows a joint.
+        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & told.any(dim=-1, keepdim=True))
+
+
+class _AsPlaced(nn.Module):
+    """No :class:`~tensorsim.vision.lifting.bone_fit.BoneFit`."""
+
+    def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
+        return joints

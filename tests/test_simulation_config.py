@@ -1,0 +1,206 @@
+"""The configuration of a whole run: documents, changes, conflicts, and the stages that it makes."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import tensorsim as ts
+from tensorsim import cli
+from tensorsim.commands.options import FIELDS, RadarOptions
+from tensorsim.config.people import PANEL_WEIGHTS_KG
+from tensorsim.errors import TensorsimError
+from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
+from tests.film import RectangleDetector, StandingPose, film, walker
+from tests.stage import assert_same
+
+CHANGED = {
+    "scene__radar__prf_hz": 4096.0,
+    "scene__wall": ts.WallConfig(loss_tangent=0.01),
+    "scene__snr_db": None,
+    "processing__range_gate_m": (1.0, 6.0),
+    "tracking__max_tracks": 2,
+    "pose__person_height_m": (1.6, 1.9, 1.7),
+    "pose__camera__pitch_rad": 0.1,
+    "smoothing__mode": "forward",
+    "seed": 7,
+}
+
+
+def test_a_yaml_file_holds_everything(tmp_path: Path) -> None:
+    config = ts.SimulationConfig().replace(**CHANGED)
+    config.to_yaml(tmp_path / "run.yaml")
+    assert ts.SimulationConfig.from_yaml(tmp_path / "run.yaml") == config
+    assert ts.SimulationConfig.from_document(json.loads(json.dumps(config.to_document()))) == config
+    (tmp_path / "some.yaml").write_text("scene: {radar: {prf_hz: 4e3}}\nseed: 3\n")
+    expected = ts.SimulationConfig().replace(scene__radar__prf_hz=4000.0, seed=3)
+    assert ts.SimulationConfig.from_yaml(tmp_path / "some.yaml") == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("tracker: {}", r"run.yaml: got the key 'tracker', .*perhaps 'tracking'"),
+        ("scene: {snr: 3}", r"run.yaml: scene: got the key 'snr', .*snr_db"),
+        ("scene: {wall_paths: best}", r"scene: SceneConfig.wall_paths: got 'best', expected one of 'series', 'paper'"),
+        ("tracking: {max_tracks: 1.5}", r"tracking: max_tracks: got 1.5, expected a whole number"),
+        ("pose: {flip_test: 1}", r"pose: flip_test: got 1, expected true or false"),
+        ("seed: -1", r"seed: got -1, expected an integer from 0"),
+        ("scene: {radar: {carrier_hz: .nan}}", r"scene: radar: RadarConfig.carrier_hz: got nan"),
+    ],
+)  # fmt: skip
+def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text(text)
+    with pytest.raises(TensorsimError, match=message):
+        ts.SimulationConfig.from_yaml(tmp_path / "run.yaml")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scene__snr": 3.0}, "'snr'.*perhaps 'snr_db'"),
+        ({"scene__wall__loss_tangent": 0.1}, "got no 'loss_tangent' in None"),
+        ({"scene": 3}, "SimulationConfig.scene: got 3, expected a SceneConfig"),
+        ({"pose__person_weight_kg": ()}, "person_weight_kg: got no values"),
+        ({"scene__paths": ("direct",), "scene__leakage": True}, "got names of paths and leakage"),
+    ],
+)
+def test_a_bad_change_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        ts.SimulationConfig().replace(**change)
+
+
+def test_every_parameter_of_the_panel_is_an_option() -> None:
+    """Each option names a field that exists; the defaults of these fields are those of the panel."""
+    config = ts.SimulationConfig.through_wall()
+    for option, path in FIELDS.items():
+        assert any(field.name == option for field in dataclasses.fields(RadarOptions)), option
+        part: object = config
+        for name in path.split("__"):
+            assert hasattr(part, name), path
+            part = getattr(part, name)
+    tracking, pose = config.tracking, config.pose
+    assert (tracking.detection_interval, tracking.max_tracks, tracking.assignment_threshold) == (2, 5, 150.0)
+    assert (tracking.confirm_hits, tracking.confirm_window) == (2, 5)
+    assert (tracking.delete_misses, tracking.delete_window, tracking.min_box_px) == (23, 23, 5.0)
+    assert pose.person_height_m == (1.80, 1.70)
+    assert pose.person_weight_kg == (84.24, 75.00)
+    assert ts.SimulationConfig.paper().pose.initial_distance_m == (4.00, 0.50)
+    assert ts.SimulationConfig.paper().smoothing.smoothing_ratio == 0.25
+    assert (config.processing.window_s, config.processing.overlap, config.processing.ridge_count) == (
+        0.1,
+        0.9,
+        3,
+    )
+
+
+def test_options_change_the_configuration_of_a_file(tmp_path: Path) -> None:
+    ts.SimulationConfig().replace(**CHANGED).to_yaml(tmp_path / "run.yaml")
+    config = RadarOptions(config=tmp_path / "run.yaml", snr=20.0, wall_permittivity=4.0).configuration()
+    changed = CHANGED | {"scene__snr_db": 20.0}
+    expected = ts.SimulationConfig().replace(**changed, scene__wall__relative_permittivity=4.0)
+    assert config == expected
+    paper = RadarOptions(paper=True, scene="through-wall").configuration()
+    assert paper == ts.SimulationConfig.paper(ts.SimulationConfig.through_wall())
+    with pytest.raises(TensorsimError, match="--wall-permittivity: got no 'relative_permittivity' in None"):
+        RadarOptions(wall_permittivity=4.0).configuration()
+
+
+def test_a_summary_repeats_its_run_to_the_bit(tmp_path: Path) -> None:
+    steps = np.linspace(0, 1, 45)[:, None, None]
+    body = np.random.default_rng(0).normal(0, 0.3, (14, 3)) + [0, 4, 1]
+    np.savez(tmp_path / "walk.npz", joints=body + steps * [0.0, -1.0, 0.0], fps=30.0)
+    first, again = tmp_path / "first", tmp_path / "again"
+    run = ["simulate", str(tmp_path / "walk.npz"), "--quiet", "--out"]
+    options = [
+        "--scene",
+        "through-wall",
+        "--snr",
+        "12",
+        "--seed",
+        "5",
+        "--ridges",
+        "2",
+        "--classifier",
+        "none",
+    ]
+    cli.main([*run, str(first), *options])
+    cli.main([*run, str(again), "--config", str(first / "summary.json")])
+    for name in ("maps.npz", "pose.npz"):
+        with np.load(first / name) as one, np.load(again / name) as other:
+            assert one.files == other.files
+            assert all(np.array_equal(one[key], other[key]) for key in one.files)
+    summaries = [json.loads((folder / "summary.json").read_text()) for folder in (first, again)]
+    assert summaries[0]["config"] == summaries[1]["config"]
+    assert summaries[0]["config"]["processing"]["ridge_count"] == 2
+
+
+def test_a_graph_made_by_hand_equals_that_of_the_configuration() -> None:
+    """The composition of the README, ``from_config`` and ``from_pretrained`` ask about the mirror image alike."""
+    detector, network = ts.vision.RTMDet.from_pretrained(), ts.vision.HRNet.from_pretrained()
+    graphs = (
+        ts.VideoToDoppler(detector=detector, pose=network, radar=ts.RadarConfig.through_wall(), snr_db=None),
+        ts.VideoToDoppler.from_pretrained(radar=ts.RadarConfig.through_wall(), snr_db=None),
+        ts.VideoToDoppler.from_config(
+            ts.SimulationConfig().replace(scene__radar=ts.RadarConfig.through_wall(), scene__snr_db=None)
+        ),
+    )
+    assert all(isinstance(graph.video_to_pose.pose.network, FlipTest) for graph in graphs)
+    # A person whom the shipped detector does not find in a drawing is given by a detector of rectangles.
+    video = film(*walker(12, 10.0, 4.0, 1.0, 0.0))[None]
+    with torch.no_grad():
+        for graph in graphs:
+            graph.eval().video_to_pose.detector = RectangleDetector()
+        poses = [graph.video_to_pose(video, 10.0) for graph in graphs]
+    assert bool(poses[0].valid.any())
+    for pose in poses[1:]:
+        assert_same(pose, poses[0], atol=1e-6)
+
+
+class OwnPose(nn.Module):
+    """A pose stage with the signature of TopDownPose."""
+
+    def forward(self, images: torch.Tensor, boxes: torch.Tensor, valid: torch.Tensor) -> object:
+        return StandingPose()(images, boxes, valid)
+
+
+def test_own_pose_stages_are_not_wrapped() -> None:
+    for pose in (OwnPose(), StandingPose(), TopDownPose(nn.Identity())):
+        assert VideoToPose(RectangleDetector(), pose).pose is pose
+    scripted = torch.jit.script(TopDownPose(nn.Identity()))
+    assert VideoToPose(RectangleDetector(), scripted).pose is scripted
+
+
+def test_presets_work_by_name() -> None:
+    graph = ts.VideoToDoppler(RectangleDetector(), StandingPose(), radar="cw-24ghz")
+    assert graph.pose_to_doppler.simulator.radar == ts.radar.PRESETS["cw-24ghz"].radar
+    with pytest.raises(TensorsimError, match="perhaps 'ti-awr1843'"):
+        ts.VideoToDoppler(RectangleDetector(), StandingPose(), radar="ti-awr1834")
+    with pytest.raises(
+        TensorsimError, match=r"SceneConfig.radar: got \{'prf_hz': 3\}, expected a RadarConfig"
+    ):
+        ts.VideoToDoppler(RectangleDetector(), StandingPose(), radar={"prf_hz": 3})  # type: ignore[arg-type]
+
+
+def test_weights_scale_the_cross_sections() -> None:
+    """The echo's power goes with the body surface of each person, (weight / panel weight)^0.425."""
+    config = ts.SimulationConfig().replace(
+        scene__radar=ts.RadarConfig.through_wall(), pose__person_weight_kg=(2 * PANEL_WEIGHTS_KG[0], 75.0)
+    )
+    stage, plain = (
+        PoseToDoppler.from_config(config),
+        PoseToDoppler.from_config(ts.SimulationConfig.through_wall()),
+    )
+    joints = torch.rand(1, 3, 10, 14, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor(
+        [0, 3.0, 0]
+    )
+    valid = torch.ones(1, 3, 10, dtype=torch.bool)
+    rcs = [s.scene(s.resampler.coefficients(joints, 30.0), valid, 30.0, 0, 4)[1] for s in (stage, plain)]
+    ratio = (rcs[0] / rcs[1]).reshape(4, 3, 14)
+    torch.testing.assert_close(ratio[:, 0], torch.full_like(ratio[:, 0], 2**0.425), rtol=1e-5, atol=0)
+    torch.testing.assert_close(ratio[:, 1:], torch.ones_like(ratio[:, 1:]), rtol=1e-6, atol=0)
