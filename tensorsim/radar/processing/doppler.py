@@ -7,9 +7,8 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_complex_map
-from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.range_profile import gate_bins
-from tensorsim.radar.synthesis.paths import safe_sqrt
 
 
 def coherent_sum(profiles: Tensor, samples: int) -> Tensor:
