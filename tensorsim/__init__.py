@@ -3,6 +3,8 @@
 One graph of ``nn.Module`` stages on batched tensors: video -> people -> 2D joints -> 3D joints -> smooth motion ->
 FMCW echo -> range-time -> Doppler-time -> ridges. ``VideoToDoppler`` is the whole; ``vision``, ``motion``, ``radar``
 and ``enhance`` hold the stages.
+
+Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where they are (see ``tensorsim.paper``):
 """
 
 from tensorsim import data, enhance, export, motion, radar, recognition, vision
@@ -23,10 +25,12 @@ from tensorsim.config import (
     WallConfig,
 )
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.paper import table as _paper_table
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
 
 __version__ = "0.1.0"
+__doc__ = f"{__doc__}{_paper_table()}\n"
 
 __all__ = [
     "ACTIVITIES",

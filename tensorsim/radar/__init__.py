@@ -1,4 +1,4 @@
-"""Scatterers -> echo -> maps."""
+"""Radar: echo synthesis from moving scatterers, signal processing to maps, and analysis of the maps."""
 
 from tensorsim.config import SceneConfig as RadarScene
 from tensorsim.radar.analysis import metrics
@@ -12,16 +12,20 @@ from tensorsim.radar.presets import (
     save_radar_yaml,
 )
 from tensorsim.radar.processing.array import AngleMapper, AngleMaps, align_transmitters
-from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo
-from tensorsim.radar.processing.mti import MovingTargetIndicator
-from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
+from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo, doppler_time_map
+from tensorsim.radar.processing.mti import MovingTargetIndicator, two_pulse_canceller
+from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile, range_profile
 from tensorsim.radar.processing.ridges import PathRidgeExtractor, RidgeExtractor
 from tensorsim.radar.processing.synchrosqueeze import SynchrosqueezedMap
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.antenna import CosineAntenna, TabulatedAntenna
 from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.dechirp import intermediate_frequency
 from tensorsim.radar.synthesis.echo import EchoSynthesizer, SideChannels
+from tensorsim.radar.synthesis.legs import mirror_delays
 from tensorsim.radar.synthesis.noise import ReceiverNoise
+from tensorsim.radar.synthesis.paths import radar_equation_amplitude
+from tensorsim.radar.synthesis.wall import two_way_wall_transmission
 
 __all__ = [
     "PRESETS",
@@ -48,9 +52,16 @@ __all__ = [
     "SynchrosqueezedMap",
     "TabulatedAntenna",
     "align_transmitters",
+    "doppler_time_map",
+    "intermediate_frequency",
     "load_radar_yaml",
     "load_scene_yaml",
     "metrics",
+    "mirror_delays",
+    "radar_equation_amplitude",
     "radar_scene",
+    "range_profile",
     "save_radar_yaml",
+    "two_pulse_canceller",
+    "two_way_wall_transmission",
 ]

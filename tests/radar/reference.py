@@ -12,14 +12,16 @@ def distance(p, antenna):
     return np.linalg.norm(p - np.asarray(antenna, dtype=np.float64), axis=-1)
 
 
-def wall_terms(wall, frequency):
+def wall_terms(wall, frequency, paper=False):
+    """(n, G, T0, T1); the paper's T0 and T1 have the propagation phase of the wall in them."""
     n = np.sqrt(wall.relative_permittivity * (1 - 1j * wall.loss_tangent) + 0j)
     d = wall.size_m[1]
     alpha = 2 * np.pi * frequency / C * -n.imag
     g = (1 - n) / (1 + n)
     t12, t21 = 1 + g, 1 - g
-    t0 = t12 * t21 * np.exp(-alpha * d)
-    t1 = t12 * g**2 * t21 * np.exp(-3 * alpha * d)
+    beta = 2 * np.pi * frequency / C * n.real if paper else 0.0
+    t0 = t12 * t21 * np.exp(-(alpha + 1j * beta) * d)
+    t1 = t12 * g**2 * t21 * np.exp(-3 * (alpha + 1j * beta) * d)
     return n, g, t0, t1
 
 
@@ -41,7 +43,7 @@ def path_list(radar, p, wall=None, multipath=False, paper=False):
     r1, r2 = distance(p, radar.tx_m), distance(p, radar.rx_m)
     if wall is None:
         return [((r1 + r2) / C, r1, r2, np.ones_like(r1))]
-    n, g, t0, t1 = wall_terms(wall, radar.carrier_hz)
+    n, g, t0, t1 = wall_terms(wall, radar.carrier_hz, paper)
     d = wall.size_m[1]
     near = wall.center_m[1] - d / 2
     front = p[..., 1] <= near

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.radar.synthesis.paths import leg_length
+from tensorsim.radar.synthesis.legs import leg_length
 
 
 def mean_range(positions: Tensor, radar: RadarConfig) -> Tensor:

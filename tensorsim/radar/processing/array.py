@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_min_rank, check_size
-from tensorsim.radar.synthesis.paths import safe_sqrt
+from tensorsim.ops import safe_sqrt
 
 
 class AngleMaps(NamedTuple):

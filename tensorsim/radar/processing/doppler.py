@@ -1,4 +1,8 @@
-"""Doppler-time maps: a short-time Fourier transform over pulses of every range bin, summed over range."""
+"""Doppler-time maps (DTM): a short-time Fourier transform (STFT) over the pulses of every range bin, summed over range.
+
+:func:`doppler_time_map` is the formula, by ``torch.stft``. :class:`DopplerTimeMap` computes the same in blocks that fit
+in the cache, and has options for the integration over range.
+"""
 
 import math
 
@@ -7,23 +11,59 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_complex_map
-from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.range_profile import gate_bins
-from tensorsim.radar.synthesis.paths import safe_sqrt
+
+
+def doppler_time_map(profiles: Tensor, window: Tensor, hop: int, fft_length: int) -> Tensor:
+    """Doppler-time map ``sqrt(sum over range bins of |STFT of that bin|^2)``.
+
+    Profiles are conjugated, so that positive Doppler is approaching. Frames lie wholly inside the signal.
+
+    Args:
+        profiles: (..., M, R) complex, M pulses of R range bins.
+        window: (L,) real, over the pulses of a frame, L <= M.
+        hop: pulses from frame to frame.
+        fft_length: F >= L, length of the zero-padded transform.
+
+    Returns:
+        (..., F, K) magnitude, K = ``(M - L) // hop + 1`` frames, Doppler ascending as in
+        ``fftshift(fftfreq(F, 1 / PRF))``. Differentiable, with gradient 0 where the map is 0.
+
+    >>> approaching = torch.polar(torch.ones(64), -2 * math.pi * torch.arange(64) / 4)  # phase decreases
+    >>> doppler_time_map(approaching[:, None], torch.hann_window(16), hop=8, fft_length=16).argmax(0)
+    tensor([12, 12, 12, 12, 12, 12, 12])
+    """
+    series = profiles.conj().transpose(-1, -2)  # (..., R, M)
+    # torch.stft centres the window in frames of fft_length samples; the signal is padded by as much.
+    margin = fft_length - window.shape[0]
+    padded = torch.nn.functional.pad(series.flatten(0, -2), [margin // 2, margin - margin // 2])
+    stft = torch.stft(
+        padded,
+        n_fft=fft_length,
+        hop_length=hop,
+        win_length=window.shape[0],
+        window=window,
+        center=False,
+        onesided=False,
+        return_complex=True,
+    )
+    power = torch.view_as_real(stft).square().sum(-1).unflatten(0, series.shape[:-1])  # (..., R, F, K)
+    return torch.fft.fftshift(safe_sqrt(power.sum(-3)), -2)
 
 
 def coherent_sum(profiles: Tensor, samples: int) -> Tensor:
-    """Sum range bins as the beat signal at mid-chirp: (..., M, R) complex -> (..., M, 1).
+    """Coherent sum over range bins, with phases referred to mid-chirp: (..., M, R) complex -> (..., M, 1).
 
-    Bin k of a profile is ``X[k] = sum over n of w[n] x[n] exp(-j 2 pi k n / N)``, its phase counted from the first
-    of N = ``samples`` samples. The plain sum over all k is therefore ``N w[0] x[0]``: one sample, where every window
-    is weakest (0 for Hann). Counted from mid-chirp, ``c = (N - 1) / 2``, the bins
+    Bin k of a profile is ``X[k] = sum over n of w[n] x[n] exp(-j 2 pi k n / N)``, its phase referred to the first
+    of N = ``samples`` samples. The plain sum over all k is therefore ``N w[0] x[0]``: one sample, at which every
+    window has its minimum (0 for Hann). Referred to mid-chirp, ``c = (N - 1) / 2``, the bins::
 
         Y[k] = X[k] exp(+j 2 pi k c / N) = sum over n of w[n] x[n] exp(-j 2 pi k (n - c) / N)
 
     of one target at beat bin b are ``a exp(j 2 pi b c / N) W(b - k)`` with a W that is real for a symmetric window:
-    its whole main lobe adds up in phase, and all bins give ``N w x`` at mid-chirp, where a window is strongest.
-    A first bin other than 0 turns the phase of all alike.
+    its main lobe adds up in phase, and the sum over all bins is ``N w x`` at mid-chirp, where a window has its
+    maximum. A first bin other than 0 adds the same phase to all pulses.
     """
     bins = torch.arange(profiles.shape[-1], dtype=torch.float64, device=profiles.device)
     cycles = torch.remainder(bins * ((samples - 1) / (2 * samples)), 1.0)
@@ -32,16 +72,16 @@ def coherent_sum(profiles: Tensor, samples: int) -> Tensor:
 
 
 class DopplerFrames(nn.Module):
-    """The short-time Fourier transform that the maps over Doppler and time share: window, frames and axes.
+    """Window, frames and axes of a short-time Fourier transform over pulses; base class of the Doppler maps.
 
     The window is a periodic Hann of ``L = round(window_s * PRF)`` pulses, the hop ``L - floor(overlap * L)``,
-    the FFT length the next power of two >= max(L, 256); frames lie wholly inside the signal; nothing is
+    the FFT length the next power of two >= max(L, 256). Frames lie wholly inside the signal. The transform is not
     normalised. Input is conjugated, so that **positive Doppler is approaching**.
 
     Args:
         radar: the radar (its PRF).
         window_s: window length in seconds.
-        overlap: part of the window that neighbouring frames share, in [0, 1).
+        overlap: overlap of neighbouring frames as a fraction of the window, in [0, 1).
 
     Attributes:
         doppler_hz: (F,) ascending, ``fftshift(fftfreq(F, 1 / PRF))``.
@@ -69,10 +109,10 @@ class DopplerFrames(nn.Module):
         self.hop = self.length - math.floor(overlap * self.length)
         self.frame_rate_hz = self.prf_hz / self.hop
         self.bins = 1 << (max(self.length, 256) - 1).bit_length()
-        # Spectra are worked on in blocks of about 512 kB (complex64), which stay in the cache.
+        # Block size: spectra of about 512 kB (complex64) fit in the cache.
         self.block_size = 2**16
         window = torch.hann_window(self.length, periodic=True, dtype=torch.float64)
-        # Every other sample with the other sign turns the spectrum by half a circle: bins ascend from -PRF / 2.
+        # A factor (-1)^n shifts the spectrum by PRF / 2, so that bins ascend from -PRF / 2 without an fftshift.
         alternating = 1.0 - 2.0 * (torch.arange(self.length, dtype=torch.float64) % 2)
         frequency = torch.fft.fftfreq(self.bins, 1 / radar.prf_hz, dtype=torch.float64)
         self.register_buffer("window", window, persistent=False)
@@ -81,7 +121,7 @@ class DopplerFrames(nn.Module):
 
     @torch.jit.export
     def frames(self, pulses: int) -> int:
-        """How many frames lie wholly inside this many pulses."""
+        """Number of frames that lie wholly inside this many pulses."""
         return max(0, (pulses - self.length) // self.hop + 1)
 
     @torch.jit.unused
@@ -90,7 +130,7 @@ class DopplerFrames(nn.Module):
         return (torch.arange(self.frames(pulses)) * self.hop + self.length / 2).double() / self.prf_hz
 
     def series(self, profiles: Tensor) -> Tensor:
-        """Profiles (..., M, R), checked, as one series per range bin: (B, R, M)."""
+        """Check profiles (..., M, R) and arrange them as one series per range bin: (B, R, M)."""
         check_complex_map(profiles, "profiles", "(..., pulses, range bins)")
         shape = list(profiles.shape)
         if shape[-2] < self.length:
@@ -103,22 +143,22 @@ class DopplerFrames(nn.Module):
     def spectrum(self, frames: Tensor) -> Tensor:
         """Real and imaginary part (..., F, 2) of the transform of frames (..., L), Doppler ascending."""
         window = self.shifting_window.to(torch.real(frames).dtype)
-        # |FFT(conj x)[f]| = |FFT(x)[-f]|, and a transform with the other sign puts -f at f.
+        # |FFT(conj x)[f]| = |FFT(x)[-f]|, which the inverse transform has at f.
         spectrum = torch.fft.ifft(frames * window, self.bins, norm="forward")
         return torch.view_as_real(spectrum.resolve_conj())
 
 
 class DopplerTimeMap(DopplerFrames):
-    """Doppler-time map of complex profiles.
+    """Doppler-time map (DTM) of complex range profiles.
 
     Args:
         radar, window_s, overlap: see :class:`DopplerFrames`.
-        integration: over range bins. ``"noncoherent"``: ``sqrt(sum over range bins of |STFT of that bin|^2)``.
-            ``"coherent"``: |STFT| of :func:`coherent_sum`, which adds the bins of a target in phase and those of
-            others with whatever phase they have: for a gate around one target. ``"paper"``: the printed formula,
-            the STFT of the sum of magnitudes over range, which is real and so shows every motion on both sides.
-        gate_m: (nearest, farthest) range in metres whose bins are used, of profiles that start at range 0; None
-            takes all of them.
+        integration: over range bins. ``"noncoherent"``: :func:`doppler_time_map`. ``"coherent"``: |STFT| of
+            :func:`coherent_sum`, which adds the bins of one target in phase, but not those of several: for a gate
+            around one target. ``"paper"``: the paper's formula, the STFT of the sum of magnitudes over range.
+            That sum is real, so the map is symmetric and has lost the sign of Doppler.
+        gate_m: (nearest, farthest) range in metres of the bins to use, for profiles that start at range 0; None
+            uses all bins.
 
     Shapes: (..., M, R) complex -> (..., F, K) magnitude, Doppler ascending. Differentiable, with gradient
     0 where the map is 0.
@@ -161,11 +201,12 @@ class DopplerTimeMap(DopplerFrames):
             series = coherent_sum(series.transpose(1, 2), self.samples).transpose(1, 2)
         frames = series.unfold(-1, self.length, self.hop)  # (B, R, K, L), a view
         batch, bins, count = frames.shape[0], frames.shape[1], frames.shape[2]
-        # Neighbouring frames share most of their pulses: blocks take frames first, then clips, then range bins.
+        # Neighbouring frames share most of their pulses, so a block is filled with frames first, then with clips,
+        # then with range bins.
         columns = max(1, min(count, self.block_size // self.bins))
         clips = max(1, self.block_size // (columns * self.bins)) if columns == count else 1
         step = max(1, self.block_size // (min(clips, batch) * columns * self.bins))
-        # Autograd wants the blocks joined; without it each is written where it belongs, while it is in the cache.
+        # With autograd the blocks are joined at the end; without, each is written to its place while in the cache.
         joined = series.requires_grad
         rows: list[Tensor] = []
         doppler_time = torch.real(series).new_empty([0 if joined else batch * count, self.bins])
@@ -190,7 +231,7 @@ class DopplerTimeMap(DopplerFrames):
 
 
 class RangeDopplerVideo(DopplerFrames):
-    """Range-Doppler power frame by frame: the Doppler-time map before its sum over range.
+    """Range-Doppler power of each frame: the Doppler-time map before its sum over range.
 
     Args:
         radar, window_s, overlap: see :class:`DopplerFrames`.

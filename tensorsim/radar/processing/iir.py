@@ -1,14 +1,17 @@
-"""Recursive filters along pulses, evaluated block by block as matrix products.
+"""Recursive filters (IIR) along pulses, evaluated block by block as matrix products.
 
-A recursion over single pulses is slow in a tensor library, and torchaudio's compiled one is an operator that a
-TorchScript file cannot carry to a process without torchaudio. In state-space form the recursion runs over blocks
-of pulses instead (Oppenheim and Schafer, *Discrete-Time Signal Processing*, ch. 6): with the state z at the start
-of a block of inputs u,
+In state-space form the recursion runs over blocks of pulses (Oppenheim and Schafer, *Discrete-Time Signal
+Processing*, ch. 6). With the state z at the start of a block of inputs u::
 
     y = H u + O z,      z' = D u + A z
 
-where H holds the impulse response, O the outputs that a state leads to, D the state that inputs lead to, and A
-takes the state over a whole block.
+H is the impulse response, O the response to the initial state, D maps inputs to the state after the block, and A the
+initial state to it.
+
+``torchaudio.functional.lfilter`` is not used, for three reasons: a scripted module with it loads only in a process that
+has imported torchaudio, since its loop is an operator of that library; it is slower (a fourth-order high-pass of
+32768 pulses x 200 range bins, complex64, one thread: 1.7 s against 0.35 s); and its direct form is less accurate in
+float32 (1.7e-5 against 2.7e-7 of the input at a cut-off of 0.2 m/s, 4e-4 against 6e-7 at 0.02 m/s).
 """
 
 import torch
@@ -18,10 +21,10 @@ BLOCK = 128
 
 
 def filter_blocks(x: Tensor, impulse: Tensor, free: Tensor, drive: Tensor, step: Tensor) -> Tensor:
-    """Filter real x (B, M, C) along M from rest.
+    """Filter real x (B, M, C) along M with zero initial state.
 
-    With L pulses a block and n states: ``impulse`` (L, L), ``free`` (L, n), ``drive`` (n, L), ``step`` (n, n), all
-    acting from the left; H, O, D and A of the module's docstring.
+    For blocks of L pulses and n states: ``impulse`` (L, L), ``free`` (L, n), ``drive`` (n, L) and ``step`` (n, n) are
+    H, O, D and A of the module's docstring.
     """
     pulses, length = x.shape[1], impulse.shape[0]
     blocks = (pulses + length - 1) // length
@@ -38,14 +41,14 @@ def filter_blocks(x: Tensor, impulse: Tensor, free: Tensor, drive: Tensor, step:
 
 
 class BlockFilter(nn.Module):
-    """A cascade of biquads along pulses, from rest; equals ``scipy.signal.sosfilt``.
+    """A cascade of biquads along pulses with zero initial state; equals ``scipy.signal.sosfilt``.
 
     Args:
         sections: (sections, 6) rows ``b0 b1 b2 a0 a1 a2`` in SciPy's order; stable.
 
     Shapes: real (B, M, C) -> (B, M, C), each column filtered along M.
 
-    The state is measured by the response that it causes (O has orthonormal columns), which keeps float32 accurate
+    The state is scaled by the response that it causes (O has orthonormal columns), so that float32 is accurate also
     for poles near the unit circle.
     """
 
@@ -62,7 +65,7 @@ class BlockFilter(nn.Module):
         sos = sections.numpy()
         count = len(sos)
         order = 2 * count
-        # Row i: what an input at pulse i of a block, or a unit of state i, leads to within the block and after it.
+        # Row i: response to an input at pulse i of a block, or to a unit of state i, within the block and after it.
         impulse, drive = sosfilt(sos, np.eye(BLOCK), zi=np.zeros((count, BLOCK, 2)))
         unit = np.eye(order).reshape(order, count, 2).transpose(1, 0, 2)
         free, step = sosfilt(sos, np.zeros((order, BLOCK)), zi=unit)

@@ -1,5 +1,7 @@
-"""Moving target indication: what stands still goes, what moves stays (Skolnik, *Introduction to Radar
-Systems*, ch. 3)."""
+"""Moving target indication (MTI): filters along pulses that suppress static echoes.
+
+See Skolnik, *Introduction to Radar Systems*, ch. 3.
+"""
 
 import math
 
@@ -14,13 +16,21 @@ from tensorsim.radar.processing.iir import BlockFilter
 METHODS = ("two-pulse", "n-pulse", "mean", "high-pass")
 
 
-def n_pulse_canceller(profiles: Tensor, pulses: int) -> Tensor:
-    """The (n - 1)-fold difference along pulses, n = ``pulses``: (..., M, R) -> (..., M - n + 1, R).
+def two_pulse_canceller(profiles: Tensor) -> Tensor:
+    """Two-pulse canceller ``y[m] = x[m + 1] - x[m]``: (..., M, R) -> (..., M - 1, R).
 
-    Its weights are binomial, ``(-1)^(n-1-k) C(n - 1, k)``, its response ``|2 sin(pi fd / PRF)|^(n - 1)``.
+    Its response to a Doppler frequency fd is ``|2 sin(pi fd / PRF)|``.
+    """
+    return profiles[..., 1:, :] - profiles[..., :-1, :]
+
+
+def n_pulse_canceller(profiles: Tensor, pulses: int) -> Tensor:
+    """n - 1 two-pulse cancellers in series, n = ``pulses``: (..., M, R) -> (..., M - n + 1, R).
+
+    The weights are binomial, ``(-1)^(n-1-k) C(n - 1, k)``, the response is ``|2 sin(pi fd / PRF)|^(n - 1)``.
     """
     for _ in range(pulses - 1):
-        profiles = profiles[..., 1:, :] - profiles[..., :-1, :]
+        profiles = two_pulse_canceller(profiles)
     return profiles
 
 
@@ -37,15 +47,16 @@ def highpass_sections(cutoff_hz: float, prf_hz: float, order: int) -> Tensor:
 
 
 class MovingTargetIndicator(nn.Module):
-    """Suppresses the static part of complex range profiles.
+    """Moving target indication: suppresses the static part of complex range profiles.
 
     Args:
         method: ``"two-pulse"`` (M pulses give M - 1); ``"n-pulse"``, a deeper and wider notch (M - n + 1);
-            ``"mean"``, which keeps slow motion at its full strength; ``"high-pass"``, a Butterworth filter that is
-            flat above its cut-off and starts at rest at the first profile, so that a static scene gives exactly 0.
+            ``"mean"``, which does not attenuate slow motion; ``"high-pass"``, a Butterworth filter that is flat
+            above its cut-off. It filters the difference to the first profile with zero initial state, so that a
+            static scene gives exactly 0.
         radar: PRF and wavelength, for ``"high-pass"`` only.
         pulses: n of ``"n-pulse"``.
-        cutoff_m_s: radial speed at which ``"high-pass"`` is down by 3 dB.
+        cutoff_m_s: radial speed at which ``"high-pass"`` attenuates by 3 dB.
         order: order of ``"high-pass"``, 1 to 8.
 
     Shapes: (..., M, R) complex -> (..., M', R) complex. Differentiable.
@@ -53,10 +64,10 @@ class MovingTargetIndicator(nn.Module):
     Attributes:
         lost_pulses: M - M'.
         delay_pulses: output m belongs to the instant ``(m + delay_pulses) / PRF`` of the input: (n - 1) / 2 for the
-            cancellers, whose weights are symmetric, else 0. The recursive filter delays every Doppler differently:
-            of order 4 by 0.6 periods of its cut-off there, by 0.004 of one at ten times the cut-off.
-        whole_clip: whether every output depends on all pulses or all earlier ones, so that a clip cannot be cut
-            into pieces that overlap by ``lost_pulses``.
+            cancellers, whose weights are symmetric, else 0. The delay of the recursive filter depends on Doppler:
+            for order 4, 0.6 periods of the cut-off frequency there, 0.004 periods at ten times the cut-off.
+        whole_clip: whether every output depends on all pulses or all earlier ones, so that a clip cannot be
+            processed in pieces that overlap by ``lost_pulses``.
 
     Raises:
         TensorsimError: unknown method or settings, real profiles, fewer pulses than the method needs.
@@ -109,9 +120,9 @@ class MovingTargetIndicator(nn.Module):
     def response(self, doppler_hz: Tensor, prf_hz: float) -> Tensor:
         """Complex gain (...) of a target at these Doppler frequencies (positive = approaching).
 
-        The gain multiplies the target's echo at the instant that the output belongs to (``delay_pulses``); for the
+        The gain refers to the echo of the target at the instant of the output (``delay_pulses``); for the
         cancellers it is ``(-2j sin(pi fd / PRF))^(n - 1)``. A radial speed v has ``fd = 2 v /
-        radar.doppler_wavelength_m``. For ``"mean"`` it is that of a long clip: 0 at multiples of the PRF, else 1.
+        radar.doppler_wavelength_m``. For ``"mean"`` it is the limit for a long clip: 0 at multiples of the PRF, else 1.
         """
         # The phase of an approaching target decreases from pulse to pulse.
         angle = -2 * math.pi * doppler_hz.double() / prf_hz

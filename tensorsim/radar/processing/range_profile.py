@@ -1,4 +1,7 @@
-"""Range profiles: the Fourier transform over fast time turns beat frequency into range."""
+"""Range profiles: pulse compression of the dechirped signal by a Fourier transform over fast time.
+
+The beat frequency of a target is proportional to its range. The magnitude of the profiles is the range-time map (RTM).
+"""
 
 import math
 
@@ -16,7 +19,15 @@ _WINDOWS = {
 
 
 def range_profile(intermediate: Tensor, window: Tensor) -> Tensor:
-    """The first N // 2 bins of ``FFT(IF * window)``, not normalised: (..., M, N) complex -> (..., M, N // 2)."""
+    """Pulse compression: the first N // 2 bins of ``FFT(IF * window)`` over fast time, not normalised.
+
+    Args:
+        intermediate: (..., M, N) complex IF samples of M pulses.
+        window: (N,) real.
+
+    Returns:
+        (..., M, N // 2) complex; bin k is at range ``k c / (2 B)``.
+    """
     return torch.fft.fft(intermediate * window)[..., : intermediate.shape[-1] // 2]
 
 
@@ -24,7 +35,7 @@ def gate_bins(gate_m: tuple[float, float], spacing_m: float, bins: int) -> tuple
     """First and last of ``bins`` range bins, ``spacing_m`` apart, that lie within (nearest, farthest) metres.
 
     Raises:
-        TensorsimError: there is none.
+        TensorsimError: no bin lies within.
     """
     near, far = gate_m
     if math.isfinite(near) and math.isfinite(far):
@@ -39,12 +50,12 @@ def gate_bins(gate_m: tuple[float, float], spacing_m: float, bins: int) -> tuple
 
 
 class RangeProfile(nn.Module):
-    """Complex range profiles of IF samples; their magnitude is the range-time map.
+    """Complex range profiles of IF samples; their magnitude is the range-time map (RTM).
 
     Args:
         radar: the radar.
         window: over fast time, ``"hamming"``, ``"hann"`` or ``"blackman"`` in their symmetric forms
-            (``numpy.hamming``, ...), or None for the paper's rectangle.
+            (``numpy.hamming``, ...), or None for none, as in the paper.
         gate_m: keep only bins within (nearest, farthest) metres; None keeps the first N // 2.
 
     Shapes: IF (..., M, N) complex -> (..., M, R) complex of the same precision. The FFT is not normalised: a
@@ -96,11 +107,11 @@ class RangeProfile(nn.Module):
 
 
 class FollowingGate(nn.Module):
-    """Keeps only the range bins around the targets, pulse by pulse, and sets the others to zero.
+    """Range gate that follows the targets: bins outside of it are set to zero, pulse by pulse.
 
-    The gate is centred on the RCS-weighted mean of the targets' geometric range ``(|P - Ptx| + |P - Prx|) / 2``; what
-    a wall adds to it has to fit into the width. Pulses without any RCS have nothing to follow: they pass whole.
-    Meant for what a moving target indicator has left: a standing echo would switch on and off with the bins.
+    The gate is centred on the RCS-weighted mean of the targets' geometric range ``(|P - Ptx| + |P - Prx|) / 2``. The
+    additional delay of a wall is not included, so the width must allow for it. Pulses without any RCS are not gated.
+    For profiles after moving target indication: the moving gate would modulate a static echo.
 
     Args:
         radar: positions of the antennas; of several, the mean range.

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_min_rank, check_positive
-from tensorsim.ops import unflatten_batch
+from tensorsim.ops import safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.doppler import DopplerFrames
-from tensorsim.radar.synthesis.paths import safe_sqrt
 
 
 def reassigned_bins(spectrum: Tensor, derivative: Tensor, threshold: Tensor) -> Tensor:

@@ -18,9 +18,10 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_scene
 from tensorsim.radar.processing.range_profile import RangeProfile
-from tensorsim.radar.synthesis.echo import EchoSynthesizer, check_scene, phasor, tone_sum
+from tensorsim.radar.synthesis.dechirp import phasor, tone_sum
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.radar.synthesis.noise import energy
 
 #: Terms of the Chebyshev series: J_11(pi / 2) = 2e-9 and J_17(pi / 2) = 4e-17.

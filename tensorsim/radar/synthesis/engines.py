@@ -28,7 +28,7 @@ class TimeEngine(nn.Module):
         """See the module."""
         echo = self.echo.target_echo(positions, rcs)
         samples = echo
-        if len(self.echo.paths.static_ways) > 0:
+        if len(self.echo.paths.static_names) > 0:
             samples = echo + self.echo.static_echo()
         return self.profile(samples), energy(samples if self.total else echo)
 
@@ -44,6 +44,6 @@ class RangeBinEngine(nn.Module):
         """See the module."""
         beat, strength = self.bins.tones(positions, rcs)
         profiles = self.bins.bins(beat, strength)
-        if len(self.bins.echo.paths.static_ways) > 0:
+        if len(self.bins.echo.paths.static_names) > 0:
             profiles = profiles + self.bins.static_bins()
         return profiles, self.bins.energy(beat, strength, self.total).sum(-1)

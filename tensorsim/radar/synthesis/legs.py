@@ -1,7 +1,8 @@
-"""Legs: what happens to a wave between one antenna and a scatterer, by every alternative.
+"""Legs of a propagation path: delay and complex factor between one antenna and a scatterer.
 
-Straight (through a wall, if one is in the way), in air, bounced inside the wall, mirrored in its near face,
-mirrored in the floor. :mod:`~tensorsim.radar.synthesis.paths` pairs two of them to a way over the scatterer.
+A leg has several alternatives: straight (through a wall in between), in air, with internal bounces in the wall,
+reflected by the near face of the wall, reflected by the floor. :mod:`~tensorsim.radar.synthesis.paths` combines a
+leg from the transmitter and a leg to the receiver into a path.
 """
 
 import math
@@ -16,6 +17,7 @@ from tensorsim.radar.synthesis.wall import (
     Slab,
     fresnel,
     near_face_m,
+    paper_transmission,
     refracted_leg,
     refractive_index,
     slab_coefficients,
@@ -24,11 +26,11 @@ from tensorsim.radar.synthesis.wall import (
 
 
 class Legs(NamedTuple):
-    """One half of the ways: from an antenna to S scatterers by X alternatives.
+    """One half of the paths: from an antenna to S scatterers, X alternatives each.
 
     Attributes:
-        delay_s: (..., S, X).
-        factor: (..., S, X) complex amplitude of the wave, 1 / length included.
+        delay_s: (..., S, X) seconds.
+        factor: (..., S, X) complex amplitude of the wave, including 1 / length.
         through: (..., S) bool, whether the straight leg passes the wall.
     """
 
@@ -38,7 +40,7 @@ class Legs(NamedTuple):
 
 
 def leg_length(position: Tensor, antenna: Tensor, shortest: float) -> Tensor:
-    """Distance (...) from ``antenna`` (..., 3) to ``position`` (..., 3) in metres, not below ``shortest``."""
+    """Distance (...) from ``antenna`` (..., 3) to ``position`` (..., 3) in metres, at least ``shortest``."""
     x, y, z = position.unbind(-1)
     ax, ay, az = antenna.unbind(-1)
     square = (x - ax).square() + (y - ay).square() + (z - az).square()
@@ -46,10 +48,45 @@ def leg_length(position: Tensor, antenna: Tensor, shortest: float) -> Tensor:
 
 
 def flipped(vector: Tensor, axis: int) -> Tensor:
-    """(..., 3) with the sign of one component changed: the direction as a mirror normal to it shows it."""
+    """Vectors (..., 3) reflected by a plane through the origin that is normal to ``axis`` (0 x, 1 y, 2 z)."""
     parts = [vector[..., 0], vector[..., 1], vector[..., 2]]
     parts[axis] = -parts[axis]
     return torch.stack(parts, -1)
+
+
+def mirror_image(position: Tensor, face_y: float) -> Tensor:
+    """Mirror method: the image (..., 3) of a point in the wall face at ``y = face_y``, for a wall normal to y.
+
+    ``P' = P - 2 ((P - w) . n) n`` for any point w of the face and its normal n.
+    """
+    x, y, z = position.unbind(-1)
+    return torch.stack((x, 2 * face_y - y, z), -1)
+
+
+def mirror_delays(
+    positions: Tensor, tx_m: Tensor, rx_m: Tensor, face_y: float, speed_m_s: float = SPEED_OF_LIGHT_M_S
+) -> Tensor:
+    """Mirror method: delays (..., 3) of the echoes of a target in front of a wall that the wall reflects.
+
+    With the images Tx' and Rx' of the antennas in the wall face (see :func:`mirror_image`)::
+
+        tau_a = (|P - Tx'| + |P - Rx|) / c     reflected on the way to the target; amplitude times G
+        tau_b = (|P - Tx| + |P - Rx'|) / c     reflected on the way back;          amplitude times G
+        tau_c = (|P - Tx'| + |P - Rx'|) / c    reflected on both;                  amplitude times G^2
+
+    Args:
+        positions: (..., 3) metres, in front of the face.
+        tx_m, rx_m: (3,) or (..., 3) metres.
+        face_y: y of the wall face, whose normal is y, in metres.
+        speed_m_s: speed of light c.
+
+    Returns:
+        (..., 3) seconds: a, b, c.
+    """
+    out, back = leg_length(positions, tx_m, 0.0), leg_length(positions, rx_m, 0.0)
+    out_image = leg_length(positions, mirror_image(tx_m, face_y), 0.0)
+    back_image = leg_length(positions, mirror_image(rx_m, face_y), 0.0)
+    return torch.stack((out_image + back, out + back_image, out_image + back_image), -1) / speed_m_s
 
 
 def passes_face(
@@ -62,27 +99,36 @@ def passes_face(
 ) -> Tensor:
     """Whether the straight leg from ``antenna`` to ``position`` (both (..., 3)) enters the near face of the wall.
 
-    The face is the rectangle at ``y = face_y`` with this centre (x, z) and half size (x, z); the antenna is
-    on it or in front of it. ``folded`` takes a height below the floor for its mirror image. Returns (...) bool.
+    Args:
+        position: (..., 3) metres.
+        antenna: (..., 3) metres, on the plane of the face or in front of it.
+        face_y: y of the face, a rectangle normal to y.
+        center: (x, z) of its centre.
+        half_size: half of its size in (x, z).
+        folded: the leg is reflected by the floor; a crossing at height -z counts as one at z.
+
+    Returns:
+        (...) bool.
     """
     x, y, z = position.unbind(-1)
     ax, ay, az = antenna.unbind(-1)
-    beyond = y > face_y
-    part = (face_y - ay) / torch.where(beyond, y - ay, 1.0)
+    behind = y > face_y
+    part = (face_y - ay) / torch.where(behind, y - ay, 1.0)
     hit_x = ax + part * (x - ax)
     hit_z = az + part * (z - az)
     if folded:
         hit_z = hit_z.abs()
-    return beyond & ((hit_x - center[0]).abs() <= half_size[0]) & ((hit_z - center[1]).abs() <= half_size[1])
+    return behind & ((hit_x - center[0]).abs() <= half_size[0]) & ((hit_z - center[1]).abs() <= half_size[1])
 
 
 class TracedLegs(nn.Module):
-    """The constants of legs, and the legs themselves; base of ``PropagationPaths``."""
+    """Computes the alternatives of a leg and owns their constants; base class of ``PropagationPaths``."""
 
     relative_permittivity: Tensor
     loss_tangent: Tensor
     thickness_m: Tensor
     orders: int
+    paper: bool
     with_bounces: bool
     with_images: bool
     with_floor: bool
@@ -116,7 +162,7 @@ class TracedLegs(nn.Module):
         self.antenna = nn.Identity() if antenna is None else antenna
 
     def _slab(self, position: Tensor, antenna: Tensor) -> Slab:
-        """The wall for straight legs through it; () at normal incidence, else (..., S)."""
+        """Coefficients of the wall for straight legs; () at normal incidence, else (..., S)."""
         permittivity, loss_tangent = self.relative_permittivity.double(), self.loss_tangent.double()
         thickness = self.thickness_m.double()
         if not self.oblique:
@@ -125,7 +171,7 @@ class TracedLegs(nn.Module):
                 permittivity, loss_tangent, thickness, self.carrier_hz, cosine, self.polarization
             )
         x, y, z = (position - antenna).unbind(-1)
-        air = (y - thickness).clamp_min(self.shortest_m)  # a scatterer inside the slab is just behind it
+        air = (y - thickness).clamp_min(self.shortest_m)  # a scatterer inside the slab counts as behind it
         lateral = safe_sqrt(x.square() + z.square())
         index = refractive_index(permittivity, loss_tangent)[0]
         cosine, length = refracted_leg(lateral, air, thickness, index)
@@ -135,26 +181,27 @@ class TracedLegs(nn.Module):
         straight = (lateral.square() + (air + thickness).square()).sqrt()
         return Slab(slab.reflection, slab.loss_neper, (length - straight) / self.speed_m_s, slab.bounce_s)
 
+    def _transmission(self, slab: Slab, bounces: int) -> Tensor:
+        """Transmission of one leg with this number of internal bounce pairs."""
+        if self.paper:
+            return paper_transmission(slab, bounces, self.carrier_hz)
+        return transmission(slab, bounces)
+
     def _face_reflection(self, cosine: Tensor) -> Tensor:
-        """G of the near face for this cosine of the angle of incidence."""
+        """Reflection coefficient G of the near face for this cosine of the angle of incidence."""
         if not self.oblique:
             cosine = torch.ones_like(cosine)
         permittivity, loss_tangent = self.relative_permittivity.double(), self.loss_tangent.double()
         return fresnel(permittivity, loss_tangent, cosine, self.polarization)
 
     def _spread(self, direction: Tensor, length: Tensor) -> Tensor:
-        """Amplitude of a leg: the antenna's pattern over the length."""
+        """Amplitude of a leg: the antenna pattern divided by the length."""
         if self.has_pattern:
             return self.antenna(direction) / length
         return 1 / length
 
-    def _mirrored(self, antenna: Tensor) -> Tensor:
-        """Image in the near face: ``P' = P - 2 ((P - w) . n) n``."""
-        x, y, z = antenna.unbind(-1)
-        return torch.stack((x, 2 * self.face_y - y, z), -1)
-
     def _legs(self, position: Tensor, antenna: Tensor) -> Legs:
-        """All alternatives between one end and the scatterers (..., S, 3); absent ones are 0."""
+        """All alternatives between an antenna and the scatterers (..., S, 3); missing ones have factor 0."""
         length = leg_length(position, antenna, self.shortest_m)
         spread = self._spread(position - antenna, length)
         in_air, spread = length / self.speed_m_s, torch.complex(spread, torch.zeros_like(spread))
@@ -164,18 +211,18 @@ class TracedLegs(nn.Module):
             through = passes_face(position, antenna, self.face_y, self.center, self.half_size)
             slab = self._slab(position, antenna)
             delays[0] = in_air + torch.where(through, slab.excess_s, 0.0)
-            factors[0] = spread * torch.where(through, transmission(slab, 0), 1.0)
+            factors[0] = spread * torch.where(through, self._transmission(slab, 0), 1.0)
             for order in range(1, self.orders + 1):
                 bounced = torch.zeros_like(spread)
                 if self.with_bounces:
-                    bounced = spread * torch.where(through, transmission(slab, order), 0.0)
+                    bounced = spread * torch.where(through, self._transmission(slab, order), 0.0)
                 delays.append(delays[0] + order * slab.bounce_s)
                 factors.append(bounced)
             if self.with_images:
-                image = self._mirrored(antenna)
+                image = mirror_image(antenna, self.face_y)
                 front = position[..., 1] <= self.face_y
                 length = leg_length(position, image, self.shortest_m)
-                offset = flipped(position - image, 1)  # as it leaves the antenna itself
+                offset = flipped(position - image, 1)  # direction at the antenna itself
                 cosine = offset[..., 1] / length
                 mirrored = self._spread(offset, length) * self._face_reflection(cosine)
                 delays[3] = torch.where(front, length / self.speed_m_s, delays[3])
@@ -185,7 +232,7 @@ class TracedLegs(nn.Module):
         return Legs(torch.stack(delays, -1), torch.stack(factors, -1), through)
 
     def _floor_leg(self, position: Tensor, antenna: Tensor) -> tuple[Tensor, Tensor]:
-        """Delay and factor by the floor (..., S): the image of the antenna in z = 0."""
+        """Delay and factor (..., S) of the leg reflected by the floor, from the image of the antenna in z = 0."""
         image = flipped(antenna, 2)
         length = leg_length(position, image, self.shortest_m)
         offset = position - image
@@ -205,5 +252,5 @@ class TracedLegs(nn.Module):
             through = passes_face(position, image, self.face_y, self.center, self.half_size, True)
             slab = self._slab(position, image)
             delay = delay + torch.where(through, slab.excess_s, 0.0)
-            factor = factor * torch.where(through, transmission(slab, 0), 1.0)
+            factor = factor * torch.where(through, self._transmission(slab, 0), 1.0)
         return delay, factor

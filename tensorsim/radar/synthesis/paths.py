@@ -1,13 +1,11 @@
-"""Propagation paths: delay and complex gain of every way a wave takes over a scatterer.
+"""Propagation paths: delay and complex gain of every path from transmitter to scatterer to receiver.
 
-Bistatic everywhere: a way has a leg from the transmitter and a leg to the receiver. Its amplitude is the
-radar equation for unit transmit power on the legs of that way,
-``a = sqrt(Gt Gr lambda^2 sigma / ((4 pi)^3 R1^2 R2^2))``, ``lambda = c / fc`` (Richards, *Fundamentals of
-Radar Signal Processing*, ch. 2), times the complex factors of wall and floor. In the IF, which is transmitted
-times conjugate of received, those factors appear conjugated.
+The delay model is bistatic: a path has a leg from the transmitter and a leg to the receiver. Its amplitude is the
+radar equation on its own two legs, :func:`radar_equation_amplitude`, times the complex factors of wall and floor.
+The IF is the transmitted times the conjugate of the received wave, so these factors enter it conjugated.
 
-Every leg has a few alternatives: straight, bounced inside the wall, mirrored in it, mirrored in the floor.
-A way is a pair of them, one per leg.
+Every leg has alternatives (:mod:`~tensorsim.radar.synthesis.legs`): straight, with bounces inside the wall,
+reflected by the wall, reflected by the floor. A path is a pair of them, one per leg.
 """
 
 import math
@@ -19,22 +17,23 @@ from torch import Tensor, nn
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.ops import safe_sqrt
-from tensorsim.radar.synthesis.legs import TracedLegs, flipped, leg_length, passes_face
+from tensorsim.radar.synthesis.legs import TracedLegs, flipped, leg_length, mirror_image, passes_face
 from tensorsim.radar.synthesis.wall import wall_tensors
 
-#: What a scene may consist of; :class:`PropagationPaths` says what each is.
+#: Names of the path groups of a scene, explained in :class:`PropagationPaths`.
 PATH_NAMES = ("direct", "direct_in_air", "wall_bounces", "wall_images", "floor", "leakage", "wall_echo")
 
-#: What the echo can be differentiated by, besides positions and RCS.
+#: Constants that can be learnable parameters, besides positions and RCS as inputs.
 LEARNABLE = ("relative_permittivity", "loss_tangent", "thickness_m", "tx_m", "rx_m")
 
 
 class Paths(NamedTuple):
-    """What a wave meets on its way to S scatterers and back.
+    """Delays and gains of P paths over each of S scatterers.
 
     Attributes:
-        delay_s: (..., S, W) float64 seconds, W ways per scatterer.
-        gain: (..., S, W) complex128 amplitude in the IF for unit transmit power; 0 for a missing way.
+        delay_s: (..., S, P) float64 seconds.
+        gain: (..., S, P) complex128 amplitude in the IF for unit transmit power, conjugate of that of the
+            received wave; 0 for a missing path.
     """
 
     delay_s: Tensor
@@ -42,12 +41,14 @@ class Paths(NamedTuple):
 
 
 class Resonance(NamedTuple):
-    """What :func:`~tensorsim.radar.synthesis.wall.airy` needs of both legs of each way: (..., S, W, 2), 0 in air.
+    """Slab constants for :func:`~tensorsim.radar.synthesis.wall.airy`, both legs of each path: (..., S, P, 2).
+
+    All are 0 for legs in air.
 
     Attributes:
         square: complex ``G^2``.
         loss_neper: ``alpha d`` at fc.
-        bounce_s: delay of a pair of bounces.
+        bounce_s: delay of a pair of internal bounces, seconds.
     """
 
     square: Tensor
@@ -55,10 +56,40 @@ class Resonance(NamedTuple):
     bounce_s: Tensor
 
 
+def radar_equation_amplitude(
+    rcs_m2: Tensor,
+    tx_range_m: Tensor,
+    rx_range_m: Tensor,
+    wavelength_m: float,
+    tx_gain: float = 1.0,
+    rx_gain: float = 1.0,
+) -> Tensor:
+    """Bistatic radar equation: amplitude of the echo of a scatterer for unit transmit power.
+
+    ``a = sqrt(Gt Gr lambda^2 sigma / ((4 pi)^3 R1^2 R2^2))`` (Richards, *Fundamentals of Radar Signal Processing*,
+    ch. 2).
+
+    Args:
+        rcs_m2: (...) radar cross section sigma.
+        tx_range_m, rx_range_m: (...) lengths R1 and R2 of the two legs of the path.
+        wavelength_m: lambda, ``c / fc``.
+        tx_gain, rx_gain: Gt and Gr, linear power gains.
+
+    Returns:
+        (...) real. Differentiable; the gradient by an RCS of 0 is 0.
+
+    >>> one = torch.ones(())
+    >>> float(radar_equation_amplitude(one, 2 * one, 2 * one, 0.01) / radar_equation_amplitude(one, one, one, 0.01))
+    0.25
+    """
+    scale = math.sqrt(tx_gain * rx_gain) * wavelength_m / (4 * math.pi) ** 1.5
+    return scale * safe_sqrt(rcs_m2) / (tx_range_m * rx_range_m)
+
+
 def chosen_paths(
     multipath: bool, leakage: bool, wall_echo: bool, direct: bool, floor: bool, paths: tuple[str, ...] | None
 ) -> tuple[str, ...]:
-    """The names of the paths of a scene: those asked for, or those that the switches stand for."""
+    """Names of the path groups of a scene: ``paths`` if given, else those that the switches select."""
     if paths is None:
         groups = {
             ("direct",): direct,
@@ -77,18 +108,18 @@ def chosen_paths(
 
 
 class PropagationPaths(TracedLegs):
-    """The list of the paths of a scene.
+    """Delays and gains of all propagation paths of a scene, by the delay model and the mirror method.
 
     ==================  ===================================================================================
     ``direct``          straight to the scatterer and back. Each leg that enters the wall through its near face
-                        is multiplied by T0 and delayed by the slab's excess; a leg beside the wall (a
-                        rectangle in x and z) is free space.
-    ``direct_in_air``   the same as if there were no wall: the ablation "without wall attenuation".
+                        is multiplied by T0 and delayed by the slab's excess; a leg that misses the wall (a
+                        rectangle in x and z) is in free space.
+    ``direct_in_air``   the same without the wall: the ablation "without wall attenuation".
     ``wall_bounces``    through the wall with up to ``bounces`` pairs of internal bounces on a leg (T_k, k
-                        bounce delays later): all combinations of both legs but the direct one.
-                        ``wall_paths="paper"`` leaves 2 T0 T1 out, as the paper does.
+                        bounce delays later): all combinations of both legs except the direct one.
     ``wall_images``     scatterers in front of the wall: the images of the antennas in the near face, a
-                        (mirrored transmitter, times G), b (mirrored receiver, times G), c (both, times G^2).
+                        (mirrored transmitter, times G), b (mirrored receiver, times G), c (both, times G^2);
+                        see :func:`~tensorsim.radar.synthesis.legs.mirror_delays`.
     ``floor``           the images of the antennas in z = 0, times the floor's reflection coefficient:
                         floor-direct, direct-floor, floor-floor. These legs pass the wall without bounces.
     ``leakage``         transmitter to receiver: ``10^(-isolation/20)``, delay ``|Ptx - Prx| / c``.
@@ -96,45 +127,54 @@ class PropagationPaths(TracedLegs):
                         ``lambda sqrt(Gt Gr) / (4 pi R) G`` with ``R = |Ptx' - Prx|``.
     ==================  ===================================================================================
 
-    ``ways`` names the W ways of a scatterer, in order: (out, back) pairs such as ``"direct"``, ``"wall 1-0"``
-    (one bounce or the image on the way out), ``"floor-direct"``; ``static_ways`` those without a scatterer.
-    ``wall k-l`` means bounces behind the wall and images in front of it: geometry decides, per scatterer.
-
-    A scatterer inside the slab counts as behind it; edges do not diffract. The mirror for targets in front is
-    not limited to the rectangle. The loss of the wall is taken at fc, as lambda is. Legs are not taken below
-    lambda / (4 pi), where the radar equation has lost its meaning.
+    A scatterer inside the slab counts as behind it. There is no diffraction at the edges. The mirror for targets
+    in front of the wall is not limited to the rectangle. The loss of the wall is that at fc, as is lambda. Legs
+    are at least lambda / (4 pi) long: the radar equation does not hold for shorter ones.
 
     Args:
         radar: antennas, gain and carrier.
-        wall: what :func:`~tensorsim.radar.synthesis.wall.place_wall` made of the wall; None is free space.
-        names: which paths, of ``PATH_NAMES``.
-        wall_paths: ``"series"`` or ``"paper"``.
-        incidence: ``"normal"`` takes every leg as normal to the wall; ``"oblique"`` bends it by Snell's law
-            and takes Fresnel's coefficients at its angle; ``"airy"`` is oblique with all internal bounces in
+        wall: a wall in front of the antennas, see :func:`~tensorsim.radar.synthesis.wall.place_wall`; None is
+            free space.
+        names: path groups to include, of ``PATH_NAMES``.
+        wall_paths: ``"series"``, or ``"paper"`` for the paper's formula: without ``2 T0 T1``
+            (:func:`~tensorsim.radar.synthesis.wall.two_way_wall_transmission`), and with the propagation phase
+            of the wall in the amplitude as well as in the delay
+            (:func:`~tensorsim.radar.synthesis.wall.paper_transmission`).
+        incidence: ``"normal"`` treats every leg as normal to the wall; ``"oblique"`` refracts it by Snell's law
+            with the Fresnel coefficients at its angle; ``"airy"`` is oblique with all internal bounces in
             closed form (see :class:`~tensorsim.radar.EchoSynthesizer`), instead of ``wall_bounces``.
-        polarization: ``"te"`` (field along the wall: vertical antennas) or ``"tm"`` at the wall; the floor
-            sees the other.
+        polarization: ``"te"`` (field parallel to the wall: vertical antennas) or ``"tm"`` at the wall; at the
+            floor it is the other one.
         bounces: largest number of pairs of internal bounces on a leg.
-        floor: reflects, if ``names`` has ``floor``.
+        floor: the floor, used if ``names`` has ``floor``.
         antenna: pattern of all antennas (see :mod:`~tensorsim.radar.synthesis.antenna`); None is isotropic.
-        learnable: which of ``LEARNABLE`` are parameters; the others are buffers. The near face stays where it
-            is when the thickness changes.
+        learnable: which of ``LEARNABLE`` are parameters; the others are buffers. The position of the near face
+            does not depend on the thickness.
 
-    Shapes: positions (..., S, 3) metres, rcs (..., S) m^2 -> :class:`Paths` of (..., S, W). All float64.
-    Several antennas: (..., M, S, 3), (..., M, S) -> (..., V, M, S, W), channel ``v = k A + a`` for transmitter
-    k and receiver a. Differentiable by both and by what is learnable; the choice between the cases is not.
+    Shapes: positions (..., S, 3) metres, rcs (..., S) m^2 -> :class:`Paths` of (..., S, P). All float64.
+    Several antennas: (..., M, S, 3), (..., M, S) -> (..., V, M, S, P), channel ``v = k A + a`` for transmitter
+    k and receiver a. Differentiable by both and by learnable constants, for a fixed choice of paths.
+
+    Attributes:
+        path_names: names of the P paths of a scatterer, in order: pairs of legs such as ``"direct"``,
+            ``"wall 1-0"`` (one bounce pair on the way to the scatterer, none on the way back),
+            ``"floor-direct"``. ``wall k-l`` means bounces for a scatterer behind the wall and images for one in
+            front of it.
+        static_names: names of the paths without a scatterer.
+        scale: amplitude of an RCS of 1 m^2 for legs of 1 m.
 
     Raises:
-        TensorsimError: unknown options; a learnable wall without a wall.
+        TensorsimError: unknown options; ``wall_paths="paper"`` with ``incidence="airy"``, whose closed form has
+            no separate bounces; a learnable constant of a wall without a wall.
     """
 
     tx_m: Tensor
     rx_m: Tensor
-    out_ways: Tensor
-    back_ways: Tensor
+    out_legs: Tensor
+    back_legs: Tensor
     turn: Tensor
-    ways: list[str]
-    static_ways: list[str]
+    path_names: list[str]
+    static_names: list[str]
 
     def __init__(
         self,
@@ -157,44 +197,49 @@ class PropagationPaths(TracedLegs):
         ):
             if value not in known:
                 raise TensorsimError(f"{option}: got {value!r}, expected one of {known}")
+        if wall_paths == "paper" and incidence == "airy":
+            raise TensorsimError(
+                "wall_paths: got 'paper' with incidence 'airy', which sums all bounces; expected 'normal' or 'oblique'"
+            )
         if bounces < 1:
             raise TensorsimError(f"bounces: got {bounces}, expected at least 1")
         self._shape_legs(radar, wall, incidence, polarization, floor, antenna)
         self.paper = wall_paths == "paper"
         self.peak_gain = 10 ** (radar.antenna_gain_dbi / 10)
+        self.wavelength_m = radar.wavelength_m
         self.scale = self.peak_gain * radar.wavelength_m / (4 * math.pi) ** 1.5
         self.coupling = 10 ** (-radar.isolation_db / 20)
-        self._list_ways(names, bounces)
+        self._list_paths(names, bounces)
         self._own_constants(radar, wall, learnable)
 
     @torch.jit.unused
-    def _list_ways(self, names: tuple[str, ...], bounces: int) -> None:
-        """Alternatives of a leg, by index: 0 straight, 1 in air, 2 mirrored in the floor, 2 + k wall order k."""
+    def _list_paths(self, names: tuple[str, ...], bounces: int) -> None:
+        """Pairs of leg alternatives, by index: 0 straight, 1 in air, 2 reflected by the floor, 2 + k wall order k."""
         air, floor = 1, 2
         self.with_bounces = "wall_bounces" in names and not self.airy
         self.with_images = "wall_images" in names
         self.orders = 0
         if self.has_wall and (self.with_bounces or self.with_images):
             self.orders = bounces if self.with_bounces else 1
-        ways: list[tuple[str, int, int]] = []
+        paths: list[tuple[str, int, int]] = []
         if "direct" in names:
-            ways.append(("direct", 0, 0))
+            paths.append(("direct", 0, 0))
         if "direct_in_air" in names:
-            ways.append(("direct_in_air", air, air))
+            paths.append(("direct_in_air", air, air))
         for total in range(1, 2 * self.orders + 1):
             for out in range(min(total, self.orders), max(0, total - self.orders) - 1, -1):
                 back = total - out
-                ways.append((f"wall {out}-{back}", floor + out if out else 0, floor + back if back else 0))
+                paths.append((f"wall {out}-{back}", floor + out if out else 0, floor + back if back else 0))
         self.with_floor = "floor" in names
         if self.with_floor:
-            ways += [("floor-direct", floor, 0), ("direct-floor", 0, floor), ("floor-floor", floor, floor)]
+            paths += [("floor-direct", floor, 0), ("direct-floor", 0, floor), ("floor-floor", floor, floor)]
         static = [name for name in ("leakage", "wall_echo") if name in names]
-        self.ways = [name for name, _, _ in ways]
-        self.static_ways = [name for name in static if self.has_wall or name != "wall_echo"]
-        self.plain = not (self.has_wall or self.with_floor or self.has_pattern) and len(ways) == 1
-        for name, index in (("out_ways", 1), ("back_ways", 2)):
+        self.path_names = [name for name, _, _ in paths]
+        self.static_names = [name for name in static if self.has_wall or name != "wall_echo"]
+        self.plain = not (self.has_wall or self.with_floor or self.has_pattern) and len(paths) == 1
+        for name, index in (("out_legs", 1), ("back_legs", 2)):
             self.register_buffer(
-                name, torch.tensor([w[index] for w in ways], dtype=torch.long), persistent=False
+                name, torch.tensor([p[index] for p in paths], dtype=torch.long), persistent=False
             )
 
     @torch.jit.unused
@@ -233,7 +278,7 @@ class PropagationPaths(TracedLegs):
         return tx, rx
 
     def _channels(self, positions: Tensor, step: Tensor | None) -> Tensor:
-        """Positions as each channel sees them: (..., V, M, S, 3), or as they are for one channel."""
+        """Positions at the pulse of each channel: (..., V, M, S, 3); unchanged for one channel."""
         if not self.has_array:
             return positions
         positions = positions.unsqueeze(-4)
@@ -242,46 +287,50 @@ class PropagationPaths(TracedLegs):
         return positions
 
     def forward(self, positions: Tensor, rcs: Tensor, step: Tensor | None = None) -> Paths:
-        """(..., S, 3) metres and (..., S) m^2, both float64, to delays and gains (..., S, W).
+        """(..., S, 3) metres and (..., S) m^2, both float64, to delays and gains (..., S, P).
 
-        ``step`` (..., S, 3) is the way of each scatterer until the next pulse: transmitters that fire in turn
-        see it part of that way on. Without it, scatterers stand still within a pulse interval.
+        ``step`` (..., S, 3) is the displacement of each scatterer until the next pulse: transmitter k of K, which
+        fires later, sees ``k / K`` of it. Without it, scatterers stand still within a pulse interval.
         """
         tx, rx = self._antennas()
         position = self._channels(positions, step)
-        strength = self.scale * safe_sqrt(rcs.unsqueeze(-3) if self.has_array else rcs)
-        if self.plain:  # what follows says the same, at several times the cost
+        if self.has_array:
+            rcs = rcs.unsqueeze(-3)
+        if self.plain:  # a shortcut: the code below gives the same result at several times the cost
             out = leg_length(position, tx, self.shortest_m)
             back = leg_length(position, rx, self.shortest_m)
-            real = (strength / (out * back)).unsqueeze(-1)
+            real = radar_equation_amplitude(
+                rcs, out, back, self.wavelength_m, self.peak_gain, self.peak_gain
+            ).unsqueeze(-1)
             delay = ((out + back) / self.speed_m_s).unsqueeze(-1)
             return Paths(delay, torch.complex(real, torch.zeros_like(real)))
         legs_out, legs_back = self._legs(position, tx), self._legs(position, rx)
-        delay = legs_out.delay_s.index_select(-1, self.out_ways)
-        delay = delay + legs_back.delay_s.index_select(-1, self.back_ways)
-        factor = legs_out.factor.index_select(-1, self.out_ways)
-        factor = factor * legs_back.factor.index_select(-1, self.back_ways)
-        if self.paper:  # keeps equal orders on both legs; 2 T0 T1 are the ways of unequal ones
-            unequal = (self.out_ways != self.back_ways) & (self.out_ways != 2) & (self.back_ways != 2)
+        delay = legs_out.delay_s.index_select(-1, self.out_legs)
+        delay = delay + legs_back.delay_s.index_select(-1, self.back_legs)
+        factor = legs_out.factor.index_select(-1, self.out_legs)
+        factor = factor * legs_back.factor.index_select(-1, self.back_legs)
+        if self.paper:  # the paper has equal orders on both legs only, without 2 T0 T1
+            unequal = (self.out_legs != self.back_legs) & (self.out_legs != 2) & (self.back_legs != 2)
             both = (legs_out.through & legs_back.through).unsqueeze(-1)
             factor = torch.where(both & unequal, 0.0, factor)
+        strength = self.scale * safe_sqrt(rcs)  # radar equation; the factors of the legs contain 1 / length
         return Paths(delay, (strength.unsqueeze(-1) * factor).conj().resolve_conj())
 
     @torch.jit.export
     def resonance(self, positions: Tensor, step: Tensor | None = None) -> Resonance:
-        """What the wall does over frequency to each leg of the ways of :meth:`forward`."""
+        """Slab constants of each leg of the paths of :meth:`forward`, for the closed sum of bounces."""
         tx, rx = self._antennas()
         position = self._channels(positions, step)
         squares: list[Tensor] = []
         losses: list[Tensor] = []
         bounces: list[Tensor] = []
-        for antenna, ways in [(tx, self.out_ways), (rx, self.back_ways)]:
+        for antenna, legs in [(tx, self.out_legs), (rx, self.back_legs)]:
             image = flipped(antenna, 2)
             straight, floor = self._slab(position, antenna), self._slab(position, image)
             through = passes_face(position, antenna, self.face_y, self.center, self.half_size).unsqueeze(-1)
             below = passes_face(position, image, self.face_y, self.center, self.half_size, True).unsqueeze(-1)
-            by_floor = ways == 2
-            passes = torch.where(by_floor, below, through & (ways == 0))
+            by_floor = legs == 2
+            passes = torch.where(by_floor, below, through & (legs == 0))
             g, g_floor = straight.reflection.unsqueeze(-1), floor.reflection.unsqueeze(-1)
             a, a_floor = straight.loss_neper.unsqueeze(-1), floor.loss_neper.unsqueeze(-1)
             t, t_floor = straight.bounce_s.unsqueeze(-1), floor.bounce_s.unsqueeze(-1)
@@ -292,24 +341,24 @@ class PropagationPaths(TracedLegs):
 
     @torch.jit.export
     def static(self) -> Paths:
-        """Paths without a scatterer, one column per name of ``static_ways``: (W,), or (V, 1, W)."""
+        """Paths without a scatterer, one per name in ``static_names``: (P,), or (V, 1, P)."""
         tx, rx = self._antennas()
         if self.has_array:
             tx, rx = tx.squeeze(-2), rx.squeeze(-2)
         delays: list[Tensor] = []
         gains: list[Tensor] = []
-        for name in self.static_ways:
+        for name in self.static_names:
             if name == "leakage":
                 length = leg_length(tx, rx, 0.0)
                 real = torch.full_like(length, self.coupling)
                 gains.append(torch.complex(real, torch.zeros_like(real)))
             else:
-                image = self._mirrored(tx)
+                image = mirror_image(tx, self.face_y)
                 length = leg_length(image, rx, self.shortest_m)
                 offset = image - rx
                 cosine = (offset[..., 1] / length).clamp(0.0, 1.0)
                 friis = self.peak_gain * self.shortest_m / length
-                if self.has_pattern:  # out of one antenna and into the other at the same angle
+                if self.has_pattern:  # specular: the same angle at both antennas
                     friis = friis * self.antenna(offset) * self.antenna(flipped(-offset, 1))
                 gains.append((friis * self._face_reflection(cosine)).conj().resolve_conj())
             delays.append(length / self.speed_m_s)

@@ -1,9 +1,10 @@
-"""A homogeneous wall: where it stands, and what a slab normal to y does to a wave.
+"""Through-the-wall propagation: position of a homogeneous wall, and transmission through a slab normal to y.
 
 Refractive index ``n = sqrt(eps_r (1 - j tan d)) = n' - j n''``; the time factor is ``exp(+j w t)``.
 Coefficients follow Balanis, *Advanced Engineering Electromagnetics*, ch. 5 (Fresnel, for waves that are plane
-at the wall) and Born and Wolf, *Principles of Optics*, 7.6 (the slab). Propagation phase is counted once, in
-the delay: coefficients keep the interfaces and the loss only.
+at the wall) and Born and Wolf, *Principles of Optics*, 7.6 (the slab). The propagation phase is counted once, in
+the delay; the coefficients contain interfaces and loss only. The paper counts it in both:
+:func:`paper_transmission`.
 """
 
 import math
@@ -31,8 +32,8 @@ class Slab(NamedTuple):
     Attributes:
         reflection: complex ``G``, air to wall; wall to air is ``-G``, and one passage through both faces is
             ``T12 T21 = 1 - G^2``.
-        loss_neper: ``alpha d``, attenuation of one passage at the frequency asked for.
-        excess_s: delay of one passage over the air it replaces, ``d (n' cos t - cos i) / c``.
+        loss_neper: ``alpha d``, attenuation of one passage at the given frequency.
+        excess_s: additional delay of one passage compared with air, ``d (n' cos t - cos i) / c``.
         bounce_s: delay of a pair of internal bounces, ``2 d n' cos t / c``.
     """
 
@@ -40,6 +41,18 @@ class Slab(NamedTuple):
     loss_neper: Tensor
     excess_s: Tensor
     bounce_s: Tensor
+
+
+class WallTerms(NamedTuple):
+    """Two-way echoes of a target behind a wall; the last dimension is the number of internal bounce pairs.
+
+    Attributes:
+        gain: (..., 3) complex factor of the received wave: ``T0^2``, ``2 T0 T1``, ``T1^2``.
+        delay_s: (..., 3) delay of each beyond that of the same path in air.
+    """
+
+    gain: Tensor
+    delay_s: Tensor
 
 
 def refractive_index(relative_permittivity: Tensor, loss_tangent: Tensor) -> tuple[Tensor, Tensor]:
@@ -75,9 +88,17 @@ def slab_coefficients(
     polarization: str = "te",
     speed_m_s: float = SPEED_OF_LIGHT_M_S,
 ) -> Slab:
-    """The slab for a wave at this cosine (...) of the angle of incidence; 1 is normal.
+    """Coefficients of a slab for a plane wave.
 
-    The ray bends by ``n'``; the loss follows from the imaginary part of ``n cos t``.
+    The ray is refracted by ``n'``; the loss follows from the imaginary part of ``n cos t``. At normal incidence
+    ``alpha = (2 pi f / c) n''``.
+
+    Args:
+        relative_permittivity, loss_tangent, thickness_m: () or (...), see :func:`wall_tensors`.
+        frequency_hz: frequency of the loss.
+        cos_incidence: (...) cosine of the angle of incidence, 1 for normal incidence.
+        polarization: ``"te"`` or ``"tm"``, see :func:`fresnel`.
+        speed_m_s: speed of light.
     """
     real, imaginary = refractive_index(relative_permittivity, loss_tangent)
     n = torch.complex(real, -imaginary)
@@ -94,17 +115,49 @@ def slab_coefficients(
 
 
 def transmission(slab: Slab, bounces: int) -> Tensor:
-    """``T_k = (1 - G^2) G^(2k) exp(-(2k + 1) alpha d)``: through the slab after k pairs of internal bounces."""
+    """One-way transmission ``T_k = T12 T21 G^(2k) exp(-(2k + 1) alpha d)`` with k pairs of internal bounces.
+
+    ``T12 T21 = (1 + G) (1 - G)``. Complex (...), without the propagation phase, which the delay contains.
+    """
     straight = (1 - slab.reflection.square()) * torch.exp(-slab.loss_neper)
     if bounces == 0:
         return straight
     return straight * (slab.reflection * torch.exp(-slab.loss_neper)).pow(2 * bounces)
 
 
-def airy(slab: Slab, frequency_hz: float) -> tuple[Tensor, Tensor]:
-    """``(R, T)``: reflection and transmission of the whole slab with all its bounces, both at ``frequency_hz``.
+def paper_transmission(slab: Slab, bounces: int, frequency_hz: float) -> Tensor:
+    """:func:`transmission` as the paper prints it: ``T_k exp(-j (2k + 1) beta d)``, ``beta = (2 pi f / c) n' cos t``.
 
-    Relative to the near face, and to a straight passage: its phase is not in T, since delays hold it.
+    The propagation phase of the wall is then counted twice, here and in the delay.
+    """
+    angle = -(2 * bounces + 1) * math.pi * frequency_hz * slab.bounce_s  # a pair of bounces is 2 d long
+    return transmission(slab, bounces) * torch.polar(torch.ones_like(angle), angle)
+
+
+def two_way_wall_transmission(slab: Slab) -> WallTerms:
+    """Two-way transmission ``(T0 + T1)^2`` of a wall, term by term: without, with one and with two bounce pairs.
+
+    Both legs of the path pass the wall; :func:`transmission` is one of them. Each leg is late by ``excess_s``,
+    and each pair of internal bounces adds ``bounce_s``::
+
+        T0^2     2 excess                direct
+        2 T0 T1  2 excess + bounce       one bounce pair, on the way to the target or back
+        T1^2     2 excess + 2 bounce     one bounce pair on both
+
+    The paper keeps ``T0^2`` and ``T1^2`` only.
+    """
+    t0, t1 = transmission(slab, 0), transmission(slab, 1)
+    excess, bounce = 2 * slab.excess_s, slab.bounce_s
+    return WallTerms(
+        torch.stack((t0.square(), 2 * t0 * t1, t1.square()), -1),
+        torch.stack((excess, excess + bounce, excess + 2 * bounce), -1),
+    )
+
+
+def airy(slab: Slab, frequency_hz: float) -> tuple[Tensor, Tensor]:
+    """``(R, T)``: reflection and transmission of the whole slab with all internal bounces at ``frequency_hz``.
+
+    R refers to the near face. T refers to a straight passage, whose phase is in the delay and not in T.
     ``T = T_0 / (1 - q)`` and ``R = G (1 - q / G^2) / (1 - q)`` with ``q = G^2 exp(-2 alpha d - j 2 pi f t)``, t
     the delay of a pair of bounces: the sum of :func:`transmission` over all k with the phases of their delays.
     """
@@ -117,13 +170,18 @@ def airy(slab: Slab, frequency_hz: float) -> tuple[Tensor, Tensor]:
 def refracted_leg(
     lateral_m: Tensor, air_m: Tensor, thickness_m: Tensor, index: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Snell's path through a slab: ``(cos i, optical length)``, each (...).
+    """Refracted path through a slab by Snell's law: ``(cos i, optical length in metres)``, each (...).
 
-    ``lateral_m`` (...) is the offset along the wall, ``air_m`` (...) > 0 the air to cross, both sides together.
     The tangent of the angle of incidence solves ``air tan i + d tan t = lateral`` with ``sin i = n' sin t``.
-    Newton's iteration from the straight line converges monotonically, quadratically in the end: eight steps
-    leave 1e-12 m even at grazing incidence. It runs without gradients; one more step with them gives the
-    derivative of the implicit function, exactly.
+    Newton's iteration from the straight line converges monotonically and finally quadratically: after eight steps
+    the error is 1e-12 m even at grazing incidence. It runs without gradients; one more step with gradients gives
+    the exact derivative of the implicit function.
+
+    Args:
+        lateral_m: (...) distance between the ends along the wall.
+        air_m: (...) > 0, distance through air normal to the wall, both sides together.
+        thickness_m: d.
+        index: n'.
     """
     lateral, air, thickness, n = lateral_m.detach(), air_m.detach(), thickness_m.detach(), index.detach()
     tangent = lateral / (air + thickness)
@@ -150,21 +208,25 @@ def wall_tensors(wall: WallConfig) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def one_way_loss_db(wall: WallConfig, frequency_hz: float) -> float:
-    """Loss of one straight passage at normal incidence, ``-20 log10 |T0|``."""
+    """Loss of one straight passage in dB at normal incidence, ``-20 log10 |T0|``."""
     slab = slab_coefficients(*wall_tensors(wall), frequency_hz, torch.ones((), dtype=torch.float64))
     return -20 * math.log10(max(float(transmission(slab, 0).abs()), sys.float_info.min))
 
 
 def near_face_m(wall: WallConfig) -> float:
-    """The y of the face towards the radar."""
+    """The y coordinate in metres of the face towards the radar."""
     return wall.center_m[1] - wall.size_m[1] / 2
 
 
 def place_wall(wall: WallConfig | None, radar: RadarConfig) -> WallConfig | None:
-    """The wall as the echo uses it: in front of all antennas, or None where there is no wall.
+    """Check the position of a wall and move it in front of the antennas if it contains one of them.
 
-    A wall of thickness 0 is no wall. A wall that contains an antenna (the original application's default
-    centre is the transmitter) moves along y until its near face touches the antenna plane, with a warning.
+    The original application's default wall is centred on the transmitter. Such a wall is moved along y until its
+    near face touches the antenna plane, with a warning. A wall that attenuates by more than ``OPAQUE_DB`` one way
+    gives a warning too.
+
+    Returns:
+        The wall, or None for no wall or one of thickness 0.
 
     Raises:
         TensorsimError: the whole wall is behind the antennas.
@@ -178,7 +240,7 @@ def place_wall(wall: WallConfig | None, radar: RadarConfig) -> WallConfig | None
     if y + half <= rear_antenna + CONTACT_M:
         raise TensorsimError(
             f"wall: its far face is at y = {y + half:.4g} m, expected in front of the antennas "
-            f"at y = {plane:.4g} m: behind them there is nothing to pass through"
+            f"at y = {plane:.4g} m: a wall behind them has no effect"
         )
     if y - half < plane + CONTACT_M:
         if y - half < plane - CONTACT_M:
@@ -193,7 +255,7 @@ def place_wall(wall: WallConfig | None, radar: RadarConfig) -> WallConfig | None
     if loss_db > OPAQUE_DB:
         warnings.warn(
             f"wall: {-loss_db:.0f} dB one way at {radar.carrier_hz / 1e9:g} GHz, "
-            "next to nothing comes back through it",
+            "targets behind it are practically invisible",
             TensorsimWarning,
             stacklevel=2,
         )

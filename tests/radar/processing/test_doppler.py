@@ -9,12 +9,18 @@ import torch
 from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo, coherent_sum
+from tensorsim.radar.processing.doppler import (
+    DopplerTimeMap,
+    RangeDopplerVideo,
+    coherent_sum,
+    doppler_time_map,
+)
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.radar.processing.range_profile import RangeProfile
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.radar import reference
 from tests.radar.scenes import SMALL, ProfilesCase, complex_noise
+from tests.stage import assert_same
 
 FREE = RadarConfig.free_space()
 THROUGH = RadarConfig.through_wall()
@@ -88,6 +94,31 @@ def test_map_equals_scipy():
     count = min(actual.shape[1], expected.shape[1])
     assert count >= 25
     np.testing.assert_allclose(actual[:, :count], expected[:, :count], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("radar", [FREE, THROUGH, SMALL])
+@pytest.mark.parametrize("batch", [(), (2, 2)])
+def test_blocks_equal_the_formula(radar, batch):
+    """The blocked path of the Module and ``torch.stft``, and that against a loop over frames in NumPy."""
+    module = DopplerTimeMap(radar).double()
+    x = complex_noise(*batch, module.length + 8 * module.hop - 1, 5, dtype=torch.float64)
+    formula = doppler_time_map(x, module.window, module.hop, module.bins)
+    assert formula.shape == (*batch, module.bins, 8)
+    assert reference.relative(module(x), formula) < 1e-12
+    assert reference.relative(module(x.to(torch.complex64)), formula) < 1e-6
+    expected, _ = reference.doppler_time(x.flatten(0, -3)[0].numpy() if batch else x.numpy(), radar.prf_hz)
+    assert reference.relative(formula.flatten(0, -3)[0] if batch else formula, expected) < 1e-12
+    scripted = torch.jit.script(doppler_time_map)
+    assert_same(scripted(x, module.window, module.hop, module.bins), formula)
+
+
+def test_gradient_of_the_formula():
+    x = complex_noise(40, 2, dtype=torch.float64).requires_grad_()
+    window = torch.hann_window(16).double()
+    assert torch.autograd.gradcheck(lambda x: doppler_time_map(x, window, 8, 32), (x,), fast_mode=True)
+    silent = torch.zeros(40, 2, dtype=torch.complex128, requires_grad=True)
+    doppler_time_map(silent, window, 8, 32).sum().backward()
+    assert torch.isfinite(silent.grad.abs()).all()
 
 
 def test_settings_of_the_presets():

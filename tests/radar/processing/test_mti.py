@@ -10,7 +10,7 @@ from scipy import signal
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.processing.iir import BLOCK, BlockFilter
-from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.mti import MovingTargetIndicator, two_pulse_canceller
 from tests.radar import reference
 from tests.radar.scenes import SMALL, complex_noise
 from tests.stage import StageTester
@@ -167,6 +167,12 @@ def test_static_scene_vanishes_and_lengths(method):
     assert mti.lost_pulses == {"two-pulse": 1, "n-pulse": 3, "mean": 0, "high-pass": 0}[method]
     assert mti.delay_pulses == {"two-pulse": 0.5, "n-pulse": 1.5, "mean": 0, "high-pass": 0}[method]
     assert mti.whole_clip == (method in ("mean", "high-pass"))
+
+
+def test_two_pulse_canceller_is_the_difference():
+    x = complex_noise(2, 9, 3)
+    np.testing.assert_array_equal(two_pulse_canceller(x), np.diff(x.numpy(), axis=-2))
+    assert torch.equal(torch.jit.script(two_pulse_canceller)(x), MovingTargetIndicator()(x))
 
 
 def test_differences_are_binomial():

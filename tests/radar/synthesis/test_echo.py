@@ -9,6 +9,7 @@ import torch
 from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
+from tensorsim.radar.synthesis.dechirp import beat_sum, intermediate_frequency
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.radar import reference
 from tests.radar.scenes import SMALL, SceneCase, joint_rcs, recorded_walk, swinging, tensors
@@ -49,6 +50,36 @@ class TestEchoSynthesizer(SceneCase):
         for args, message in self.bad_inputs():
             with pytest.raises(Exception, match=message):
                 scripted(*args)
+
+
+def test_intermediate_frequency():
+    """The formula against NumPy, and the factorised sum of the echo against the formula."""
+    rng = np.random.default_rng(0)
+    delay, t = rng.uniform(1e-9, 4e-8, (3, 5)), np.arange(400) / 10e6
+    amplitude = rng.normal(size=(3, 5)) + 1j * rng.normal(size=(3, 5))
+    mu = 4e9 / 40e-6
+    phase = 77e9 * delay[..., None] + mu * delay[..., None] * t - mu * delay[..., None] ** 2 / 2
+    expected = (np.conj(amplitude)[..., None] * np.exp(2j * np.pi * phase)).sum(1)
+    tau, a, time = map(torch.as_tensor, (delay, amplitude, t))
+    actual = intermediate_frequency(tau, a, 77e9, mu, time)
+    assert reference.relative(actual, expected) < 1e-11
+    assert_same(torch.jit.script(intermediate_frequency)(tau, a, 77e9, mu, time), actual, atol=1e-12)
+    index = torch.arange(20).double()
+    fast = beat_sum(tau, a.conj().resolve_conj(), 77e9, mu, 10e6, index, index)
+    assert reference.relative(fast, actual) < 1e-11
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_echo_is_the_sum_over_its_paths(scene):
+    radar, options, _ = SCENES[scene]
+    p, rcs = tensors(swinging(8, 4, radar.prf_hz), np.linspace(0.1, 1, 4))
+    module = EchoSynthesizer(radar, **options).double()
+    paths = module.paths(p, rcs.expand(8, 4))
+    time = torch.arange(module.samples).double() / radar.sample_rate_hz
+    slow = intermediate_frequency(
+        paths.delay_s.flatten(-2), paths.gain.flatten(-2).conj(), radar.carrier_hz, radar.slope_hz_per_s, time
+    )
+    assert reference.relative(module(p, rcs), slow) < 1e-11
 
 
 @pytest.mark.parametrize("scene", SCENES)

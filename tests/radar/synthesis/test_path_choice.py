@@ -64,7 +64,7 @@ def test_floor_equals_the_definition(floor, polarization):
         legs.append([(r, r / C, 1.0), reference.floor_leg(point, antenna, floor, other)])
     delays, gains = reference.pair_legs(THROUGH, *legs)
     module = EchoSynthesizer(THROUGH, floor=floor, polarization=polarization).double()
-    assert module.paths.ways == ["direct", "floor-direct", "direct-floor", "floor-floor"]
+    assert module.paths.path_names == ["direct", "floor-direct", "direct-floor", "floor-floor"]
     position = torch.tensor(point).double()[None, None]
     paths = module.paths(torch.tensor([point], dtype=torch.float64), torch.ones(1).double())
     order = [0, 2, 1, 3]  # the reference runs through the way back first
@@ -107,14 +107,14 @@ def test_contributions_add_up_and_are_those_of_people(incidence):
     module = EchoSynthesizer(THROUGH, BETWEEN, True, True, floor=FLOOR, incidence=incidence).double()
     groups = torch.tensor([0, 1, 1, 0])
     parts = module.contributions(p, rcs, groups)
-    assert parts.shape == (2, len(module.paths.ways), 5, 400)
+    assert parts.shape == (2, len(module.paths.path_names), 5, 400)
     assert_same(parts.sum((0, 1)) + module.static_echo(), module(p, rcs), atol=1e-9)
     first = module(p, rcs * (groups == 0)) - module.static_echo()
     assert_same(parts[0].sum(0), first, atol=1e-9)
     direct = EchoSynthesizer(THROUGH, BETWEEN, incidence=incidence).double()(p, rcs)
-    assert_same(parts.sum(0)[module.paths.ways.index("direct")], direct, atol=1e-9)
+    assert_same(parts.sum(0)[module.paths.path_names.index("direct")], direct, atol=1e-9)
     batch = module.contributions(torch.stack((p, p + 0.1)), rcs, groups)
-    assert batch.shape == (2, 2, len(module.paths.ways), 5, 400)
+    assert batch.shape == (2, 2, len(module.paths.path_names), 5, 400)
     assert_same(batch[0], parts, atol=1e-9)
     with pytest.raises(TensorsimError, match="groups: got"):
         module.contributions(p, rcs, groups[:2])

@@ -11,15 +11,19 @@ import torch
 from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.radar.synthesis.paths import PropagationPaths, leg_length, safe_sqrt
+from tensorsim.ops import safe_sqrt
+from tensorsim.radar.synthesis.legs import leg_length, mirror_delays
+from tensorsim.radar.synthesis.paths import PropagationPaths, radar_equation_amplitude
 from tensorsim.radar.synthesis.wall import (
     one_way_loss_db,
     place_wall,
     slab_coefficients,
     transmission,
+    two_way_wall_transmission,
     wall_tensors,
 )
 from tests.radar import reference
+from tests.stage import assert_same
 
 RADAR = RadarConfig.through_wall()
 FAR_WALL = WallConfig(center_m=(0.0, 5.12, 1.5))  # near face at y = 5
@@ -87,9 +91,79 @@ def test_through_wall_terms():
     excess = np.array([2 * d * (n - 1), once, once, 2 * d * (3 * n - 1)]) / C
     np.testing.assert_allclose(delay - air, excess, atol=1e-18)
     np.testing.assert_allclose(gain / plain, np.conj([t0**2, t0 * t1, t0 * t1, t1**2]), rtol=1e-12)
-    paper = paths_of(point, wall, multipath=True, wall_paths="paper")[1]
-    np.testing.assert_allclose(paper / plain, np.conj([t0**2, 0, 0, t1**2]), rtol=1e-12)
     np.testing.assert_allclose(paths_of(point, wall)[1], gain[:1], rtol=1e-15)
+
+
+def test_literal_paper_formula():
+    """T0^2 and T1^2 with exp(-j beta d) per passage, in the amplitude and again in the delay; no 2 T0 T1."""
+    wall, point, f = WallConfig(), (0.5, 3.0, 1.0), RADAR.carrier_hz
+    air, plain = paths_of(point, None)
+    n = np.sqrt(6 * (1 - 0.03j))
+    d, k = 0.24, 2 * np.pi * f / C
+    alpha, beta = -k * n.imag, k * n.real
+    g = (1 - n) / (1 + n)
+    t0 = (1 + g) * (1 - g) * np.exp(-alpha * d) * np.exp(-1j * beta * d)
+    t1 = (1 + g) * g**2 * (1 - g) * np.exp(-3 * alpha * d) * np.exp(-3j * beta * d)
+    delay, gain = paths_of(point, wall, multipath=True, wall_paths="paper")
+    excess = np.array([2 * d * (n.real - 1), 2 * d * (3 * n.real - 1)]) / C
+    np.testing.assert_allclose(delay[[0, 3]] - air, excess, atol=1e-18)
+    np.testing.assert_allclose(gain / plain, np.conj([t0**2, 0, 0, t1**2]), rtol=1e-11)
+    series = paths_of(point, wall, multipath=True)[1]
+    np.testing.assert_allclose(abs(gain[[0, 3]]), abs(series[[0, 3]]), rtol=1e-12)
+    assert abs(np.angle(gain[0] / series[0])) > 0.1  # the phase does differ
+
+
+@pytest.mark.parametrize("wall_paths", ["series", "paper"])
+def test_paper_option_changes_nothing_in_front_of_the_wall(wall_paths):
+    delay, gain = paths_of((0.5, 3.0, 1.0), FAR_WALL, multipath=True, wall_paths=wall_paths)
+    _, plain = paths_of((0.5, 3.0, 1.0), FAR_WALL, multipath=True)
+    np.testing.assert_array_equal(gain, plain)
+    assert delay.shape == (4,)
+
+
+def test_two_way_wall_transmission():
+    """Term by term against NumPy, and their sum against the path list of a target behind the wall."""
+    wall, point = WallConfig(), (0.5, 3.0, 1.0)
+    terms = two_way_wall_transmission(slab_coefficients(*wall_tensors(wall), 2e9, torch.ones(()).double()))
+    _, _, t0, t1 = reference.wall_terms(wall, 2e9)
+    np.testing.assert_allclose(terms.gain, [t0**2, 2 * t0 * t1, t1**2], rtol=1e-12)
+    d, n = wall.size_m[1], wall.refractive_index.real
+    expected = np.array([2 * d * (n - 1), 2 * d * (n - 1) + 2 * d * n, 2 * d * (n - 1) + 4 * d * n]) / C
+    np.testing.assert_allclose(terms.delay_s, expected, rtol=1e-12)
+    air, plain = paths_of(point, None)
+    delay, gain = paths_of(point, wall, multipath=True)
+    np.testing.assert_allclose(air + terms.delay_s.numpy(), delay[[0, 1, 3]], rtol=1e-14)
+    found = np.conj(terms.gain.numpy()) * plain
+    np.testing.assert_allclose(found, [gain[0], gain[1] + gain[2], gain[3]], rtol=1e-12)
+    scripted = torch.jit.script(two_way_wall_transmission)
+    slab = slab_coefficients(*wall_tensors(wall), 2e9, torch.ones(3).double())
+    assert_same(scripted(slab), two_way_wall_transmission(slab))
+
+
+def test_mirror_delays():
+    """The worked case: antennas 0.2 m apart, a target at (0.5, 3, 1), the face at y = 5."""
+    point, tx, rx = (
+        torch.tensor([[0.5, 3.0, 1.0], [-0.3, 4.0, 0.2]], dtype=torch.float64),
+        RADAR.tx_m,
+        RADAR.rx_m,
+    )
+    tx_m, rx_m = torch.tensor([tx, rx], dtype=torch.float64)
+    delays = mirror_delays(point, tx_m, rx_m, 5.0)
+    assert delays.shape == (2, 3)
+    np.testing.assert_allclose(delays[0] * C, [10.1110, 10.1292, 14.0727], atol=5e-5)
+    for p, found in zip(point, delays, strict=True):
+        listed, _ = paths_of(p.tolist(), FAR_WALL, multipath=True)
+        np.testing.assert_allclose(found, listed[1:], rtol=1e-14)
+    assert_same(torch.jit.script(mirror_delays)(point, tx_m, rx_m, 5.0), delays)
+
+
+def test_radar_equation_amplitude():
+    out, back, rcs = 3.0, 4.0, 0.5
+    found = radar_equation_amplitude(*map(torch.tensor, (rcs, out, back)), 0.15, 20.0, 5.0)
+    power = 20.0 * 5.0 * 0.15**2 * rcs / ((4 * math.pi) ** 3 * out**2 * back**2)
+    assert float(found) == pytest.approx(math.sqrt(power), rel=1e-6)
+    scripted = torch.jit.script(radar_equation_amplitude)
+    assert_same(scripted(*map(torch.tensor, (rcs, out, back)), 0.15, 20.0, 5.0), found)
 
 
 def test_wall_factors_in_decibels():
@@ -173,9 +247,9 @@ def test_wall_around_the_antennas_is_moved():
 
 
 def test_wall_behind_the_antennas_is_refused():
-    with pytest.raises(TensorsimError, match="nothing to pass through"):
+    with pytest.raises(TensorsimError, match="a wall behind them has no effect"):
         place_wall(WallConfig(center_m=(0, -1, 1.5)), RADAR)
-    with pytest.raises(TensorsimError, match="nothing to pass through"):
+    with pytest.raises(TensorsimError, match="a wall behind them has no effect"):
         place_wall(WallConfig(center_m=(0, -0.12, 1.5)), RADAR)
 
 
@@ -187,6 +261,8 @@ def test_opaque_wall_warns():
 def test_unknown_wall_paths_are_refused():
     with pytest.raises(TensorsimError, match="wall_paths: got 'airy'"):
         PropagationPaths(RADAR, WallConfig(), wall_paths="airy")
+    with pytest.raises(TensorsimError, match="wall_paths: got 'paper' with incidence 'airy'"):
+        PropagationPaths(RADAR, WallConfig(), wall_paths="paper", incidence="airy")
 
 
 def test_square_root_and_legs_have_finite_gradients_at_zero():

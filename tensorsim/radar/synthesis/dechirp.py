@@ -1,0 +1,142 @@
+"""The dechirped signal: the intermediate frequency (IF) of an FMCW radar as a sum over propagation paths.
+
+:func:`intermediate_frequency` is the formula. The other functions compute the same sum fast: phases are wrapped to
+one cycle in float64, and the exponentials of the samples of a pulse are factorised.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from tensorsim.radar.synthesis.paths import Paths, Resonance
+
+
+def intermediate_frequency(
+    delay_s: Tensor, amplitude: Tensor, carrier_hz: float, slope_hz_per_s: float, time_s: Tensor
+) -> Tensor:
+    """Dechirp: the transmitted chirp times the conjugate of the received sum of its delayed copies.
+
+    With the instantaneous frequency ``f(t) = fc + mu t``::
+
+        IF(t) = sum over paths of conj(a) exp(+j 2 pi (fc tau + mu tau t - mu tau^2 / 2))
+
+    so the beat frequency ``mu tau`` is positive and the phase of an approaching target decreases. See Jankiraman,
+    *FMCW Radar Design*, ch. 2; sign and ``mu tau^2 / 2`` follow from the mixing product. This evaluates every
+    exponential, in float64; :class:`~tensorsim.radar.EchoSynthesizer` computes the same sum faster.
+
+    Args:
+        delay_s: (..., P) tau of P paths, seconds.
+        amplitude: (..., P) a of the received wave, real or complex; a phase of a wall or a floor is part of it.
+        carrier_hz: fc, the frequency at the start of the sweep.
+        slope_hz_per_s: mu, bandwidth over chirp duration.
+        time_s: (N,) t, seconds after the start of the chirp.
+
+    Returns:
+        (..., N) complex128. Differentiable.
+    """
+    tau, t = delay_s.double().unsqueeze(-1), time_s.double()
+    cycles = carrier_hz * tau + slope_hz_per_s * tau * t - 0.5 * slope_hz_per_s * tau.square()
+    conjugate = amplitude.to(torch.complex128).conj().unsqueeze(-1)
+    return (conjugate * phasor(cycles)).sum(-2)
+
+
+def phasor(cycles: Tensor) -> Tensor:
+    """``exp(j 2 pi cycles)`` as complex, elementwise."""
+    angle = cycles * (2 * math.pi)
+    return torch.complex(angle.cos(), angle.sin())
+
+
+def tones(first: Tensor, step: Tensor, index: Tensor) -> Tensor:
+    """``first exp(j 2 pi step n)`` for n of ``index``: (...) complex, (...) cycles, (N,) 0, 1, ... -> (..., N).
+
+    The exponential factors over ``n = Q n1 + n2``: about ``2 sqrt(N)`` sines and cosines and N products.
+    """
+    fine = math.ceil(math.sqrt(index.shape[0]))
+    step = step.unsqueeze(-1)
+    outer = first.unsqueeze(-1) * phasor(step * index[::fine])
+    inner = phasor(step * index[:fine])
+    return (outer.unsqueeze(-1) * inner.unsqueeze(-2)).flatten(-2)[..., : index.shape[0]]
+
+
+def tone_sum(first: Tensor, step: Tensor, coarse: Tensor, fine: Tensor) -> Tensor:
+    """Sum over P tones of ``first exp(j 2 pi step n)`` for n = 0, 1, ..., N1 Q - 1.
+
+    The exponential factors over ``n = Q n1 + n2``, so the sum is a product of two small matrices per pulse
+    instead of N exponentials per tone.
+
+    Args:
+        first: (L, P) complex, value of each tone at n = 0.
+        step: (L, P) float64 cycles per sample; wrapped to one cycle before the cast to the precision of ``fine``.
+        coarse: (N1,) 0, 1, ..., N1 - 1 in the real precision of the result.
+        fine: (Q,) 0, 1, ..., Q - 1 likewise.
+
+    Returns:
+        (L, N1 * Q) complex.
+    """
+    stride = step * fine.shape[0]
+    step = (step - step.round()).to(fine.dtype)
+    stride = (stride - stride.round()).to(fine.dtype)
+    right = tones(torch.ones_like(first), step, fine)  # (L, P, Q)
+    left = tones(first, stride, coarse)  # (L, P, N1)
+    return torch.matmul(left.transpose(-1, -2), right).flatten(-2)
+
+
+def beat_sum(
+    delay_s: Tensor,
+    gain: Tensor,
+    carrier_hz: float,
+    slope_hz_per_s: float,
+    sample_rate_hz: float,
+    coarse: Tensor,
+    fine: Tensor,
+) -> Tensor:
+    """:func:`intermediate_frequency` at the samples ``t = n / fs``, n = 0, 1, ..., in the precision of ``fine``.
+
+    Phases are wrapped to one cycle in float64 before they are cast: a float32 phase at 77 GHz would have an error
+    of -60 dB.
+
+    Args:
+        delay_s: (L, P) float64.
+        gain: (L, P) complex128, conjugate of the amplitude of the received wave.
+        carrier_hz: fc, the start of the sweep.
+        slope_hz_per_s: mu.
+        sample_rate_hz: fs.
+        coarse, fine: see :func:`tone_sum`.
+
+    Returns:
+        (L, N1 * Q) complex.
+    """
+    start = carrier_hz * delay_s - 0.5 * slope_hz_per_s * delay_s.square()
+    first = phasor((start - start.round()).to(fine.dtype))
+    first = first * gain.to(first.dtype)
+    return tone_sum(first, slope_hz_per_s / sample_rate_hz * delay_s, coarse, fine)
+
+
+def dispersed_sum(
+    paths: Paths,
+    resonance: Resonance,
+    carrier_hz: float,
+    slope_hz_per_s: float,
+    time_s: Tensor,
+) -> Tensor:
+    """:func:`beat_sum` of paths whose gain depends on the frequency of the sweep: (..., S, P) -> (..., N).
+
+    The wave that arrives at ``t_n`` has the frequency ``f = fc + mu (t_n - tau)``, and each leg multiplies it
+    by ``T(f) / T_0(fc) = exp(-alpha d (f / fc - 1)) / (1 - G^2 exp(-2 alpha d f / fc - j 2 pi f t))``: the
+    closed sum of all internal bounces over the straight passage, t the delay of a pair. The phase of the straight
+    passage is in ``tau`` and not in this factor. The delay ``k t`` of the k-th bounce enters through the frequency
+    alone, which leaves out ``mu (k t)^2 / 2`` cycles (2e-4 for the default wall).
+    """
+    echo = paths.gain.new_zeros(list(paths.gain.shape[:-2]) + list(time_s.shape))
+    for s in range(paths.gain.shape[-2]):  # all scatterers at once would need S P N complex numbers per pulse
+        delay = paths.delay_s[..., s, :, None]
+        cycles = carrier_hz * delay + slope_hz_per_s * delay * (time_s - 0.5 * delay)
+        frequency = (carrier_hz + slope_hz_per_s * (time_s - delay)).unsqueeze(-2)  # (..., P, 1, N)
+        relative = frequency / carrier_hz
+        neper, bounce = resonance.loss_neper[..., s, :, :, None], resonance.bounce_s[..., s, :, :, None]
+        turn = torch.polar(torch.exp(-2 * neper * relative), -2 * math.pi * bounce * frequency)
+        leg = torch.exp(-neper * (relative - 1)) / (1 - resonance.square[..., s, :, :, None] * turn)
+        factor = (leg[..., 0, :] * leg[..., 1, :]).conj() * paths.gain[..., s, :, None]
+        echo = echo + (phasor(cycles - cycles.round()) * factor).sum(-2)
+    return echo
