@@ -41,7 +41,8 @@ from tensorsim.errors import (
 )
 from tensorsim.vision.lifting.block_tridiagonal import solve_block_tridiagonal
 from tensorsim.vision.lifting.bone_branches import choose_branches
-from tensorsim.vision.smoothing.along_time import masked_median, nearest_valid
+from tensorsim.vision.smoothing.along_time import nearest_valid
+from tensorsim.vision.smoothing.noise import jitter
 
 #: Bones by their ends; 14 is the middle of the hips. The neck, joint 1, is the middle of the shoulders.
 BONES = (
@@ -54,27 +55,6 @@ LENGTH_OF_BONE = (0, 1, 2, 3, 2, 3, 4, 5, 6, 5, 6, 7)
 LENGTH_SHARES = (0.125, 0.210, 0.186, 0.146, 0.122, 0.2455, 0.2455, 0.288)
 #: Height over the floor of an ankle that stands, likewise, and of any other joint that lies, which has flesh around it.
 ANKLE_SHARE, FLESH_SHARE = 0.039, 0.045
-
-
-def jitter(x: Tensor, valid: Tensor) -> Tensor:
-    """Standard deviation of the noise of tracks, from their fourth differences.
-
-    White noise of variance s^2 has fourth differences of variance 70 s^2; movement has next to none. Their median
-    is taken, so that moments of fast movement do not count.
-
-    Args:
-        x: (..., T, D).
-        valid: (..., T) bool.
-
-    Returns:
-        (..., D); 0 where there are not 5 valid frames in a row.
-    """
-    if x.shape[-2] < 5:
-        return x.new_zeros(x.shape[:-2] + x.shape[-1:])
-    d = x[..., 4:, :] - 4 * x[..., 3:-1, :] + 6 * x[..., 2:-2, :] - 4 * x[..., 1:-3, :] + x[..., :-4, :]
-    whole = valid[..., 4:] & valid[..., 3:-1] & valid[..., 2:-2] & valid[..., 1:-3] & valid[..., :-4]
-    d, whole = d.abs().transpose(-1, -2), whole.unsqueeze(-2)
-    return 1.4826 / 70**0.5 * masked_median(d, whole.expand_as(d))[..., 0]
 
 
 def expected_acceleration(across: Tensor, noise: Tensor, fps: float, least: float, ratio: float) -> Tensor:
@@ -247,7 +227,7 @@ class BoneFit(nn.Module):
         lines, given = (sight / distance[..., None]).index_select(2, free), distance.index_select(2, free)
 
         there = seen.reshape(-1, frames, 14).index_select(2, free)
-        shake = jitter(lines.transpose(1, 2), there.transpose(1, 2)).mean(dim=(1, 2))
+        shake = jitter(lines.transpose(1, 2), there.transpose(1, 2), order=4).mean(dim=(1, 2))
         away = given.mean(dim=(1, 2))
         noise = 2 * shake * away
         across = away[:, None, None, None] * lines

@@ -205,8 +205,9 @@ class GNNTracker(nn.Module):
         matched = which >= 0
         index = which.clamp(min=0).transpose(1, 2).unsqueeze(-1).expand(clips, frames, people, 4)
         measured = xyxy_to_center(boxes.gather(2, index).transpose(1, 2))
-        q, r, speed = self.process_noise, self.measurement_noise, self.initial_speed
-        smooth = smooth_constant_velocity(measured, matched, q, r, speed, 1.0)
+        q = torch.full([1], self.process_noise, dtype=torch.float64)
+        r = torch.full([1], self.measurement_noise, dtype=torch.float64)
+        smooth = smooth_constant_velocity(measured, matched, q, r, self.initial_speed, 1.0)
         smooth = torch.cat([smooth[..., :2], smooth[..., 2:].clamp(min=self.min_box_px)], dim=-1)
         valid = _presence(matched, looked)
         tracked = center_to_xyxy(smooth) * valid.unsqueeze(-1)

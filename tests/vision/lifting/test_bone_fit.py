@@ -19,7 +19,6 @@ from tensorsim.vision.lifting.bone_fit import (
     LENGTH_SHARES,
     BoneFit,
     expected_acceleration,
-    jitter,
 )
 from tests.stage import StageTester
 
@@ -301,17 +300,6 @@ def test_invalid_frames_and_very_short_clips_stay() -> None:
     assert torch.equal(fitted[:, 10:13], given[:, 10:13])
     assert not torch.equal(fitted[:, 9], given[:, 9])
     assert torch.equal(BoneFit(CAMERA)(given[:, :3], seen[:, :3], FPS), given[:, :3])
-
-
-def test_jitter_is_the_deviation_of_noise_and_not_of_movement() -> None:
-    generator = torch.Generator().manual_seed(0)
-    time = torch.arange(400, dtype=torch.float64) / FPS
-    path = torch.stack([torch.sin(2 * torch.pi * time), 0.5 * time], dim=-1)
-    valid = torch.ones(400, dtype=torch.bool)
-    assert float(jitter(path, valid).max()) < 0.003
-    noisy = path + 0.05 * torch.randn(path.shape, generator=generator, dtype=torch.float64)
-    assert jitter(noisy, valid).tolist() == pytest.approx([0.05, 0.05], rel=0.2)
-    assert jitter(noisy[:4], valid[:4]).tolist() == [0, 0]
 
 
 def test_settings_are_checked() -> None:

@@ -9,8 +9,12 @@ import torch
 from torch import nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tests.stage import StageTester
+
+#: Noises of the original's control panel.
+PANEL = {"process_noise": 0.001, "measurement_noise": 0.01}
 
 
 def random_joints(*shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -46,6 +50,27 @@ class TestKalmanSmoother(StageTester):
             ((broken, valid, fps), "NaN"),
             ((joints, valid, 0.0), "fps"),
             ((joints, valid, math.nan), "fps"),
+        ]
+
+
+class TestKnownErrors(TestKalmanSmoother):
+    """With estimates that count: enough frames in a row, and errors known beforehand of some joints."""
+
+    batched_arguments = (0, 1, 3)
+    gradient_arguments = (0, 3)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        joints, valid = random_joints(*batch, 16, 3, dtype=dtype), random_valid(*batch, 16, 3, share=0.95)
+        known = torch.rand(*batch, 16, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+        return joints, valid, 25.0, 0.06 * known.to(dtype)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        joints, valid, fps, known = self.inputs((2,), torch.float32)
+        return [
+            ((joints, valid, fps, known[..., :2]), "noise_std_m: got shape"),
+            ((joints, valid, fps, known[:1]), "noise_std_m: got shape"),
+            ((joints, valid, fps, known.long()), "noise_std_m: got dtype"),
+            ((joints, valid, fps, known * torch.nan), "noise_std_m"),
         ]
 
 
@@ -108,7 +133,7 @@ def test_equals_filterpy(fps: float, case: str, noise: tuple[float, float]) -> N
 def test_frequency_response_is_the_closed_form_and_the_documented_bandwidth() -> None:
     impulse = torch.zeros(1201, 1, 3, dtype=torch.float64)
     impulse[600] = 1.0
-    response = KalmanSmoother()(impulse, None, 30.0)[:, 0, 0].numpy()
+    response = KalmanSmoother(**PANEL)(impulse, None, 30.0)[:, 0, 0].numpy()
     np.testing.assert_allclose(response, response[::-1], rtol=0, atol=1e-12)  # zero phase
     size = 1 << 17
     gain = np.abs(np.fft.rfft(response, size))
@@ -129,7 +154,7 @@ def test_forward_sees_the_past_only_and_rts_sees_all_and_errs_less() -> None:
     later[60:] += 1.0
     error = {}
     for mode in ("rts", "forward"):
-        smoother = KalmanSmoother(mode=mode)
+        smoother = KalmanSmoother(**PANEL, mode=mode)
         out = smoother(noisy, None, 30.0)
         unmoved = torch.equal(smoother(later, None, 30.0)[:60], out[:60])
         assert unmoved == (mode == "forward")
@@ -205,3 +230,122 @@ def test_one_frame_and_no_people_pass() -> None:
 def test_refuses_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
         KalmanSmoother(**settings)
+
+
+def in_numpy(z: np.ndarray, q: np.ndarray, r: np.ndarray, fps: float) -> np.ndarray:
+    """Smoothed positions of one coordinate (T,) under noises q, r (T,): normal equations instead of recursions.
+
+    The states x(t) minimise the squared measurement errors, process noises and deviation from the prior, each over
+    its covariance.
+    """
+    frames, dt = len(z), 1.0 / fps
+    f = np.array([[1.0, dt], [0.0, 1.0]])
+    information, right = np.zeros((2 * frames, 2 * frames)), np.zeros(2 * frames)
+    information[:2, :2] += np.diag([1.0 / (1e4 * r[0]), 1.0 / 3.0**2])
+    right[0] += z[0] / (1e4 * r[0])
+    for t in range(frames):
+        information[2 * t, 2 * t] += 1.0 / r[t]
+        right[2 * t] += z[t] / r[t]
+        if t > 0:
+            step = np.hstack([-f, np.eye(2)])
+            weight = np.linalg.inv(q[t] * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]))
+            two = slice(2 * t - 2, 2 * t + 2)
+            information[two, two] += step.T @ weight @ step
+    return np.linalg.solve(information, right)[::2]
+
+
+def noises_in_numpy(z: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """The estimates that the class describes, of one joint (T, 3) seen throughout: q (T,) and r (3,)."""
+    sixth = np.abs(np.diff(z, n=6, axis=0))
+    middle = np.sort(sixth, axis=0)[(len(sixth) - 1) // 2]
+    r = 1.5 * (1.4826 * middle) ** 2 / 924 + 0.0005**2
+    m, frames = round(0.13 * fps), len(z)
+    centre = np.arange(m, frames - m)
+    each = (z[centre + m] - 2 * z[centre] + z[centre - m]) ** 2 - 6 * r
+    each = each.mean(axis=1) / (2 / 3 * (m / fps) ** 3)
+    radius = int(3 * 0.15 * fps) + 1
+    q = np.empty(frames)
+    for t in range(frames):
+        near = np.abs(centre - t) <= radius
+        weight = np.exp(-0.5 * ((centre[near] - t) / (0.15 * fps)) ** 2)
+        q[t] = max((weight @ each[near] + 0.3) / (weight.sum() + 1), 0.3)
+    return q, r
+
+
+@pytest.mark.parametrize("fps", [30.0, 60.0])
+def test_adaptive_equals_numpy(fps: float) -> None:
+    motion = ActivityGenerator().generate("Kicking", seed=4, duration_s=2.0, rate_hz=fps).joints[0]
+    deviation = torch.tensor([0.01, 0.03, 0.005], dtype=torch.float64)
+    noisy = motion + deviation * torch.randn(
+        motion.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64
+    )
+    smooth = KalmanSmoother()(noisy, None, fps)
+    for joint in (1, 4, 10, 13):
+        z = noisy[:, joint].numpy()
+        q, r = noises_in_numpy(z, fps)
+        for axis in range(3):
+            expected = in_numpy(z[:, axis], q, np.full(len(z), r[axis]), fps)
+            np.testing.assert_allclose(smooth[:, joint, axis].numpy(), expected, rtol=0, atol=1e-7)
+
+
+def speeds(joints: torch.Tensor, fps: float) -> torch.Tensor:
+    return (joints[2:] - joints[:-2]).norm(dim=-1) * fps / 2
+
+
+@pytest.mark.parametrize("hz", [1.0, 2.0, 3.0, 4.0, 5.0])
+@pytest.mark.parametrize("amplitude", [0.001, 0.05, 0.4])
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.5, -0.7, 0.6)])
+def test_exact_joints_pass_up_to_5_hz(hz: float, amplitude: float, direction: tuple[float, ...]) -> None:
+    t = torch.arange(180, dtype=torch.float64) / 30.0
+    wave = amplitude * torch.sin(2 * math.pi * hz * t + 0.4)
+    joints = wave[:, None, None] * torch.tensor(direction, dtype=torch.float64)
+    smooth = KalmanSmoother()(joints, None, 30.0)[:, 0] @ torch.tensor(direction, dtype=torch.float64)
+    tone = torch.exp(-2j * math.pi * hz * t)[30:150]
+    assert float(((smooth[30:150] * tone).sum() / (wave[30:150] * tone).sum()).abs()) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("activity", "joint", "least_m_s"), [("Punching", 4, 4.0), ("Punching", 7, 4.0), ("Kicking", 13, 5.5)]
+)
+def test_punch_and_kick_keep_their_peak_speed(activity: str, joint: int, least_m_s: float) -> None:
+    motion = ActivityGenerator().generate(activity, seed=100, duration_s=4.0, rate_hz=30.0).joints[0]
+    truth = float(speeds(motion[:, joint], 30.0).max())
+    assert truth > least_m_s
+    for joints in (motion, motion.float()):
+        assert float(speeds(KalmanSmoother()(joints, None, 30.0)[:, joint], 30.0).max()) > 0.97 * truth
+
+
+@pytest.mark.parametrize("deviation_m", [0.003, 0.01, 0.02, 0.03])
+def test_adapts_better_than_any_noise_fixed_in_the_panel(deviation_m: float) -> None:
+    error: dict[str, float] = {"panel": 0.0, "adaptive": 0.0, "raw": 0.0}
+    for i, activity in enumerate(("Punching", "Kicking", "Sitting Down", "Walking", "Walking to Falling")):
+        motion = ActivityGenerator().generate(activity, seed=i, duration_s=4.0, rate_hz=30.0).joints[0]
+        noise = torch.randn(motion.shape, generator=torch.Generator().manual_seed(i), dtype=torch.float64)
+        noisy = motion + deviation_m * noise
+        for name, out in (
+            ("panel", KalmanSmoother(**PANEL)(noisy, None, 30.0)),
+            ("adaptive", KalmanSmoother()(noisy, None, 30.0)),
+            ("raw", noisy),
+        ):
+            error[name] += float(speeds(out - motion, 30.0).square().mean())
+    assert error["adaptive"] < 0.8 * error["panel"]
+    assert error["adaptive"] < 0.3 * error["raw"]
+
+
+def test_known_errors_smooth_what_looks_like_motion() -> None:
+    """An error that wanders within a second has no jitter; given its size, the smoother removes more of it."""
+    t = torch.arange(120, dtype=torch.float64) / 30.0
+    wandering = 0.03 * torch.sin(2 * math.pi * 3.0 * t).reshape(-1, 1, 1).expand(120, 1, 3)
+    alone = KalmanSmoother()(wandering, None, 30.0).square().mean()
+    known = KalmanSmoother()(wandering, None, 30.0, torch.full((120, 1, 1), 0.1)).square().mean()
+    assert float(alone) > 0.95 * float(wandering.square().mean())
+    assert float(known) < 0.2 * float(wandering.square().mean())
+
+
+def test_flickering_joint_is_smoothed_as_the_noisiest_of_the_body() -> None:
+    generator = torch.Generator().manual_seed(6)
+    noisy = 0.02 * torch.randn(60, 2, 3, generator=generator, dtype=torch.float64)
+    valid = torch.ones(60, 2, dtype=torch.bool)
+    valid[::4, 1] = False  # never long enough in a row for an estimate
+    smooth = KalmanSmoother()(noisy, valid, 30.0)
+    assert float(smooth[:, 1].square().mean()) < 0.35 * 0.02**2

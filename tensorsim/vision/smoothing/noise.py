@@ -1,0 +1,74 @@
+"""Noise of tracks, estimated from the tracks themselves: of the measurement and of the motion.
+
+Both estimates compare differences along time over a short and a long span: measurement noise is alike in all of
+them, motion grows with the span.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from tensorsim.vision.smoothing.along_time import masked_median
+
+
+def jitter(x: Tensor, valid: Tensor, order: int = 6) -> Tensor:
+    """Standard deviation of the white noise of tracks, from differences of high order along time.
+
+    The n-th difference of white noise of variance s^2 has the variance s^2 binomial(2n, n), while that of motion is
+    small: a sinusoid of frequency f is scaled by (2 sin(pi f / fps))^n, 1 at a sixth of the frame rate. The median of
+    the magnitudes is taken (times 1.4826, as for a normal distribution), so that short fast motion does not count.
+
+    Args:
+        x: (..., T, D).
+        valid: (..., T) bool.
+        order: n.
+
+    Returns:
+        (..., D); 0 where there are no n + 1 valid frames in a row. Differentiable.
+    """
+    if x.shape[-2] <= order:
+        return x.new_zeros(x.shape[:-2] + x.shape[-1:])
+    difference = torch.diff(x, n=order, dim=-2).abs().transpose(-1, -2)
+    whole = valid.unfold(-1, order + 1, 1).all(dim=-1).unsqueeze(-2).expand_as(difference)
+    gain = math.exp(math.lgamma(2.0 * order + 1.0) - 2.0 * math.lgamma(order + 1.0))  # binomial(2n, n)
+    return 1.4826 / math.sqrt(gain) * masked_median(difference, whole)[..., 0]
+
+
+def acceleration_density(
+    x: Tensor, valid: Tensor, noise: Tensor, fps: float, span_s: float, window_s: float, least: float
+) -> Tensor:
+    """Density of the white acceleration noise that moves a track, over time.
+
+    Under the constant-velocity model with acceleration noise of density q, second differences over m frames,
+    x(t + m) - 2 x(t) + x(t - m), have the variance 2/3 q (m dt)^3 + 6 r with measurement noise of variance r. Solved
+    for q with a local mean of the squared differences, over coordinates and a Gaussian window of time.
+
+    Args:
+        x: (..., T, D) positions in m.
+        valid: (..., T) bool.
+        noise: (..., T, D) variance of a measured coordinate, m^2.
+        fps: frames per second.
+        span_s: m in seconds. Long spans resolve slow motion in noise; what repeats after half a span is missed.
+        window_s: standard deviation of the window.
+        least: smallest result; it also counts as one more frame of every window, so it is that of a long gap.
+
+    Returns:
+        (..., T, 1) m^2/s^3. Differentiable.
+    """
+    frames, m = x.shape[-2], max(int(span_s * fps + 0.5), 1)
+    if frames <= 2 * m:
+        return torch.full_like(x[..., :1], least)
+    second = x[..., 2 * m :, :] - 2.0 * x[..., m:-m, :] + x[..., : -2 * m, :]
+    expected = noise[..., 2 * m :, :] + 4.0 * noise[..., m:-m, :] + noise[..., : -2 * m, :]
+    density = (second.square() - expected).mean(dim=-1) / (2.0 / 3.0 * (m / fps) ** 3)
+    whole = (valid[..., 2 * m :] & valid[..., m:-m] & valid[..., : -2 * m]).to(x.dtype)
+
+    radius = int(3.0 * window_s * fps) + 1
+    offset = torch.arange(-radius, radius + 1, dtype=x.dtype, device=x.device)
+    kernel = torch.exp(-0.5 * (offset / (window_s * fps)).square())[None, None]
+    rows = torch.stack([density * whole, whole]).reshape(-1, 1, frames - 2 * m)
+    sums = F.conv1d(F.pad(rows, [m, m]), kernel, padding=radius).reshape(2, -1)
+    motion, weight = sums[0].reshape(valid.shape), sums[1].reshape(valid.shape)
+    return ((motion + least) / (weight + 1.0)).clamp(min=least).unsqueeze(-1)

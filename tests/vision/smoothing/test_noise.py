@@ -1,0 +1,57 @@
+"""Estimates of noise against noise and motion whose sizes are known."""
+
+import math
+
+import pytest
+import torch
+
+from tensorsim.vision.smoothing.noise import acceleration_density, jitter
+
+FPS = 30.0
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_jitter_is_the_deviation_of_noise_and_not_of_movement(order: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    time = torch.arange(400, dtype=torch.float64) / FPS
+    path = torch.stack([torch.sin(2 * torch.pi * time), 0.5 * time], dim=-1)
+    valid = torch.ones(400, dtype=torch.bool)
+    assert float(jitter(path, valid, order).max()) < 0.003
+    noisy = path + 0.05 * torch.randn(path.shape, generator=generator, dtype=torch.float64)
+    assert jitter(noisy, valid, order).tolist() == pytest.approx([0.05, 0.05], rel=0.2)
+    assert jitter(noisy[:order], valid[:order], order).tolist() == [0, 0]
+    valid[::order] = False
+    assert jitter(noisy, valid, order).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.01])
+def test_density_of_simulated_white_acceleration(noise_m: float) -> None:
+    density, dt, frames = 5.0, 1 / FPS, 6000
+    generator = torch.Generator().manual_seed(1)
+    white = torch.randn(2, frames, 3, generator=generator, dtype=torch.float64)
+    # The exact increments of position and velocity (Bar-Shalom et al., section 6.2.2) by their Cholesky factor.
+    q = density * torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], dtype=torch.float64)
+    factor = torch.linalg.cholesky(q)
+    velocity = (factor[1, 0] * white[0] + factor[1, 1] * white[1]).cumsum(0)
+    steps = factor[0, 0] * white[0]
+    steps[1:] += dt * velocity[:-1]
+    x = steps.cumsum(0)
+    x = x + noise_m * torch.randn(frames, 3, generator=generator, dtype=torch.float64)
+    valid = torch.ones(frames, dtype=torch.bool)
+    found = acceleration_density(x, valid, torch.full_like(x, noise_m**2), FPS, 0.13, 0.15, 0.3)
+    assert found.shape == (frames, 1)
+    assert float(found.mean()) == pytest.approx(density, rel=0.15)
+
+
+def test_density_follows_motion_in_time_and_is_least_where_nothing_moves() -> None:
+    time = torch.arange(150, dtype=torch.float64) / FPS
+    moving = (time > 2.0) & (time < 3.0)
+    x = torch.where(moving, 0.3 * torch.sin(2 * math.pi * 2.0 * (time - 2.0)), 0.0)[:, None]
+    valid = torch.ones(150, dtype=torch.bool)
+    found = acceleration_density(x, valid, torch.zeros_like(x), FPS, 0.13, 0.15, 0.3)[:, 0]
+    assert float(found[75]) > 100.0
+    assert found[:30].tolist() == pytest.approx([0.3] * 30, rel=1e-9)
+    assert acceleration_density(x, ~valid, torch.zeros_like(x), FPS, 0.13, 0.15, 0.3).unique().tolist() == [
+        0.3
+    ]
+    assert acceleration_density(x[:8], valid[:8], x[:8], FPS, 0.13, 0.15, 0.3).unique().tolist() == [0.3]
