@@ -1,7 +1,13 @@
 """Pictures show the numbers: axes, units, colours, and people where they are."""
 
-import numpy as np
+import itertools
+from pathlib import Path
 
+import numpy as np
+import pytest
+import torch
+
+import tensorsim as ts
 from tensorsim import plot
 
 
@@ -13,14 +19,27 @@ def test_decibels_are_below_the_peak_and_clipped() -> None:
 
 def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
     magnitude = np.ones((5, 7))
+    ridges = np.stack([np.zeros(7), np.ones(7), -np.ones(7)])
     figure = plot.map_figure(
-        magnitude, np.arange(7) / 10, np.linspace(-2, 2, 5), "map", "Doppler in Hz", np.zeros((2, 7)), 0.5
+        magnitude,
+        np.arange(7) / 10,
+        np.linspace(-2, 2, 5),
+        "map",
+        "Doppler in Hz",
+        ridges,
+        0.5,
+        subtitle="film.mp4",
     )
-    axes = figure.axes[0]
+    axes, speed, bar = figure.axes
     assert axes.get_xlabel() == "time in s"
     assert axes.get_ylabel() == "Doppler in Hz"
-    assert len(axes.lines) == 2
-    assert [a.get_ylabel() for a in figure.axes[1:]] == ["dB below the peak"]
+    assert [line.get_color() for line in axes.lines] == list(plot.RIDGE_COLOURS)
+    assert len(set(plot.RIDGE_COLOURS)) == 3
+    assert np.allclose([line.get_ydata() for line in axes.lines], ridges)
+    assert speed.get_ylabel().startswith("radial speed in m/s")
+    assert np.allclose(np.array(axes.get_ylim()) * 0.5, speed.get_ylim())
+    assert bar.get_ylabel() == "dB below the peak"
+    assert figure.get_suptitle() == "film.mp4"
     left, right, bottom, top = axes.images[0].get_extent()
     assert np.allclose([left, right, bottom, top], [-0.05, 0.65, -2.5, 2.5])
     assert axes.images[0].origin == "lower"
@@ -29,7 +48,7 @@ def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
 def test_long_maps_are_thinned_by_power() -> None:
     magnitude = np.zeros((1, 40_000))
     magnitude[0, 100] = 3.0
-    thin = plot._thin_columns(magnitude)
+    thin = plot.maps._thin_columns(magnitude)
     assert thin.shape[1] <= 4000
     assert np.isclose(np.square(thin).sum() * 20, 9.0)
 
@@ -57,5 +76,111 @@ def test_skeleton_figure_shows_only_people_who_are_there() -> None:
     valid[0, 2:8] = True
     figure = plot.skeleton_figure(joints, valid, 10.0, poses=3)
     labels = [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
-    assert labels == ["person 1", "radar"]
+    assert labels == ["person 1, 0.2 to 0.7 s", "radar"]
     assert len(figure.axes[0].lines) == 3 * len(plot.BODY_BONES) + 1
+
+
+def test_ridges_are_hidden_where_dots_would_cover_the_map() -> None:
+    axis = np.arange(-10.0, 11.0)
+    shown = np.zeros((21, 4), dtype=bool)
+    shown[8:14, 0] = True  # -2 to 3: high enough
+    shown[10, 1] = True  # one row
+    shown[:, 2] = True
+    ridges = np.array([[0.0, 0.0, 5.0, 0.0], [3.0, np.nan, 5.5, np.nan]])
+    kept = plot.clear_ridges(ridges, axis, shown, least_height=4.0)
+    expected = np.array([[0.0, np.nan, 5.0, np.nan], [3.0, np.nan, np.nan, np.nan]])
+    assert np.array_equal(kept, expected, equal_nan=True)
+
+
+def test_style_without_ridges_and_with_another_range_and_colour_map() -> None:
+    style = plot.MapStyle("parula", dynamic_range_db=30.0, ridges=False)
+    magnitude = np.logspace(-3, 0, 20)[:, None] * np.ones((20, 4))
+    figure = plot.map_figure(
+        magnitude, np.arange(4.0), np.arange(20.0), "map", "range in m", np.ones((1, 4)), style=style
+    )
+    axes = figure.axes[0]
+    assert len(axes.lines) == 0
+    assert axes.images[0].get_clim() == (-30, 0)
+    assert axes.images[0].get_cmap().name == "parula-like"
+    with pytest.raises(ts.TensorsimError, match="colormap: got 'parulla'"):
+        plot.MapStyle("parulla")  # type: ignore[arg-type]
+    with pytest.raises(ts.TensorsimError, match="dynamic_range_db"):
+        plot.MapStyle(dynamic_range_db=0.0)
+
+
+def test_parula_like_runs_from_blue_to_yellow_and_grows_lighter() -> None:
+    colours = plot.colormap("parula")(np.linspace(0, 1, 64))[:, :3]
+    lightness = colours @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(lightness) > 0).all()
+    assert colours[0].argmax() == 2
+    assert colours[-1].argmin() == 2
+
+
+def test_noise_of_an_empty_scene_is_drawn_below_the_echo_of_a_person() -> None:
+    simulator = ts.radar.RadarSimulator(ts.RadarConfig.free_space())
+    state = torch.get_rng_state()
+    peaks = plot.person_peaks(simulator)
+    assert torch.equal(state, torch.get_rng_state())
+    empty = simulator(torch.tensor([0.0, 3.0, 1.0]).expand(1000, 1, 3), torch.zeros(1))
+    for name, peak in peaks.items():
+        magnitude = getattr(empty, name).numpy()
+        assert plot.decibels(magnitude, 90.0, peak).max() < -50
+    magnitude = empty.doppler_time.numpy()
+    figure = plot.map_figure(
+        magnitude,
+        np.arange(magnitude.shape[1]),
+        simulator.doppler.doppler_hz.numpy(),
+        "map",
+        "Doppler in Hz",
+        peak=peaks["doppler_time"],
+        note="no person in the scene",
+    )
+    assert (figure.axes[0].images[0].get_array() == -50).all()
+    assert figure.axes[0].texts[0].get_text() == "no person in the scene"
+    assert figure.axes[1].get_ylabel() == "dB below the echo of a person"
+
+
+def test_caption_names_film_radar_and_label() -> None:
+    radar = ts.RadarConfig.free_space()
+    line = plot.caption(radar, "S8 Walking", "films/clip.mp4")
+    assert line == "clip.mp4 | 77 GHz, sweep 4 GHz, PRF 8192 Hz | S8 Walking"
+    assert plot.caption(radar) == "77 GHz, sweep 4 GHz, PRF 8192 Hz"
+
+
+def test_skeleton_axes_hold_feet_below_the_floor_and_what_is_far_off_is_reported() -> None:
+    joints = np.zeros((1, 4, 14, 3))
+    joints[..., 1] = 3.0
+    joints[..., 2] = np.linspace(1.5, -0.3, 14)
+    joints[0, :, 4, 0] = 9.0
+    figure = plot.skeleton_figure(joints, np.ones((1, 4), dtype=bool), 10.0, poses=4)
+    axes = figure.axes[0]
+    assert axes.get_zlim()[0] <= -0.3
+    assert axes.get_xlim()[1] < 2.0
+    assert "4 of 56 joints lie more than 1.5 m from their hips" in figure.get_supxlabel()
+    assert "the lowest joint is 0.30 m below the floor" in figure.get_supxlabel()
+
+
+@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_figures_are_written_by_suffix(suffix: str, start: bytes, tmp_path: Path) -> None:
+    figure = plot.confusion_figure(np.eye(2), ["a", "b"], "counts")
+    plot.save_figure(figure, tmp_path / f"figure.{suffix}")
+    assert (tmp_path / f"figure.{suffix}").read_bytes().startswith(start)
+    with pytest.raises(ts.TensorsimError, match=r"got the suffix '\.bmp', expected one of"):
+        plot.save_figure(figure, tmp_path / "figure.bmp")
+
+
+def test_tick_labels_do_not_overlap() -> None:
+    axis = np.linspace(-4096, 4096, 819)
+    figure = plot.map_figure(np.ones((819, 9)), np.arange(9.0), axis, "map", "Doppler in Hz", None, 1.95e-3)
+    figure.canvas.draw()
+    boxes = [
+        label.get_window_extent()
+        for axes in figure.axes
+        for place, label in [
+            *zip(axes.get_yticks(), axes.get_yticklabels(), strict=True),
+            (axes.get_ylim()[0], axes.yaxis.label),
+        ]
+        if axes.get_ylim()[0] <= place <= axes.get_ylim()[1]
+    ]
+    assert len(boxes) > 15
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))

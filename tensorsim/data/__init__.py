@@ -1,6 +1,7 @@
-"""Video in, synthetic people, motion files, results out."""
+"""Films and motion files in, rendered people, films and sound out."""
 
 from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
+from tensorsim.data.sound import Sound, doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import VideoReader, write_video
 from tensorsim.geometry.framing import camera_on
 from tensorsim.render.renderer import PersonRenderer, RenderedVideo
@@ -10,10 +11,14 @@ __all__ = [
     "Motion",
     "PersonRenderer",
     "RenderedVideo",
+    "Sound",
     "VideoReader",
     "camera_on",
+    "doppler_sound",
     "load_coco_keypoints",
     "load_motion",
     "place",
+    "slow_time_signal",
+    "write_sound",
     "write_video",
 ]

@@ -1,0 +1,152 @@
+"""Micro-Doppler to listen to: approaching motion in the left channel, receding motion in the right one."""
+
+import math
+import os
+import wave
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError, check_positive, check_rank
+from tensorsim.files import complete_file
+from tensorsim.radar.processing.doppler import coherent_sum
+from tensorsim.radar.simulator import RadarSimulator
+
+#: A radar whose Doppler reaches this far is heard as it is; of others the highest Doppler is put at ``_TOP_HZ``.
+_HEARD_AS_IT_IS_HZ = (1000.0, 8000.0)
+_TOP_HZ = 4000.0
+#: Window of the time stretching in seconds: a step is longer, a kick is not much shorter.
+_WINDOW_S = 0.1
+
+
+class Sound(NamedTuple):
+    """Stereo sound.
+
+    Attributes:
+        waveform: (2, n) float32 in [-1, 1]: approaching, receding.
+        rate_hz: samples per second.
+        scale: heard frequency over Doppler frequency.
+    """
+
+    waveform: Tensor
+    rate_hz: int
+    scale: float
+
+
+def slow_time_signal(
+    simulator: RadarSimulator, source: Callable[[int, int], tuple[Tensor, Tensor]], pulses: int
+) -> Tensor:
+    """The echo of a scene as one number per pulse, after the moving target indicator, free of noise.
+
+    Args:
+        simulator: gives the range profiles; their coherent sum over range is taken.
+        source: as in ``RadarSimulator.stream``: ``source(start, stop)`` gives positions (stop - start, S, 3) and RCS.
+        pulses: of the scene.
+
+    Returns:
+        (M,) complex, conjugated so that positive frequencies approach, as in the Doppler-time map; a two-pulse
+        canceller leaves one pulse fewer than ``pulses``.
+    """
+    samples = simulator.radar.samples_per_chirp
+    parts = []
+    for start in range(0, pulses, simulator.pulse_chunk):
+        positions, rcs = source(start, min(start + simulator.pulse_chunk, pulses))
+        rcs = rcs.expand(positions.shape[:-1])
+        profiles = simulator.engine(positions[None], rcs[None])[0]
+        parts.append(coherent_sum(profiles, samples)[0])
+    # The indicator is linear along the pulses and the same in each range bin, so it may follow the sum over range.
+    return simulator.mti(torch.cat(parts))[:, 0].conj().resolve_conj()
+
+
+def doppler_sound(signal: Tensor, prf_hz: float, scale: float | None = None, rate_hz: int = 16_000) -> Sound:
+    """Turn a slow-time signal into sound as long as the motion, with every frequency multiplied by ``scale``.
+
+    Positive Doppler, motion towards the radar, is heard on the left and negative Doppler on the right. Where
+    ``scale`` is not 1, a phase vocoder stretches the signal in time and the sound is played that much faster
+    (Flanagan and Golden, *Phase Vocoder*, Bell System Technical Journal 45, 1966).
+
+    Args:
+        signal: (M,) complex, one number per pulse, free of clutter: see :func:`slow_time_signal`.
+        prf_hz: pulses per second.
+        scale: heard frequency over Doppler frequency. By default 1 where half of the PRF is between 1 and 8 kHz, and
+            otherwise what puts half of the PRF at 4 kHz.
+        rate_hz: samples per second of the sound.
+
+    Returns:
+        The sound, its peak at 0.9; silence of a signal that is zero.
+
+    Raises:
+        TensorsimError: a signal that is not complex (M,), a number that is not positive, no torchaudio.
+    """
+    check_rank(signal, 1, "signal", "(pulses,)")
+    if not signal.is_complex() or signal.numel() == 0:
+        raise TensorsimError(
+            f"signal: got {signal.dtype} of {signal.numel()} pulses, expected a complex tensor of at least one"
+        )
+    check_positive(prf_hz, "prf_hz")
+    check_positive(rate_hz, "rate_hz")
+    if scale is None:
+        audible = _HEARD_AS_IT_IS_HZ[0] <= prf_hz / 2 <= _HEARD_AS_IT_IS_HZ[1]
+        scale = 1.0 if audible else 2 * _TOP_HZ / prf_hz
+    check_positive(scale, "scale")
+    resample, phase_vocoder = _torchaudio()
+    length = max(1, round(signal.shape[0] * rate_hz / prf_hz))
+    channels = _stretched(_by_direction(signal), prf_hz, scale, phase_vocoder)
+    # A rate is rounded to a hundredth, so that its ratio to the other is one of small whole numbers.
+    given = round(100 * prf_hz * scale)
+    common = math.gcd(given, 100 * rate_hz)
+    waveform = resample(channels, given // common, 100 * rate_hz // common)[:, :length]
+    waveform = torch.nn.functional.pad(waveform, (0, length - waveform.shape[1]))
+    peak = waveform.abs().max()
+    return Sound(waveform.float() * (0.9 / peak if peak > 0 else 0.0), rate_hz, scale)
+
+
+def _by_direction(signal: Tensor) -> Tensor:
+    """Complex (M,) to real (2, M): the part of positive frequencies, and that of negative ones."""
+    spectrum = torch.fft.fft(signal)
+    frequency = torch.fft.fftfreq(signal.shape[0], device=signal.device)
+    return torch.stack(
+        [torch.fft.ifft(spectrum * (frequency > 0)), torch.fft.ifft(spectrum * (frequency < 0))]
+    ).real
+
+
+def _stretched(
+    channels: Tensor, prf_hz: float, scale: float, phase_vocoder: Callable[[Tensor, float, Tensor], Tensor]
+) -> Tensor:
+    """Channels (2, M) made ``scale`` times longer with the same frequencies per sample."""
+    if scale == 1.0:
+        return channels
+    size = 2 ** max(4, round(math.log2(_WINDOW_S * prf_hz)))
+    hop = size // 8
+    window = torch.hann_window(size, dtype=channels.dtype, device=channels.device)
+    padded = torch.nn.functional.pad(channels, (size, size))  # short signals, too, have a whole window
+    spectrum = torch.stft(padded, size, hop, window=window, return_complex=True)
+    advance = torch.linspace(0, math.pi * hop, size // 2 + 1, dtype=channels.dtype, device=channels.device)
+    longer = phase_vocoder(spectrum, 1 / scale, advance[:, None])
+    stretched = torch.istft(longer, size, hop, window=window)
+    first = round(size * scale)
+    return stretched[:, first : first + round(channels.shape[1] * scale)]
+
+
+def write_sound(path: str | os.PathLike[str], sound: Sound) -> None:
+    """Write a 16-bit stereo wav file; it appears when it is complete, or not at all."""
+    samples = (sound.waveform.clamp(-1, 1) * 32767).round().to(torch.int16)
+    with complete_file(path) as scratch, wave.open(str(scratch), "wb") as file:
+        file.setnchannels(samples.shape[0])
+        file.setsampwidth(2)
+        file.setframerate(sound.rate_hz)
+        file.writeframes(samples.T.contiguous().cpu().numpy().astype("<i2").tobytes())
+
+
+def _torchaudio() -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
+    """``resample`` and ``phase_vocoder`` of torchaudio, which is imported on use."""
+    try:
+        from torchaudio.functional import phase_vocoder, resample
+    except (ImportError, OSError) as error:
+        raise TensorsimError(
+            f"torchaudio cannot be imported ({error}); reinstall it in the release of your torch: "
+            "pip install --force-reinstall torch torchaudio"
+        ) from error
+    return resample, phase_vocoder

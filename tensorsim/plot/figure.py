@@ -1,0 +1,39 @@
+"""Figures without a window system, and the files they become."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tensorsim.errors import TensorsimError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Suffixes that :func:`save_figure` writes.
+FIGURE_FORMATS = ("png", "pdf", "svg")
+
+
+def new_figure(width: float = 9.0, height: float = 5.0) -> Figure:
+    """An empty figure of this size in inches; no pyplot, so no global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a picture in the format of its suffix: PNG, or PDF and SVG with lines and letters as vectors.
+
+    Raises:
+        TensorsimError: another suffix.
+    """
+    suffix = path.suffix.removeprefix(".").lower()
+    if suffix not in FIGURE_FORMATS:
+        expected = ", ".join(f".{name}" for name in FIGURE_FORMATS)
+        raise TensorsimError(f"{path}: got the suffix {path.suffix!r}, expected one of {expected}")
+    # Without the date the same run writes the same file.
+    dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    figure.savefig(path, dpi=120, metadata=dated.get(suffix))

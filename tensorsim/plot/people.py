@@ -1,0 +1,161 @@
+"""Pictures of people: skeletons in radar coordinates, and boxes and keypoints in a frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tensorsim.plot.figure import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Bones of the 14-joint radar body and of COCO-17, as pairs of indices.
+# fmt: off
+BODY_BONES = (
+    (0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7),
+    (1, 8), (8, 9), (9, 10), (1, 11), (11, 12), (12, 13), (8, 11),
+)
+COCO_BONES = (
+    (0, 1), (0, 2), (1, 3), (2, 4), (5, 6), (5, 7), (7, 9), (6, 8), (8, 10),
+    (5, 11), (6, 12), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16),
+)
+# fmt: on
+#: One colour per person, RGB.
+PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (23, 190, 207))
+
+#: No joint is further than this from the middle of its hips; one that is was placed wrongly.
+_LIMB_REACH_M = 1.5
+
+
+def skeleton_figure(
+    joints_m: np.ndarray, valid: np.ndarray, fps: float, poses: int = 6, *, subtitle: str | None = None
+) -> Figure:
+    """Draw people in the coordinates of the radar at a few moments spread over each one's time in the scene.
+
+    All joints are drawn. The axes hold every joint within reach of its body; below the picture it says how many are
+    further away, and how far feet are below the floor.
+
+    Args:
+        joints_m: (P, T, 14, 3) world metres.
+        valid: (P, T) bool, whether the person is in the scene.
+        fps: frames per second.
+        poses: moments to draw of each person.
+        subtitle: a line below the title, see :func:`caption`.
+    """
+    from matplotlib.ticker import MultipleLocator
+
+    figure = new_figure(9.0, 7.0)
+    axes: Any = figure.add_subplot(projection="3d")
+    shown: list[np.ndarray] = []
+    for person in range(joints_m.shape[0]):
+        frames = np.flatnonzero(valid[person])
+        if frames.size == 0:
+            continue
+        chosen = np.unique(frames[np.linspace(0, frames.size - 1, poses).astype(int)])
+        shown.append(joints_m[person, chosen])
+        _draw_person(axes, person, joints_m[person], frames, chosen, fps)
+    axes.scatter([0], [0], [1.5], color="black", marker="^", s=50, label="radar")
+    bodies = np.concatenate([*shown, np.zeros((0, 14, 3))])
+    hips = bodies[:, (8, 11)].mean(axis=1, keepdims=True)
+    attached = np.linalg.norm(bodies - hips, axis=-1) <= _LIMB_REACH_M
+    points = np.concatenate([bodies[attached], [[-0.75, 0.0, 0.0], [0.75, 1.0, 2.0]]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(high - low)
+    for scale, label, spacing in (
+        (axes.xaxis, "x", 0.5),
+        (axes.yaxis, "y (range)", 1.0),
+        (axes.zaxis, "z", 0.5),
+    ):
+        scale.set_major_locator(MultipleLocator(spacing))
+        scale.set_tick_params(labelsize="small")
+        scale.set_label_text(f"{label} in m")
+    axes.yaxis.labelpad = 12  # its labels are on a slope, where they need more room
+    axes.set_title("skeletons in radar coordinates")
+    axes.view_init(elev=20, azim=-60)
+    axes.legend(loc="upper left")
+    remarks = [] if subtitle is None else [subtitle]
+    if not attached.all():
+        remarks.append(
+            f"{(~attached).sum()} of {attached.size} joints lie more than {_LIMB_REACH_M} m from their hips"
+        )
+    if low[2] < -0.02:
+        remarks.append(f"the lowest joint is {-low[2]:.2f} m below the floor")
+    if remarks:
+        figure.supxlabel("\n".join(remarks), fontsize="small", color="dimgray")
+    return figure
+
+
+def _draw_person(
+    axes: Any, person: int, joints: np.ndarray, frames: np.ndarray, chosen: np.ndarray, fps: float
+) -> None:
+    """Poses of ``chosen`` frames, the later the stronger, and the way of the hips on the floor in all ``frames``."""
+    colour = np.array(PERSON_COLOURS[person % len(PERSON_COLOURS)]) / 255
+    labelled = np.full((1, 3), np.inf)
+    for k, frame in enumerate(chosen):
+        shade = 0.35 + 0.65 * (k + 1) / chosen.size
+        for a, b in BODY_BONES:
+            axes.plot(
+                *zip(joints[frame, a], joints[frame, b], strict=True),
+                color=colour,
+                alpha=shade,
+                linewidth=1.8,
+            )
+        top = joints[frame, 0] + (0, 0, 0.15)
+        # Somebody who stays in place has the times of all poses in the legend only.
+        if (np.linalg.norm(labelled - top, axis=1) > 0.4).all():
+            axes.text(*top, f"{frame / fps:.1f} s", color=colour, fontsize=7)
+            labelled = np.concatenate([labelled, top[None]])
+    track = joints[frames][:, (8, 11)].mean(axis=1)
+    label = f"person {person + 1}, {frames[0] / fps:.1f} to {frames[-1] / fps:.1f} s"
+    axes.plot(track[:, 0], track[:, 1], 0 * track[:, 2], color=colour, linestyle=":", label=label)
+
+
+def draw_people(
+    image: np.ndarray,
+    boxes: np.ndarray,
+    keypoints: np.ndarray,
+    scores: np.ndarray,
+    valid: np.ndarray,
+    threshold: float,
+) -> np.ndarray:
+    """Draw boxes, ids and COCO skeletons of one frame.
+
+    Args:
+        image: (H, W, 3) uint8 RGB; not changed.
+        boxes: (P, 4) ``xyxy`` pixels.
+        keypoints: (P, 17, 2) pixels.
+        scores: (P, 17); a bone is drawn when both ends reach ``threshold``.
+        valid: (P,) bool.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    import cv2
+
+    image = np.ascontiguousarray(image).copy()
+    stroke = max(1, round(min(image.shape[:2]) / 240))
+    for person in np.flatnonzero(valid):
+        colour = PERSON_COLOURS[person % len(PERSON_COLOURS)]
+        x1, y1, x2, y2 = (round(float(v)) for v in boxes[person])
+        cv2.rectangle(image, (x1, y1), (x2, y2), colour, stroke)
+        cv2.putText(
+            image,
+            f"{person + 1}",
+            (x1, max(y1 - 4, 12)),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.35 * stroke + 0.2,
+            colour,
+            stroke,
+        )
+        points = [(round(float(u)), round(float(v))) for u, v in keypoints[person]]
+        for a, b in COCO_BONES:
+            if scores[person, a] >= threshold and scores[person, b] >= threshold:
+                cv2.line(image, points[a], points[b], (255, 255, 255), stroke + 1, cv2.LINE_AA)
+                cv2.line(image, points[a], points[b], colour, stroke, cv2.LINE_AA)
+        for joint, point in enumerate(points):
+            if scores[person, joint] >= threshold:
+                cv2.circle(image, point, stroke + 1, (255, 255, 0), -1, cv2.LINE_AA)
+    return image

@@ -1,0 +1,229 @@
+"""What each replaceable stage of a pipeline is called with and returns.
+
+A stage of your own is an ``nn.Module`` whose ``forward`` has the signature of the ``__call__`` below; it need not
+inherit from anything here. :func:`check_part` refuses others when a pipeline is built. Letters of shapes are those of
+:mod:`tensorsim.types`.
+"""
+
+import inspect
+import typing
+from typing import Any, Protocol
+
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.types import Detections, Lifted, RadarMaps, Tracks
+
+
+class Detector(Protocol):
+    """Finds people in images, e.g. :class:`tensorsim.vision.RTMDet`."""
+
+    def __call__(self, images: Tensor) -> Detections:
+        """Images (B, 3, H, W), RGB, uint8 or float in [0, 1], to padded boxes.
+
+        Returns:
+            boxes (B, K, 4) ``xyxy`` in pixels of the images, scores (B, K), labels (B, K) with 0 for people, and
+            valid (B, K), which is False for padding.
+        """
+        ...
+
+
+class Tracker(Protocol):
+    """Follows detections through clips, e.g. :class:`tensorsim.vision.GNNTracker`."""
+
+    def __call__(self, detections: Detections, observed: Tensor) -> Tracks:
+        """Detections of clips (B, T, K, ...) to tracks (B, P, T, ...).
+
+        Args:
+            detections: of every frame; not valid where the detector was not run.
+            observed: (B, T) bool, the frames in which it was run.
+        """
+        ...
+
+
+class PoseEstimator(Protocol):
+    """Finds the keypoints of people in boxes, e.g. :class:`tensorsim.vision.TopDownPose`."""
+
+    def __call__(self, images: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints of the valid boxes.
+
+        Args:
+            images: (B, 3, H, W) RGB, uint8 or float in [0, 1].
+            boxes: (B, P, 4) ``xyxy`` in pixels.
+            valid: (B, P) bool.
+
+        Returns:
+            COCO-17 keypoints (B, P, 17, 2), ``uv`` in pixels of the images, and scores (B, P, 17).
+        """
+        ...
+
+
+class HeatmapNetwork(Protocol):
+    """Crops to heat maps, e.g. :class:`tensorsim.vision.HRNet`; ``TopDownPose`` makes a pose estimator of it."""
+
+    def __call__(self, crops: Tensor) -> Tensor:
+        """Crops (N, 3, H, W), RGB in [0, 1], to heat maps (N, 17, H / 4, W / 4) of the COCO-17 keypoints.
+
+        A module with other sizes says so in its attributes ``input_size`` (H, W) and ``stride``.
+        """
+        ...
+
+
+class Lifter(Protocol):
+    """Finds 3D poses for 2D joints, e.g. :class:`tensorsim.vision.NearestPoseLifter`."""
+
+    def __call__(self, keypoints: Tensor, weights: Tensor) -> Lifted:
+        """The 14 body joints (..., T, 14, 2) in pixels and their weights (..., T, 14), 0 for hidden ones, to poses."""
+        ...
+
+
+class Smoother(Protocol):
+    """Smooths joints along time, e.g. :class:`tensorsim.vision.KalmanSmoother`."""
+
+    def __call__(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """Joints (..., T, J, 3) in metres at ``fps``, smoothed, of the same shape.
+
+        Args:
+            joints: anything where not valid.
+            valid: (..., T, J) bool; the other joints are filled in.
+            fps: frames per second.
+        """
+        ...
+
+
+class Scatterers(Protocol):
+    """Places point scatterers on people, e.g. :class:`tensorsim.motion.JointScatterers`."""
+
+    def __call__(self, positions: Tensor, fade: Tensor) -> tuple[Tensor, Tensor]:
+        """Joints at the pulse rate to the scatterers of one scene.
+
+        Args:
+            positions: (..., P, M, 14, 3) metres.
+            fade: (..., P, M) amplitude of each person in [0, 1], 0 outside of the scene.
+
+        Returns:
+            Positions (..., M, S, 3) in metres and radar cross sections (..., M, S) in m^2, those of all people.
+        """
+        ...
+
+
+class Denoiser(Protocol):
+    """Cleans maps, e.g. :class:`tensorsim.enhance.MapDenoiser`."""
+
+    def __call__(self, maps: Tensor) -> Tensor:
+        """Linear magnitude (..., H, W), rows range or Doppler, to the same shape, not negative."""
+        ...
+
+
+class Recognizer(Protocol):
+    """Names the activity that maps show, e.g. :class:`tensorsim.recognition.ActivityRecognizer`."""
+
+    def __call__(self, maps: RadarMaps) -> Tensor:
+        """Maps of B scenes to logits (B, classes)."""
+        ...
+
+
+#: The protocol of each argument of the pipelines.
+SLOTS: dict[str, type] = {
+    "detector": Detector,
+    "tracker": Tracker,
+    "pose": PoseEstimator,
+    "network": HeatmapNetwork,
+    "lifter": Lifter,
+    "smoother": Smoother,
+    "scatterers": Scatterers,
+    "denoiser": Denoiser,
+    "recognizer": Recognizer,
+}
+
+
+def check_part(part: Any, slot: str) -> nn.Module:
+    """Return a stage that can be called as its slot requires.
+
+    Looks at the arguments of ``forward`` and at its return annotation if it has one. ``nn.Identity`` passes: it
+    stands for a stage that is not used.
+
+    Args:
+        part: the stage.
+        slot: a key of :data:`SLOTS`, for the message too.
+
+    Raises:
+        TensorsimError: not a module, a class in place of an instance, other arguments, or another result.
+    """
+    protocol = SLOTS[slot]
+    call = inspect.signature(protocol.__call__)
+    wanted = list(call.parameters)[1:]
+    # A function's repr of its annotations would spell out modules.
+    result = typing.get_type_hints(protocol.__call__)["return"]
+    expected = f"expected a module called as {slot}({', '.join(wanted)}) -> {_name(result)}"
+    if inspect.isclass(part):
+        raise TensorsimError(f"{slot}: got the class {part.__name__}, expected an instance of it")
+    if not isinstance(part, nn.Module):
+        raise TensorsimError(f"{slot}: got a {type(part).__name__}, {expected}")
+    if isinstance(part, nn.Identity):
+        return part
+    if not _takes(part, len(wanted)):
+        raise TensorsimError(
+            f"{slot}: got {type(part).__name__}{inspect.signature(part.forward)}, {expected}"
+        )
+    found = _return_type(part)
+    if found is not None and not _serves_as(found, result):
+        raise TensorsimError(f"{slot}: got {type(part).__name__}, which returns {_name(found)}, {expected}")
+    return part
+
+
+def is_pose_estimator(part: nn.Module) -> bool:
+    """Whether a module is called like a :class:`PoseEstimator` and not like a :class:`HeatmapNetwork`."""
+    return _takes(part, 3) and not _takes(part, 1)
+
+
+def check_detections(found: Any) -> None:
+    """Refuse what a detector returned if it is not :class:`~tensorsim.types.Detections` (or alike).
+
+    Raises:
+        TensorsimError: a list of dictionaries, as torchvision's detectors return, or anything else.
+    """
+    if not all(isinstance(getattr(found, name, None), Tensor) for name in Detections._fields):
+        inside = f" of {type(found[0]).__name__}" if isinstance(found, list | tuple) and found else ""
+        raise TensorsimError(
+            f"detector: it returned a {type(found).__name__}{inside}, expected Detections"
+            f"({', '.join(Detections._fields)}) with padded tensors; see tensorsim.protocols.Detector"
+        )
+
+
+def _takes(part: nn.Module, arguments: int) -> bool:
+    """Whether ``forward`` can be called with this many positional arguments; True where it does not say."""
+    try:
+        inspect.signature(part.forward).bind(*[None] * arguments)
+    except TypeError:
+        return False
+    except ValueError:  # compiled code without a signature
+        return True
+    return True
+
+
+def _return_type(part: nn.Module) -> Any:
+    """The return annotation of ``forward``, None where there is none that can be read."""
+    try:
+        found = typing.get_type_hints(type(part).forward).get("return")
+    except (NameError, TypeError, AttributeError):
+        return None
+    return None if found is Any else found
+
+
+def _serves_as(found: Any, wanted: Any) -> bool:
+    """Whether a value annotated as ``found`` can be used where ``wanted`` is expected, as far as is known."""
+    found_class, wanted_class = typing.get_origin(found) or found, typing.get_origin(wanted) or wanted
+    if not inspect.isclass(found_class) or found_class is object:
+        return True
+    fields = getattr(wanted_class, "_fields", None)
+    if fields is not None:
+        return set(fields) <= set(getattr(found_class, "_fields", ()))
+    return issubclass(found_class, wanted_class)
+
+
+def _name(hint: Any) -> str:
+    """An annotation without the names of modules."""
+    arguments = ", ".join(_name(a) for a in typing.get_args(hint))
+    plain = getattr(typing.get_origin(hint) or hint, "__name__", str(hint))
+    return f"{plain}[{arguments}]" if arguments else plain
