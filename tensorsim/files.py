@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Files that are read with one kind of error; files and folders that appear whole or not at all."""
 
 import os
 import shutil
@@ -6,6 +6,19 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from tensorsim.errors import TensorsimError
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Whatever a reader stumbles over in a file that is damaged or another is one error that names the file."""
+    try:
+        yield
+    except TensorsimError:
+        raise
+    except Exception as error:  # such exceptions share no base class
+        raise TensorsimError(f"{path}: got a file that cannot be read as {kind} ({error})") from error
 
 
 @contextmanager

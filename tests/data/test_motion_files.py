@@ -10,16 +10,11 @@ import torch
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
-from tensorsim.data.motion_files import (
-    H36M_JOINTS,
-    SMPL_JOINTS,
-    Motion,
-    body_joints,
-    load_coco_keypoints,
-    load_motion,
-    motion_keys,
-    place,
-)
+from tensorsim.data.coco import load_coco_keypoints
+from tensorsim.data.h36m import H36M_JOINTS
+from tensorsim.data.motion_files import load_motion, motion_keys, place
+from tensorsim.data.npz import SMPL_JOINTS
+from tensorsim.data.skeletons import Motion, body_joints
 from tensorsim.errors import TensorsimError
 
 
