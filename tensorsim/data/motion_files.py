@@ -75,7 +75,7 @@ def load_motion(
         raise TensorsimError(f"{path}: got a {path.suffix or 'nameless'} file, expected .bvh or .npz")
     with open_npz(path) as arrays:
         if "positions_3d" in arrays.files:
-            return read_h36m(path, key, fps)
+            return read_h36m(path, arrays, key, fps)
         return read_npz(path, arrays, key, fps, joint_names, unit_m)
 
 

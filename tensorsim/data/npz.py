@@ -1,10 +1,11 @@
 """Motion capture in npz files: arrays of joints by name, AMASS."""
 
+import math
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import numpy as np
 import torch
@@ -22,19 +23,66 @@ SMPL_JOINTS = (
 )  # fmt: skip
 
 
+#: Unpacked bytes of one array: an hour of 52 joints at 120 frames per second, in float64, is half of it.
+MAX_BYTES = 10**9
+
+
+class Arrays:
+    """The arrays of an npz. Types and sizes are looked at before any data is read, and pickles are never run."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+        #: Names of the arrays.
+        self.files = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Dimensions of an array; reads its header only."""
+        with self._archive.open(f"{name}.npy") as file:
+            return _header(file)[0]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        with self._archive.open(f"{name}.npy") as file:
+            shape, _, dtype = _header(file)
+            if dtype.kind not in "fiubU":
+                raise ValueError(f"{name} holds {dtype}, expected numbers")
+            self._check_size(name, math.prod(shape) * dtype.itemsize)
+        with self._archive.open(f"{name}.npy") as file:
+            return np.lib.format.read_array(file, allow_pickle=False)
+
+    def pickled(self, name: str) -> bytes:
+        """The pickle in which NumPy stores an array of objects."""
+        with self._archive.open(f"{name}.npy") as file:
+            _, _, dtype = _header(file)
+            if not dtype.hasobject:
+                raise ValueError(f"{name} holds {dtype}, expected a dictionary")
+            self._check_size(name, self._archive.getinfo(f"{name}.npy").file_size)
+            return file.read()
+
+    def _check_size(self, name: str, size: int) -> None:
+        if size > MAX_BYTES:
+            raise ValueError(f"{name} unpacks to {size / 1e6:.0f} MB, expected at most {MAX_BYTES / 1e6:.0f}")
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(file)
+
+
 @contextmanager
-def open_npz(path: Path) -> Iterator[Any]:
-    """The arrays of an npz."""
+def open_npz(path: Path) -> Iterator[Arrays]:
+    """The arrays of an npz; errors name the file."""
     with reading(path, "npz"):
         if not zipfile.is_zipfile(path):
             raise ValueError("it is no archive of arrays")
-        with np.load(path, allow_pickle=False) as arrays:
-            yield arrays
+        with zipfile.ZipFile(path) as archive:
+            yield Arrays(archive)
 
 
-def motions_in(arrays: Any) -> list[str]:
+def motions_in(arrays: Arrays) -> list[str]:
     """Names of the arrays (T, J, 3) and (P, T, J, 3)."""
-    return [name for name in arrays.files if arrays[name].ndim in (3, 4) and arrays[name].shape[-1] == 3]
+    shapes = {name: arrays.shape(name) for name in arrays.files}
+    return [name for name, shape in shapes.items() if len(shape) in (3, 4) and shape[-1] == 3]
 
 
 def preferred(motions: list[str]) -> str | None:
@@ -43,7 +91,7 @@ def preferred(motions: list[str]) -> str | None:
 
 
 def read_npz(
-    path: Path, arrays: Any, key: str | None, fps: float | None, names: tuple[str, ...] | None,
+    path: Path, arrays: Arrays, key: str | None, fps: float | None, names: tuple[str, ...] | None,
     unit_m: float | None,
 ) -> Motion:  # fmt: skip
     """The motion of opened ``arrays``; arguments as in :func:`tensorsim.data.motion_files.load_motion`.
