@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError
+from tensorsim.limited_yaml import load_limited_yaml
 
 
 class RadarScene(NamedTuple):
@@ -192,13 +193,11 @@ def load_scene_yaml(path: str | Path) -> RadarScene:
         TensorsimError: no such file, no YAML, an unknown or repeated key, a value of the wrong type, or one that
             the configuration refuses; the message names file and key.
     """
-    import yaml
-
     try:
-        document = yaml.load(Path(path).read_text(encoding="utf-8"), _unique_keys_loader())
+        document = load_limited_yaml(Path(path).read_text(encoding="utf-8"), f"{path}")
     except OSError as error:
         raise TensorsimError(f"{path}: {error.strerror}") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except UnicodeDecodeError as error:
         raise TensorsimError(f"{path}: not valid YAML: {error}") from None
     document = _mapping(f"{path}", document)
     sections = {
@@ -227,21 +226,6 @@ def save_radar_yaml(
         if part is not None:
             document[name] = _plain(dataclasses.asdict(part))
     Path(path).write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-
-
-def _unique_keys_loader() -> type:
-    """YAML's safe loader, which would take the last of two equal keys, made to refuse them."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            keys = [str(key.value) for key, _ in node.value]
-            twice = sorted({key for key in keys if keys.count(key) > 1})
-            if twice:
-                raise yaml.YAMLError(f"twice the key {', '.join(twice)}")
-            return super().construct_mapping(node, deep)
-
-    return Loader
 
 
 def _plain(value: Any) -> Any:
