@@ -1,11 +1,30 @@
-"""Files and folders that appear whole or not at all."""
+"""Files that are read with one kind of error; files and folders that appear whole or not at all."""
 
+import json
+import math
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from tensorsim.errors import TensorsimError
+
+#: What says of a folder of results which run they are from.
+SUMMARY = "summary.json"
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Whatever a reader stumbles over in a file that is damaged or another is one error that names the file."""
+    try:
+        yield
+    except TensorsimError:
+        raise
+    except Exception as error:  # such exceptions share no base class
+        raise TensorsimError(f"{path}: got a file that cannot be read as {kind} ({error})") from error
 
 
 @contextmanager
@@ -30,13 +49,101 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def complete_or_nothing(out: Path) -> Iterator[Path]:
-    """A scratch folder whose files move to ``out`` when the block ends well; otherwise nothing remains of it."""
+    """A scratch folder whose files move to ``out`` when the block ends well; otherwise ``out`` stays as it was.
+
+    Files of other names that are in ``out`` already stay there, but not those that its ``summary.json`` lists under
+    ``files``: they are of an earlier run. ``summary.json`` is the first to go and the last to come, so that a folder
+    that has one holds the files of one run, even after a crash.
+
+    Raises:
+        TensorsimError: another process is writing into ``out``, or a folder lies where a file should.
+    """
     out.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
+    with _locked(out):
+        scratch = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
+        try:
+            new, old = scratch / "new", scratch / "old"
+            new.mkdir()
+            old.mkdir()
+            yield new
+            _exchange(out, new, old)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _exchange(out: Path, new: Path, old: Path) -> None:
+    """Move the files of ``new`` to ``out``, and those that they replace to ``old``; all or none."""
+    names = sorted((file.name for file in new.iterdir()), key=lambda name: (name == SUMMARY, name))
+    for name in names:
+        if (out / name).is_dir():
+            raise TensorsimError(f"{out / name}: got a folder, expected a file or nothing there")
+    made = not out.exists()
+    out.mkdir(exist_ok=True)
+    moves = [
+        (out / name, old / name)
+        for name in (SUMMARY, *sorted({*names, *_listed(out)} - {SUMMARY}))
+        if (out / name).is_file()
+    ]
+    moves += [(new / name, out / name) for name in names]
+    done: list[tuple[Path, Path]] = []
     try:
-        yield scratch
-        out.mkdir(exist_ok=True)
-        for file in scratch.iterdir():
-            os.replace(file, out / file.name)
+        for source, target in moves:
+            os.replace(source, target)
+            done.append((source, target))
+    except BaseException:
+        for source, target in reversed(done):
+            os.replace(target, source)
+        if made:
+            out.rmdir()
+        raise
+
+
+def _listed(out: Path) -> list[str]:
+    """Names of the files that the summary of an earlier run lists, as far as it has a list."""
+    try:
+        names = json.loads((out / SUMMARY).read_text(encoding="utf-8"))["files"]
+        return [name for name in names if Path(name).name == name]
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return []
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Hold a folder for this process; the lock ends with the process, however that ends."""
+    try:
+        import fcntl
+    except ImportError:  # not on Windows
+        yield
+        return
+    path = out.parent / f".{out.name}.lock"
+    file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not path.exists() or not os.path.samestat(os.stat(path), os.fstat(file)):
+                raise BlockingIOError  # its last holder removed it, and another run has made a new one since
+        except BlockingIOError:
+            raise TensorsimError(
+                f"{out}: another run is writing into this folder, expected one at a time"
+            ) from None
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        os.close(file)
+
+
+def write_json(path: str | os.PathLike[str], content: Any) -> None:
+    """Write strict JSON: NaN and infinity, which JSON has not, become ``null``. The file appears whole."""
+    with complete_file(path) as scratch:
+        text = json.dumps(_finite(content), indent=2, allow_nan=False)
+        scratch.write_text(text + "\n", encoding="utf-8")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content

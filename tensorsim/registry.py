@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 from tensorsim.model_files import manifest, models_dir
 
 
@@ -45,6 +46,15 @@ class ModelEntry:
     def shipped(self) -> bool:
         """Whether the file comes with the package."""
         return self.url is None
+
+    @property
+    def assurance(self) -> str:
+        """What its digest says of a file that was just downloaded."""
+        if len(self.sha256) == 64:
+            return "whole SHA-256"
+        return (
+            f"{len(self.sha256)} digits of SHA-256, which is weak" if self.sha256 else "no SHA-256 published"
+        )
 
     @property
     def path(self) -> Path:
@@ -240,11 +250,17 @@ def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
 def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
     """The file of an entry, downloaded if it is not there. An interrupted download goes on where it stopped.
 
+    The whole SHA-256 of what came is kept beside it, so that later changes show also where only eight digits, or
+    none, are published.
+
     Raises:
         TensorsimError: no connection, or a file whose SHA-256 is another (it is removed).
     """
     path = entry.path
-    if path.is_file() or entry.url is None:
+    if entry.url is None:
+        return path
+    if path.is_file():
+        verify(entry)
         return path
     import gdown
     import requests
@@ -257,8 +273,14 @@ def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
             f"{entry.name}: could not fetch {entry.url} ({type(error).__name__}: {str(error).splitlines()[0]}); "
             f"with a connection elsewhere, save it as {path}, or give the path of a copy"
         ) from error
-    verify(entry)
+    digest = verify(entry)
+    with complete_file(_kept_digest(entry)) as scratch:
+        scratch.write_text(digest + "\n", encoding="ascii")
     return path
+
+
+def _kept_digest(entry: ModelEntry) -> Path:
+    return entry.path.with_name(f"{entry.file}.sha256")
 
 
 def verify(entry: ModelEntry) -> str:
@@ -272,11 +294,16 @@ def verify(entry: ModelEntry) -> str:
             f"{entry.name}: {entry.path} is not there; fetch it: tensorsim models fetch {entry.name}"
         )
     digest = hashlib.sha256(entry.path.read_bytes()).hexdigest()
-    if not digest.startswith(entry.sha256):
+    kept = _kept_digest(entry)
+    expected = entry.sha256
+    if not entry.shipped and digest.startswith(expected) and kept.is_file():
+        expected = kept.read_text(encoding="ascii", errors="replace").strip()
+    if not digest.startswith(expected):
         if not entry.shipped:
             entry.path.unlink()
+            kept.unlink(missing_ok=True)
         raise TensorsimError(
-            f"{entry.name}: {entry.path} has SHA-256 {digest}, expected {entry.sha256}"
+            f"{entry.name}: {entry.path} has SHA-256 {digest}, expected {expected}"
             + ("; reinstall tensorsim" if entry.shipped else "...; it was removed, fetch it again")
         )
     return digest

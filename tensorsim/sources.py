@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import CameraConfig
-from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
+from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
+from tensorsim.data.motion_files import load_motion, place
+from tensorsim.data.skeletons import Motion
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
@@ -112,7 +114,7 @@ def keypoint_source(
     """People whose COCO keypoints are known; only lifting, placing and smoothing of ``stage`` run.
 
     Args:
-        path: see :func:`~tensorsim.data.motion_files.load_coco_keypoints`.
+        path: see :func:`~tensorsim.data.coco.load_coco_keypoints`.
         stage: its networks are not used.
         fps: frames per second; no such file tells them.
         size: (height, width) of the pictures; None where the file says it.

@@ -10,7 +10,9 @@ import io
 import os
 import pickle
 import re
+import zipfile
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,15 +34,19 @@ _TENSOR_PARTS = {
     ("collections", "OrderedDict"): OrderedDict,
     ("torch", "Size"): torch.Size,
     ("torch", "device"): torch.device,
-    # Behind partial, so that a pickle cannot set attributes of torch's own functions.
-    ("torch._utils", "_rebuild_tensor_v2"): functools.partial(torch._utils._rebuild_tensor_v2),
-    ("torch._utils", "_rebuild_parameter"): functools.partial(torch._utils._rebuild_parameter),
+}
+_TENSOR_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("torch._utils", "_rebuild_tensor_v2"): torch._utils._rebuild_tensor_v2,
+    ("torch._utils", "_rebuild_parameter"): torch._utils._rebuild_parameter,
 }
 
 # Training logs lie beside the weights in published checkpoints (mmengine's message hub, NumPy scalars). Their
 # objects are read as placeholders that do nothing; a name from anywhere else is refused.
 _LOG_PACKAGES = ("mmengine", "mmcv", "numpy", "collections", "datetime", "_codecs")
 _LOG_BUILTINS = ("getattr", "set", "frozenset", "slice", "range", "complex", "bytearray")
+
+# Unpacked over packed size of a checkpoint; torch writes about 1.
+_MAX_COMPRESSION = 20
 
 
 class _Placeholder:
@@ -74,6 +80,9 @@ class _TensorUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _TENSOR_PARTS:
             return _TENSOR_PARTS[module, name]
+        if (module, name) in _TENSOR_FUNCTIONS:
+            # A pickle can set the state of what it names: of a partial made for it, not of torch's own function.
+            return functools.partial(_TENSOR_FUNCTIONS[module, name])
         if module == "torch" and isinstance(getattr(torch, name, None), torch.dtype):
             return getattr(torch, name)
         package = module.partition(".")[0]
@@ -96,7 +105,7 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
     Raises:
         TensorsimError: no such file, another suffix, a wrong hash, a damaged file, a pickle that asks for
-            anything but tensors (it is not run), or a file without tensors.
+            anything but tensors (it is not run), a file without tensors, values that are not finite.
     """
     path = Path(path)
     if path.suffix not in (*PICKLE_SUFFIXES, ".safetensors"):
@@ -123,6 +132,7 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
             tensors[key] = value.detach()
     if not tensors:
         raise TensorsimError(f"{path}: got no tensors, expected weights")
+    _check_values(path, tensors)
     return tensors
 
 
@@ -236,6 +246,19 @@ def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict
         save_file(stored, scratch, metadata)
 
 
+def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Refuse what no training leaves behind: numbers that are not finite, variances below zero, repeated storage."""
+    for key, value in tensors.items():
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise TensorsimError(
+                f"{path}: {key} of shape {list(value.shape)} has more values than are stored"
+            )
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            raise TensorsimError(f"{path}: {key} has NaN or infinite values, expected finite weights")
+        if key.endswith("running_var") and bool((value < 0).any()):
+            raise TensorsimError(f"{path}: {key} has negative values, expected variances")
+
+
 def _equal(state_dict: dict[str, Tensor], first: str, second: str) -> bool:
     a, b = state_dict[first], state_dict[second]
     return a.data_ptr() == b.data_ptr() or torch.equal(a, b)
@@ -276,6 +299,12 @@ def _read_pickle(path: Path, data: bytes) -> Any:
     try:
         # torch.load would hand a TorchScript archive, which is a program too, to torch.jit.load.
         if data.startswith(b"PK\x03\x04"):
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                unpacked = sum(record.file_size for record in archive.infolist())
+            if unpacked > _MAX_COMPRESSION * len(data):
+                raise TensorsimError(
+                    f"it unpacks from {len(data)} to {unpacked} bytes, and torch does not compress weights"
+                )
             records = torch._C.PyTorchFileReader(io.BytesIO(data)).get_all_records()
             if "constants.pkl" in records:
                 raise TensorsimError("it is a TorchScript program, expected a file of weights")

@@ -1,13 +1,18 @@
 """Files and folders appear whole, with ordinary rights, or not at all."""
 
+import json
+import math
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
 import tensorsim as ts
-from tensorsim.files import complete_file, complete_or_nothing
+from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file, complete_or_nothing, write_json
 from tensorsim.weights import save_weights
 
 
@@ -40,3 +45,74 @@ def test_others_may_read_what_is_written(tmp_path: Path) -> None:
     save_weights(nn.Linear(2, 2), tmp_path / "m.safetensors", {})
     assert len({p.stat().st_mode for p in tmp_path.iterdir()}) == 1
     assert torch.jit.load(tmp_path / "m.pt")(torch.zeros(1, 2)).shape == (1, 2)
+
+
+def files_in(folder: Path) -> dict[str, str]:
+    return {p.name: p.read_text() for p in folder.iterdir()}
+
+
+def write_run(out: Path, name: str, *files: str) -> None:
+    with complete_or_nothing(out) as folder:
+        for file in files:
+            (folder / file).write_text(name)
+        write_json(folder / "summary.json", {"run": name, "files": [*files, "summary.json"]})
+
+
+def test_a_folder_holds_the_files_of_one_run(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+    write_run(out, "first", "a", "only_the_first")
+    (out / "mine").write_text("kept")
+    write_run(out, "second", "a", "b")
+    assert set(files_in(out)) == {"a", "b", "mine", "summary.json"}
+    assert files_in(out)["a"] == files_in(out)["b"] == "second"
+    assert [p.name for p in out.parent.iterdir()] == ["out"]
+
+
+def test_results_appear_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    write_run(out, "first", "a", "b")
+    before = files_in(out)
+    (out / "c").mkdir()
+    with pytest.raises(TensorsimError, match="out/c: got a folder, expected a file"):
+        write_run(out, "second", "a", "c")
+    (out / "c").rmdir()
+    assert files_in(out) == before
+
+    replace = os.replace
+    for failing in range(1, 7):
+        calls = iter(range(1, 100))
+
+        def fails_once(source: Path, target: Path, failing: int = failing, calls: Any = calls) -> None:
+            # The first rename belongs to the JSON that the block writes.
+            if next(calls) == failing + 1:
+                raise OSError("the disk is gone")
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", fails_once)
+        with pytest.raises(OSError, match="the disk is gone"):
+            write_run(out, "second", "a", "b")
+        monkeypatch.undo()
+        assert files_in(out) == before
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("the disk is gone")))
+    with pytest.raises(OSError, match="gone"), complete_or_nothing(tmp_path / "new") as folder:
+        (folder / "a").touch()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_second_run_into_a_folder_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with complete_or_nothing(out) as folder:
+        (folder / "a").write_text("first")
+        with pytest.raises(TensorsimError, match="out: another run is writing"):
+            write_run(out, "second", "a")
+    assert files_in(out) == {"a": "first"}
+    write_run(out, "third", "a")
+    assert files_in(out)["a"] == "third"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_json_is_strict(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"a": [math.nan, 1.5, {"b": math.inf}], "c": (True, None, "NaN")})
+    text = (tmp_path / "a.json").read_text()
+    content = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert content == {"a": [None, 1.5, {"b": None}], "c": [True, None, "NaN"]}

@@ -105,6 +105,18 @@ def test_another_content_is_refused_and_removed(entry: ModelEntry) -> None:
     assert not wrong.path.exists()
 
 
+@pytest.mark.parametrize("digits", [0, 8, 64])
+def test_the_cache_is_verified_by_the_whole_digest(entry: ModelEntry, server: Server, digits: int) -> None:
+    entry = dataclasses.replace(entry, sha256=hashlib.sha256(CONTENT).hexdigest()[:digits])
+    path = registry.fetch(entry, quiet=True)
+    path.write_bytes(CONTENT[:-1] + b"?")
+    with pytest.raises(TensorsimError, match=r"has SHA-256 .* it was removed, fetch it again"):
+        registry.fetch(entry, quiet=True)
+    assert registry.fetch(entry, quiet=True).read_bytes() == CONTENT
+    assert len(server.ranges) == 2
+    assert ("weak" in entry.assurance) == (digits == 8)
+
+
 def test_offline_says_what_to_do(entry: ModelEntry) -> None:
     # Port 9 of this machine answers nobody.
     offline = dataclasses.replace(entry, url="http://127.0.0.1:9/test-net.pth")

@@ -6,6 +6,7 @@ import pickle
 import re
 import sys
 import types
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -236,6 +237,46 @@ def test_refuses_what_is_no_weight_file(tmp_path: Path) -> None:
     ]:
         with pytest.raises(TensorsimError, match=message):
             load_state_dict(save(content, tmp_path / "w.pth"))
+
+
+def test_one_file_does_not_change_how_the_next_is_read(tmp_path: Path) -> None:
+    good = save({"a": nn.Parameter(torch.ones(2))}, tmp_path / "good.pth")
+    # After a function is named (GLOBAL), BUILD gives it the state of a partial that calls something else.
+    for name in ("_rebuild_tensor_v2", "_rebuild_parameter"):
+        state = b"(ccollections\nOrderedDict\n)}Ntb"
+        bad = tmp_path / "bad.pth"
+        bad.write_bytes(b"ctorch._utils\n" + name.encode() + b"\n" + state + b".")
+        with pytest.raises(TensorsimError, match=r"bad\.pth"):
+            load_state_dict(bad)
+        assert same(load_state_dict(good), {"a": torch.ones(2)})
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+def test_values_that_no_training_leaves_are_refused(tmp_path: Path, suffix: str) -> None:
+    from safetensors.torch import save_file
+
+    path = tmp_path / f"w{suffix}"
+    for content, message in [
+        ({"a": torch.tensor([1.0, float("nan")])}, "a has NaN or infinite values"),
+        ({"a": torch.tensor([1.0, float("inf")]).half()}, "a has NaN or infinite values"),
+        ({"norm.running_var": torch.tensor([1.0, -1.0])}, r"norm\.running_var has negative values"),
+    ]:
+        save(content, path) if suffix == ".pth" else save_file(content, path)
+        with pytest.raises(TensorsimError, match=message):
+            load_state_dict(path)
+
+
+def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+    whole = save({"a": torch.zeros(1_000_000)}, tmp_path / "w.pth")
+    bomb = tmp_path / "bomb.pth"
+    with zipfile.ZipFile(whole) as source, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as packed:
+        for record in source.infolist():
+            packed.writestr(record.filename, source.read(record))
+    with pytest.raises(TensorsimError, match=r"bomb\.pth: it unpacks from \d+ to 400\d+ bytes"):
+        load_state_dict(bomb)
+    repeated = save({"a": torch.zeros(1).expand(10**12)}, tmp_path / "r.pth")
+    with pytest.raises(TensorsimError, match=r"a of shape .* has more values than are stored"):
+        load_state_dict(repeated)
 
 
 # ---- loading completely or not at all --------------------------------------------------------------------

@@ -17,7 +17,9 @@ class ListModels:
 
         for entry in registry.entries():
             there = "shipped" if entry.shipped else "fetched" if entry.path.is_file() else "online"
-            print(f"{entry.name}\n    {entry.network}, {there}, {entry.licence}; {entry.metrics}")
+            print(
+                f"{entry.name}\n    {entry.network}, {there}, {entry.licence}, {entry.assurance}; {entry.metrics}"
+            )
             print(f"    {entry.source}; {entry.path if there != 'online' else entry.url}")
 
 
@@ -55,9 +57,7 @@ class VerifyModels:
                 continue
             try:
                 digest = registry.verify(entry)
-                print(
-                    f"ok    {entry.name}: {digest}" + ("" if entry.sha256 else " (its maker publishes none)")
-                )
+                print(f"ok    {entry.name}: {digest} ({entry.assurance})")
             except TensorsimError as error:
                 wrong.append(entry.name)
                 print(f"WRONG {error}")

@@ -1,6 +1,8 @@
 """Films and motion files in, rendered people, films and sound out."""
 
-from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
+from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
+from tensorsim.data.motion_files import load_motion, place
+from tensorsim.data.skeletons import Motion
 from tensorsim.data.sound import Sound, doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import VideoReader, write_video
 from tensorsim.geometry.framing import camera_on

@@ -14,9 +14,29 @@ import torch
 from torch import Tensor
 
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
+from tensorsim.limits import RANGES, check_range
 
 #: A file that announces so many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
+#: Frames that are this many seconds and this many frames away from even time are said to be uneven.
+_UNEVEN_S, _UNEVEN_FRAMES = 0.05, 1.5
+
+#: How films begin, and where: FFmpeg would also open playlists, which name further files and addresses.
+_CONTAINERS = (
+    *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")),  # mp4, mov, 3gp
+    (8, b"AVI "),
+    (0, b"\x1a\x45\xdf\xa3"),  # Matroska, WebM
+    (0, b"GIF8"),
+    (0, b"\x47"),  # MPEG-2 transport stream
+    (4, b"\x47"),  # the same with time stamps (m2ts)
+    (0, b"\x00\x00\x01"),  # MPEG program and elementary streams
+    (0, b"\x00\x00\x00\x01"),
+    (0, b"FLV"),
+    (0, b"OggS"),
+    (0, b"\x30\x26\xb2\x75"),  # Windows Media
+    (0, b"YUV4MPEG2 "),
+    (0, b"DKIF"),
+)
 
 
 class VideoReader:
@@ -59,8 +79,10 @@ class VideoReader:
         self.path = Path(path)
         if fps is not None:
             check_positive(fps, "fps")
+            check_range(fps, "frame rate", "fps")
         if stride < 1:
             raise TensorsimError(f"stride: got {stride}, expected 1 or more")
+        check_range(stride, "stride", "stride")
         start_s = 0.0 if start_s is None else start_s
         if not 0 <= start_s < math.inf:
             raise TensorsimError(f"start_s: got {start_s}, expected a number of seconds from 0 on")
@@ -68,10 +90,13 @@ class VideoReader:
             raise TensorsimError(
                 f"end_s: got {end_s}, expected a number of seconds above the start, {start_s}"
             )
+        check_range(start_s, "time", "start_s")
         if not self.path.exists():
             raise TensorsimError(f"{self.path}: no such file, expected a video")
         if not self.path.is_file():
             raise TensorsimError(f"{self.path}: got a folder, expected a video file")
+        if not _begins_like_a_film(self.path):
+            raise TensorsimError(f"{self.path}: OpenCV cannot read this, expected a video")
 
         with self._opened() as capture:
             file_fps, announced = _properties(capture)
@@ -83,7 +108,8 @@ class VideoReader:
             film_fps = float(file_fps if fps is None else fps)
             self._stride = stride
             self._first = _frame_at(start_s, film_fps)
-            self._end = None if end_s is None or end_s == math.inf else _frame_at(end_s, film_fps)
+            self._end = None if end_s is None or end_s > RANGES["time"].high else _frame_at(end_s, film_fps)
+            self._fps_of_file = None if fps is not None else film_fps
             skipped = _skip(capture, self._first)
             found, frame = capture.read() if skipped == self._first else (False, np.empty((0, 0)))
         if not found and skipped:
@@ -100,6 +126,8 @@ class VideoReader:
         self.fps = film_fps / stride
         self.height: int = frame.shape[0]
         self.width: int = frame.shape[1]
+        for side in (self.height, self.width):
+            check_range(side, "image side", f"{self.path}: frames of {self.width}x{self.height} pixels")
         self._announced = announced
         self.frame_count = (
             None if announced is None else max(1, -(-(self._stop(announced) - self._first) // stride))
@@ -109,7 +137,8 @@ class VideoReader:
         """The frames in order, at most ``size`` at a time: (n, 3, H, W) uint8 RGB on the CPU, n >= 1.
 
         A film that ends before the frames that its file announces (a cut-off download) gives what is there,
-        with a TensorsimWarning.
+        with a TensorsimWarning. Frames at uneven times (a GIF with a pause, a telephone that saves power) are
+        given as they come, with a TensorsimWarning: what follows takes their rate as constant.
 
         Raises:
             TensorsimError: a size below 1, or a film whose frames change their size.
@@ -125,7 +154,9 @@ class VideoReader:
             index = _skip(capture, self._first)
             buffer = np.empty((size, self.height, self.width, 3), np.uint8)
             filled = 0
+            times_s: list[float] = []
             while (self._end is None or index < self._end) and capture.grab():
+                times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
                 if (index - self._first) % self._stride == 0:
                     found, frame = capture.retrieve()
                     if not found:
@@ -143,6 +174,7 @@ class VideoReader:
                     filled = 0
             if filled:
                 yield _planes(buffer[:filled])
+        self._check_times(np.array(times_s))
         if self._announced is not None:
             expected = self._stop(self._announced)
             # Containers count by duration and are often a frame or two off.
@@ -154,6 +186,22 @@ class VideoReader:
                     stacklevel=2,
                 )
 
+    def _check_times(self, times_s: np.ndarray) -> None:
+        """Warn of frames that are not at even times, where the file states times and its rate is taken."""
+        if self._fps_of_file is None or len(times_s) < 3 or not np.all(np.diff(times_s) > 0):
+            return
+        late_s = np.abs(times_s - times_s[0] - np.arange(len(times_s)) / self._fps_of_file).max()
+        if late_s > max(_UNEVEN_S, _UNEVEN_FRAMES / self._fps_of_file):
+            steps_s = np.diff(times_s)
+            usual = steps_s[steps_s < 1.5 * np.median(steps_s)].mean()
+            warnings.warn(
+                f"{self.path}: its frames are up to {late_s:.2f} s away from the constant {self._fps_of_file:g} frames "
+                f"per second that it announces and that speeds are computed with; by its own times it mostly has "
+                f"{1 / usual:.3g}: give that as fps, or convert it (ffmpeg -i IN -fps_mode cfr OUT)",
+                TensorsimWarning,
+                stacklevel=3,
+            )
+
     def _stop(self, announced: int) -> int:
         return announced if self._end is None else min(announced, self._end)
 
@@ -161,8 +209,8 @@ class VideoReader:
     def _opened(self) -> Iterator[Any]:
         import cv2
 
-        with _quiet_opencv():
-            capture = cv2.VideoCapture(str(self.path))
+        with _opening():
+            capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         try:
             if not capture.isOpened():
                 raise TensorsimError(f"{self.path}: OpenCV cannot read this, expected a video")
@@ -193,9 +241,10 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
         raise TensorsimError(f"{path}: no such folder {path.parent}, expected one to write into")
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".writing-") as folder:
         partial = Path(folder) / path.name
-        writer, shape = cv2.VideoWriter(), None
+        writer, shape, count = cv2.VideoWriter(), None, 0
         try:
             for frame in frames:
+                count += 1
                 is_image = frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3
                 if not is_image or frame.shape != (shape or frame.shape):
                     raise TensorsimError(
@@ -212,13 +261,34 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
             writer.release()
         if shape is None:
             raise TensorsimError(f"{path}: got no frames, expected at least one")
+        # OpenCV says nothing of writes that fail, as on a full disk; what is missing shows when it is read.
+        if _frames_in(partial) != count:
+            raise TensorsimError(f"{path}: the film could not be written whole; is the disk full?")
         os.replace(partial, path)
+
+
+def _frames_in(path: Path) -> int | None:
+    """Number of frames that a complete file announces; None of a file that is not complete."""
+    import cv2
+
+    with _opening():
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        return _properties(capture)[1] if capture.isOpened() else None
+    finally:
+        capture.release()
+
+
+def _begins_like_a_film(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(16)
+    return any(head[at : at + len(kind)] == kind for at, kind in _CONTAINERS)
 
 
 def _open_writer(writer: Any, path: Path, fps: float, size: tuple[int, int]) -> None:
     import cv2
 
-    with _quiet_opencv():
+    with _opening():
         opened = writer.open(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     if not opened:
         raise TensorsimError(
@@ -254,15 +324,22 @@ def _skip(capture: Any, count: int) -> int:
 
 
 @contextmanager
-def _quiet_opencv() -> Iterator[None]:
-    """Keep the log of OpenCV and its FFmpeg off stderr: damage becomes an exception or a warning of ours."""
+def _opening() -> Iterator[None]:
+    """Open films without OpenCV's and FFmpeg's log on stderr, and without FFmpeg's protocols but files."""
     # FFmpeg's level is read once, by the first film of the process.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from cv2.utils import logging
 
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    options = os.environ.get("OPENCV_FFMPEG_CAPTURE_OPTIONS")
+    # Whatever a file names, FFmpeg opens local files only.
+    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "protocol_whitelist;file"
     try:
         yield
     finally:
         logging.setLogLevel(level)
+        if options is None:
+            del os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"]
+        else:
+            os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = options

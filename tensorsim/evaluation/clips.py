@@ -9,7 +9,8 @@ from torch import Tensor
 
 from tensorsim.body.skeleton import body_height
 from tensorsim.config import ACTIVITIES
-from tensorsim.data.motion_files import Motion, load_motion, motion_keys, place
+from tensorsim.data.motion_files import load_motion, motion_keys, place
+from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator, activity_index
 from tensorsim.motion.resample import PoseResampler

@@ -1,8 +1,12 @@
+import io
 import json
 import math
 import pickle
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,16 +14,12 @@ import torch
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
-from tensorsim.data.motion_files import (
-    H36M_JOINTS,
-    SMPL_JOINTS,
-    Motion,
-    body_joints,
-    load_coco_keypoints,
-    load_motion,
-    motion_keys,
-    place,
-)
+from tensorsim.data import npz
+from tensorsim.data.coco import load_coco_keypoints
+from tensorsim.data.h36m import H36M_JOINTS
+from tensorsim.data.motion_files import load_motion, motion_keys, place
+from tensorsim.data.npz import SMPL_JOINTS
+from tensorsim.data.skeletons import Motion, body_joints
 from tensorsim.errors import TensorsimError
 
 
@@ -234,6 +234,72 @@ def test_hostile_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
         content = archive.read("positions_3d.npy")
     pickle.loads(content[content.index(b"\x80") :])
     assert (tmp_path / "pwned").exists()
+
+
+class _Pickled:
+    """Pickles as this call and this state."""
+
+    def __init__(self, *reduced: object) -> None:
+        self.reduced = reduced
+
+    def __reduce__(self) -> Any:
+        return self.reduced
+
+
+#: A structure whose field is said to be an object, but not its whole: NumPy takes its bytes for addresses.
+DTYPE = _Pickled(np.dtype, ("V8", False, True), (3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0))
+ADDRESSES = {
+    "a buffer": _Pickled(np.ndarray, ((1,), DTYPE, b"\x01" * 8)),
+    "a state": _Pickled(
+        np._core.multiarray._reconstruct,
+        (np.ndarray, (0,), b"b"),
+        (1, (1,), DTYPE, False, b"\x01" * 8),
+    ),
+    "a scalar": _Pickled(np._core.multiarray.scalar, (DTYPE, b"\x01" * 8)),
+    "objects": np.array([1, "a", None], dtype=object),
+    "text": np.array(["a", "b"]),
+    "too few bytes": _Pickled(
+        np._core.multiarray._reconstruct,
+        (np.ndarray, (0,), b"b"),
+        (1, (9, 32, 3), np.dtype("f4"), False, b"\x01" * 8),
+    ),
+}
+
+
+def test_a_pickle_cannot_make_addresses_of_its_bytes(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.npz" for name in ADDRESSES]
+    for path in paths:
+        np.savez(path, positions_3d=np.array({"S1": {"Walking": ADDRESSES[path.stem]}}, dtype=object))
+    read = (
+        "import sys; from tensorsim.data import load_motion\nfor path in sys.argv[1:]:\n"
+        " try: load_motion(path)\n except ValueError as error: print(type(error).__name__, error, flush=True)"
+    )
+    command = [sys.executable, "-c", read, *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"a segmentation fault is -11; {done.stdout} {done.stderr}"
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(paths)
+    for line, path in zip(lines, paths, strict=True):
+        assert line.startswith(f"TensorsimError {path}: ")
+
+
+def test_a_memo_without_end_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "|O", "fortran_order": False, "shape": ()})
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        # LONG_BINPUT 2**30: the unpickler would fill 16 GB with zeros.
+        archive.writestr("positions_3d.npy", header.getvalue() + b"\x80\x04}r\x00\x00\x00\x40.")
+    with pytest.raises(TensorsimError, match="memo"):
+        load_motion(tmp_path / "a.npz")
+
+
+def test_sizes_are_read_before_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(npz, "MAX_BYTES", 10_000)
+    np.savez_compressed(tmp_path / "big.npz", joints_m=np.zeros((30, 14, 3)), fps=30.0)
+    np.savez_compressed(tmp_path / "big3d.npz", positions_3d={"S1": {"Walking": np.zeros((30, 32, 3))}})
+    for name in ("big", "big3d"):
+        with pytest.raises(TensorsimError, match=f"{name}.npz: .* unpacks to .* MB"):
+            load_motion(tmp_path / f"{name}.npz")
 
 
 # ---- COCO ----------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import torch
 
 from tensorsim.data import video
 from tensorsim.data.video import VideoReader, write_video
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, collected_warnings
 
 HEIGHT, WIDTH, SIDE = 48, 64, 12
 BACKGROUND, SQUARE = (30, 60, 200), (230, 120, 20)  # RGB
@@ -281,6 +281,64 @@ def test_log_level_of_opencv_comes_back(clip: Path) -> None:
         logging.setLogLevel(before)
 
 
+def test_uneven_times_are_said(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    pictures = [image.fromarray(picture(i)) for i in range(20)]
+    durations = [40] * 20
+    durations[8] = 2000
+    pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=durations)
+    with pytest.warns(TensorsimWarning, match=r"a\.gif: .* up to [12]\.\d+ s away .* mostly has 25:"):
+        read(tmp_path / "a.gif")
+    # Before the pause all is even, and a rate that is given is taken.
+    assert len(read(tmp_path / "a.gif", fps=25.0)) == 20
+    assert len(read(tmp_path / "a.gif", fps=25.0, end_s=0.2)) == 5
+
+
+def test_playlists_are_not_opened(clip: Path) -> None:
+    for name, text in (
+        ("list.m3u8", f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{clip}\n#EXT-X-ENDLIST\n"),
+        ("list.mp4", f"ffconcat version 1.0\nfile {clip.name}\n"),
+        ("list.sdp", "v=0\no=- 0 0 IN IP4 127.0.0.1\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n"),
+    ):
+        path = clip.with_name(name)
+        path.write_text(text)
+        with pytest.raises(TensorsimError, match=f"{name}: OpenCV cannot read this, expected a video"):
+            VideoReader(path)
+
+
+def test_settings_of_opencv_come_back(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+    monkeypatch.delenv(name, raising=False)
+    VideoReader(clip)
+    assert name not in os.environ
+    monkeypatch.setenv(name, "threads;1")
+    VideoReader(clip)
+    assert os.environ[name] == "threads;1"
+
+
+def test_huge_frames_are_refused_when_the_film_is_opened(tmp_path: Path) -> None:
+    path = tmp_path / "huge.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (8192, 32))
+    writer.write(np.zeros((32, 8192, 3), np.uint8))
+    writer.release()
+    with pytest.raises(TensorsimError, match="frames of 8192x32 pixels: got 8192, expected image side"):
+        VideoReader(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fps": 1e-300}, "fps: got 1e-300, expected frame rate from 0.1 to 1000"),
+        ({"start_s": 1e308}, r"start_s: got 1e\+308, expected time from 0 to"),
+        ({"stride": 10**25}, "stride: got 1e"),
+    ],
+)
+def test_implausible_numbers_are_refused(clip: Path, arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        VideoReader(clip, **arguments)  # type: ignore[arg-type]
+    assert len(read(clip, end_s=1e308)) == 20
+
+
 @pytest.mark.parametrize(
     ("name", "height", "width", "frames", "fps"),
     [
@@ -295,7 +353,10 @@ def test_real_films(shared_data: Path, name: str, height: int, width: int, frame
     reader = VideoReader(shared_data / "video" / name)
     assert (reader.height, reader.width, reader.frame_count) == (height, width, frames)
     assert reader.fps == pytest.approx(fps, abs=0.01)
-    assert sum(chunk.shape[0] for chunk in reader.chunks(16)) == frames
+    uneven = {"walk_away_1person_16fps.gif": "15", "hug_2people_28fps.mp4": "30"}  # by the times in the files
+    with collected_warnings() as messages:
+        assert sum(chunk.shape[0] for chunk in reader.chunks(16)) == frames
+    assert [f"mostly has {uneven[name]}:" in message for message in messages] == [True] * (name in uneven)
 
 
 # ---- write_video -----------------------------------------------------------------------------------------
@@ -358,4 +419,19 @@ def test_refuses_to_write(
 ) -> None:
     with pytest.raises(TensorsimError, match=message):
         write_video(tmp_path / name, frames, fps)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_noticed(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the end of the disk."""
+    import resource
+
+    noise = np.random.default_rng(0).integers(0, 255, (20, 96, 128, 3), np.uint8)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+    try:
+        with pytest.raises(TensorsimError, match=r"out\.mp4: the film could not be written whole"):
+            write_video(tmp_path / "out.mp4", noise, 24.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []

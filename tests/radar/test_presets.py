@@ -164,7 +164,7 @@ def test_several_receivers_become_tuples(tmp_path: Path) -> None:
         ("tx_m: [0, 1]", r"radar.yaml: RadarConfig.tx_m: got \(0.0, 1.0\), expected three finite numbers"),
         ("rx_m: [[0, 0, 1], [0, 1]]", r"RadarConfig.rx_m: got \(0.0, 1.0\)"),
         ("prf_hz: -1", r"radar.yaml: RadarConfig.prf_hz: got -1.0, expected a positive finite number"),
-        ("prf_hz: .nan", r"RadarConfig.prf_hz: got nan"),
+        ("prf_hz: nan", r"RadarConfig.prf_hz: got nan"),
         ("wall: {relative_permittivity: 0.5}", r"yaml: wall: WallConfig.relative_permittivity: got 0.5"),
         ("wall:", r"yaml: wall: got None, expected keys with values"),
         ("wall: 6", r"wall: got 6, expected keys"),
@@ -177,7 +177,7 @@ def test_several_receivers_become_tuples(tmp_path: Path) -> None:
         ("", r"yaml: got None, expected keys"),
         ("prf_hz: 1\nprf_hz: 2", r"twice the key prf_hz"),
         ("prf_hz: [", r"radar.yaml: not valid YAML"),
-        ("prf_hz: !!python/object/apply:os.getpid []", r"not valid YAML: could not determine a constructor"),
+        ("prf_hz: !!python/object/apply:os.getpid []", r"line 1 has an anchor, an alias or a tag"),
     ],
 )
 def test_refuses(text: str, message: str, tmp_path: Path) -> None:

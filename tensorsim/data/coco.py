@@ -1,0 +1,88 @@
+"""COCO keypoints of a video, as JSON."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError, check_finite
+from tensorsim.files import reading
+
+
+class Keypoints2D(NamedTuple):
+    """People in the frames of a video.
+
+    Attributes:
+        keypoints: (T, P, 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
+        scores: (T, P, 17); 0 where a keypoint was not labelled.
+        valid: (T, P) bool, whether the person is in that frame.
+        size: (height, width) of the frames in pixels; None where the file does not say.
+    """
+
+    keypoints: Tensor
+    scores: Tensor
+    valid: Tensor
+    size: tuple[int, int] | None = None
+
+
+def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
+    """Reads COCO keypoints of a video: annotations or results in one JSON file, or a folder with one per frame.
+
+    Frames are image ids in ascending order (files of a folder in order of name); people are ``track_id`` where
+    there is one, else they stand in their order. ``keypoints`` are 51 numbers (x, y, visibility or score).
+
+    Raises:
+        TensorsimError: files that are missing or not such JSON, no people, other than 17 keypoints, a ``track_id``
+            of some people only.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise TensorsimError(f"{path}: no such file, expected COCO keypoints (.json)")
+    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+    people: dict[Any, list[dict[str, Any]]] = {}
+    size = None
+    for number, file in enumerate(files):
+        with reading(file, "JSON of COCO keypoints"):
+            content = json.loads(file.read_text(encoding="utf-8"))
+            whole = isinstance(content, dict)
+            for image in content.get("images", []) if whole else []:
+                people.setdefault(number if path.is_dir() else image["id"], [])
+                if "height" in image and "width" in image:
+                    size = (int(image["height"]), int(image["width"]))
+            people.setdefault(number, []) if path.is_dir() else None
+            for person in content.get("annotations", []) if whole else content:
+                numbers = person.get("keypoints") if isinstance(person, dict) else None
+                if not isinstance(numbers, list) or len(numbers) != 51:
+                    raise TensorsimError(
+                        f"{file}: got an entry without 17 keypoints, expected 51 numbers each"
+                    )
+                people.setdefault(number if path.is_dir() else person.get("image_id", 0), []).append(person)
+    everybody = [person for frame in people.values() for person in frame]
+    if not everybody:
+        raise TensorsimError(f"{path}: got no keypoints, expected COCO annotations or results")
+    tracked = sum("track_id" in person for person in everybody)
+    if 0 < tracked < len(everybody):
+        raise TensorsimError(
+            f"{path}: got a track_id for {tracked} of {len(everybody)} people, expected one for all or for none"
+        )
+
+    with reading(path, "JSON of COCO keypoints"):
+        frames = [people[frame] for frame in sorted(people)]
+        tracks = sorted({person["track_id"] for person in everybody if tracked})
+        count = len(tracks) or max(len(frame) for frame in frames)
+        data = torch.zeros(len(frames), count, 17, 3)
+        valid = torch.zeros(len(frames), count, dtype=torch.bool)
+        for t, frame in enumerate(frames):
+            for p, person in enumerate(frame):
+                place = tracks.index(person["track_id"]) if tracked else p
+                data[t, place] = torch.tensor(person["keypoints"], dtype=torch.float32).view(17, 3)
+                valid[t, place] = True
+    check_finite(data, str(path))
+    # Annotations flag visibility by 0, 1 or 2; networks write scores.
+    scores = data[..., 2]
+    if bool((scores == scores.round()).all()) and float(scores.max()) <= 2:
+        scores = (scores > 0).float()
+    return Keypoints2D(data[..., :2], scores, valid, size)

@@ -1,0 +1,132 @@
+"""Human3.6M as VideoPose3D publishes it: a pickle inside an npz.
+
+A pickle is a program, and one that builds NumPy's objects from raw bytes can reach any address of the process. Here
+it can name five things only, and each of them is a class of this file that keeps what it is given; the arrays are made
+afterwards, from numbers of plain types.
+"""
+
+import io
+import math
+import pickle
+import pickletools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tensorsim.data.npz import Arrays
+from tensorsim.data.skeletons import Motion, motion_of
+from tensorsim.errors import TensorsimError
+
+#: The joints of Human3.6M's 32 that the body needs, by index.
+H36M_JOINTS = {
+    14: "nose", 25: "right_shoulder", 26: "right_elbow", 27: "right_wrist", 17: "left_shoulder", 18: "left_elbow",
+    19: "left_wrist", 1: "right_hip", 2: "right_knee", 3: "right_ankle", 6: "left_hip", 7: "left_knee", 8: "left_ankle",
+}  # fmt: skip
+H36M_FPS = 50.0
+
+#: Plain numbers; no objects, no structures, no text.
+_NUMBERS = ("f2", "f4", "f8")
+#: Entries of a pickle's memo; the published file has about 3000.
+_MAX_MEMO = 100_000
+
+
+class _Dtype:
+    """What a pickle says of a ``numpy.dtype``."""
+
+    def __init__(self, code: Any = "", *_: Any) -> None:
+        self.code = code
+        self.order = "|"
+
+    def __setstate__(self, state: Any) -> None:
+        # (version, byte order, subarray, names, fields, ...): the last three are there for structured types.
+        self.order = state[1]
+        if any(part is not None for part in state[2:5]):
+            self.code = "a structure"
+
+
+class _Array:
+    """What a pickle says of a ``numpy.ndarray``."""
+
+    def __init__(self, *_: Any) -> None:
+        self.state: tuple[Any, ...] = ()
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = tuple(state)
+
+    def item(self) -> Any:
+        """The only entry of an array of objects without dimensions."""
+        _, shape, dtype, _, content = self.state
+        if dtype.code not in ("O", "O8") or shape != () or not isinstance(content, list):
+            raise pickle.UnpicklingError("it is no dictionary")
+        (item,) = content
+        return item
+
+    def numbers(self) -> np.ndarray:
+        """The array, if it is one of plain numbers and its bytes are as many as its shape needs."""
+        _, shape, dtype, columns_first, content = self.state
+        if dtype.code not in _NUMBERS or dtype.order not in ("<", ">", "="):
+            raise pickle.UnpicklingError(f"an array of {dtype.code!r}, expected one of {', '.join(_NUMBERS)}")
+        plain = np.dtype(dtype.order + dtype.code)
+        raw = content.encode("latin1") if isinstance(content, str) else content
+        if not all(type(n) is int and n >= 0 for n in shape) or len(raw) != math.prod(shape) * plain.itemsize:
+            raise pickle.UnpicklingError(f"an array of shape {shape} from {len(raw)} bytes")
+        return np.frombuffer(raw, plain).reshape(shape, order="F" if columns_first else "C")
+
+
+class _Encoded:
+    """``_codecs.encode(text, "latin1")``, which is how older protocols write bytes."""
+
+    def __new__(cls, text: str, _: str) -> Any:
+        """The bytes themselves."""
+        return text.encode("latin1")
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("a function with a state")
+
+
+class _ArraysOnly(pickle.Unpickler):
+    """Unpickles dictionaries, strings and arrays; whatever else a pickle asks for is refused."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        core = module in ("numpy.core.multiarray", "numpy._core.multiarray")
+        if (core and name == "_reconstruct") or (module, name) == ("numpy", "ndarray"):
+            return _Array
+        if (module, name) == ("numpy", "dtype"):
+            return _Dtype
+        if (module, name) == ("_codecs", "encode"):
+            return _Encoded
+        raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}, expected arrays only")
+
+
+def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) -> Motion:
+    """The clip ``key`` ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+
+    Raises:
+        TensorsimError: a pickle that holds anything but dictionaries of arrays, no such clip.
+    """
+    data = arrays.pickled("positions_3d")
+    try:
+        # A memo is a list as long as its highest index, which one instruction can set to anything.
+        if any(
+            "PUT" in opcode.name and (argument or 0) > _MAX_MEMO
+            for opcode, argument, _ in pickletools.genops(data)
+        ):
+            raise pickle.UnpicklingError("a memo without end")
+        subjects = _ArraysOnly(io.BytesIO(data), encoding="latin1").load().item()
+        clips = {
+            f"{subject}/{action}": clip for subject in subjects for action, clip in subjects[subject].items()
+        }
+    except (AttributeError, EOFError, IndexError, TypeError, ValueError) as error:
+        raise TensorsimError(f"{path}: got positions_3d that hold no dictionary ({error})") from error
+    if key is None and len(clips) == 1:
+        key = next(iter(clips))
+    if key not in clips:
+        shown = ", ".join(list(clips)[:12])
+        raise TensorsimError(f"{path}: got key {key!r}, expected a subject and action such as {shown}")
+    positions = torch.from_numpy(clips[key].numbers().astype(np.float64))
+    if positions.dim() != 3 or positions.shape[1:] != (32, 3):
+        raise TensorsimError(f"{path}: got {key} of shape {list(positions.shape)}, expected (T, 32, 3)")
+    positions = positions[:, list(H36M_JOINTS)]
+    return motion_of(path, positions, tuple(H36M_JOINTS.values()), H36M_FPS if fps is None else fps)

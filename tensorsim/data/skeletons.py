@@ -1,0 +1,134 @@
+"""Skeletons of capture files as the 14 joints of ``tensorsim.JOINTS``.
+
+Skeletons differ in their joints and agree in their names, more or less: names are matched.
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from tensorsim.config import JOINTS
+from tensorsim.errors import TensorsimError, check_finite, check_positive
+
+#: What skeletons call a joint, best first, after the side: Mixamo and CMU name bones by where they start.
+_ALIASES = {
+    "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder"),
+    "elbow": ("elbow", "forearm", "lowerarm", "lowarm"),
+    "wrist": ("wrist", "hand"),
+    "hip": ("upleg", "upperleg", "thigh", "hip"),
+    "knee": ("knee", "lowleg", "lowerleg", "leg", "shin", "calf"),
+    "ankle": ("ankle", "foot"),
+}
+
+
+class Motion(NamedTuple):
+    """People moving in the world.
+
+    Attributes:
+        joints: (P, T, 14, 3) float32 metres, order of ``tensorsim.JOINTS``, x right, y away, z up.
+        valid: (P, T) bool, whether the person is there.
+        fps: frames per second.
+    """
+
+    joints: Tensor
+    valid: Tensor
+    fps: float
+
+
+def body_joints(positions: Tensor, names: tuple[str, ...], top: Tensor | None = None) -> Tensor:
+    """The 14 joints from a skeleton with named joints.
+
+    The neck is the middle of the shoulders. Where no nose is named, it is put before the head: half way to the
+    top of the head and as far to the front, or by the size of a typical head where no ``top`` is known.
+
+    Args:
+        positions: (..., J, 3) world metres.
+        names: J names, sides as "right", "r", "left" or "l" before or after them, in any case and with any prefix.
+        top: (..., 3) top of the head.
+    """
+    index = {plain_name(name): i for i, name in reversed(list(enumerate(names)))}
+
+    def find(joint: str) -> Tensor | None:
+        side, _, kind = joint.partition("_")
+        candidates = [joint]
+        if kind:
+            candidates = [
+                form
+                for alias in _ALIASES[kind]
+                for form in (side + alias, side[0] + alias, alias + side, alias + side[0], side + kind)
+            ]
+        for candidate in candidates:
+            if candidate in index:
+                return positions[..., index[candidate], :]
+        return None
+
+    found = {joint: find(joint) for joint in JOINTS[2:]}
+    head, nose = find("head"), find("nose")
+    missing = [joint for joint, position in found.items() if position is None]
+    if head is None and nose is None:
+        missing.insert(0, "head")
+    if missing:
+        raise TensorsimError(
+            f"joint names: got {', '.join(names)}; expected names for {', '.join(missing)} as well"
+        )
+    limbs = torch.stack([position for position in found.values() if position is not None], dim=-2)
+    right, left = limbs[..., 0, :], limbs[..., 3, :]
+    neck = (right + left) / 2
+    if nose is None:
+        assert head is not None
+        hips = (limbs[..., 6, :] + limbs[..., 9, :]) / 2
+        up = F.normalize(neck - hips if top is None else top - head, dim=-1)
+        front = F.normalize(torch.linalg.cross(up, right - left), dim=-1)
+        size = 0.2 if top is None else (top - head).norm(dim=-1, keepdim=True)
+        nose = head + 0.5 * size * (up * (0.4 if top is None else 1.0) + front)
+    return torch.cat([torch.stack([nose, neck], dim=-2), limbs], dim=-2)
+
+
+def plain_name(name: str) -> str:
+    """A joint's name without prefix, case and punctuation: "mixamorig:RightArm" -> "rightarm"."""
+    name = re.sub(
+        r"^(bip\d*|valvebiped|mixamorig\d*|character\d*)[\s_:.]+", "", name.strip(), flags=re.IGNORECASE
+    )
+    return re.sub(r"[^a-z0-9]", "", name.split(":")[-1].lower())
+
+
+def motion_of(
+    path: Path, positions: Tensor, names: tuple[str, ...], fps: float | None, valid: Tensor | None = None,
+    top: Tensor | None = None,
+) -> Motion:  # fmt: skip
+    """The motion of a file, checked.
+
+    Args:
+        path: the file, for messages.
+        positions: (..., T, J, 3) world metres.
+        names: of the J joints.
+        fps: frames per second.
+        valid: (P, T) bool; None for people who are always there.
+        top: (..., T, 3) top of the head.
+
+    Raises:
+        TensorsimError: no frame rate, no frames, NaN, joints that are missing, ``valid`` of another shape.
+    """
+    if fps is None:
+        raise TensorsimError(f"{path}: got no frame rate in the file, expected one as fps")
+    check_positive(fps, f"{path}: fps")
+    if positions.shape[-3] < 1:
+        raise TensorsimError(f"{path}: got no frames, expected at least one")
+    check_finite(positions, str(path))
+    try:
+        joints = body_joints(positions, names, top)
+    except TensorsimError as error:
+        raise TensorsimError(f"{path}: {error}") from error
+    if joints.dim() == 3:
+        joints = joints[None]
+    if valid is None:
+        valid = torch.ones(joints.shape[:2], dtype=torch.bool)
+    if valid.shape != joints.shape[:2]:
+        raise TensorsimError(
+            f"{path}: got valid of shape {list(valid.shape)}, expected {list(joints.shape[:2])}"
+        )
+    return Motion(joints.float(), valid, float(fps))

@@ -1,0 +1,66 @@
+"""Plausible ranges of physical quantities and counts: one table, which messages quote.
+
+The ranges are wide: they keep out slips of the unit and numbers with which nothing can be computed, not unusual
+radars or people.
+"""
+
+import math
+from typing import NamedTuple
+
+from tensorsim.errors import TensorsimError
+
+
+class Range(NamedTuple):
+    """From ``low`` to ``high``, both included."""
+
+    low: float
+    high: float
+    unit: str
+
+
+RANGES: dict[str, Range] = {
+    # films and motion
+    "frame rate": Range(0.1, 1000.0, "frames per second"),
+    "time": Range(0.0, 1e6, "s"),
+    "stride": Range(1, 100_000, "frames"),
+    "image side": Range(2, 8190, "pixels"),
+    "people": Range(1, 64, "people"),
+    # bodies and places
+    "body height": Range(0.3, 3.0, "m"),
+    "distance": Range(0.1, 1000.0, "m"),
+    "position": Range(-1000.0, 1000.0, "m"),
+    "field of view": Range(1.0, 175.0, "degrees"),
+    "angle": Range(-36_000.0, 36_000.0, "degrees"),
+    # radar
+    "carrier frequency": Range(1e8, 1e12, "Hz"),
+    "bandwidth": Range(1e4, 1e11, "Hz"),
+    "chirp duration": Range(1e-7, 0.1, "s"),
+    "pulse repetition frequency": Range(1.0, 1e6, "Hz"),
+    "sample rate": Range(1e3, 1e10, "Hz"),
+    "samples per chirp": Range(2, 65_536, "samples"),
+    "antennas": Range(1, 64, "antennas"),
+    "gain": Range(-100.0, 100.0, "dB"),
+    "signal-to-noise ratio": Range(-200.0, 300.0, "dB"),
+    # matter
+    "relative permittivity": Range(1.0, 1000.0, "times that of vacuum"),
+    "loss tangent": Range(0.0, 100.0, "(ratio)"),
+    "length": Range(0.0, 1000.0, "m"),
+}
+
+
+def check_range(value: float, quantity: str, option: str) -> None:
+    """Refuse a value outside of the range of its quantity.
+
+    Args:
+        value: the number.
+        quantity: a key of :data:`RANGES`.
+        option: what the value was given as, such as ``"--fps"`` or ``"RadarConfig.prf_hz"``.
+
+    Raises:
+        TensorsimError: NaN, or a value that the range does not contain.
+    """
+    low, high, unit = RANGES[quantity]
+    if math.isnan(value) or not low <= value <= high:
+        raise TensorsimError(
+            f"{option}: got {value:.6g}, expected {quantity} from {low:g} to {high:g} {unit}"
+        )
