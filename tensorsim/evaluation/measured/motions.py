@@ -141,6 +141,14 @@ def at_instants(joints: Tensor, time_s: Tensor) -> Tensor:
     )
 
 
+def linear(values: Tensor, time_s: Tensor) -> Tensor:
+    """Values (N, K, S) at ``KNOT_HZ`` to (N, M, S) at instants (M,), by straight lines."""
+    at = (time_s * KNOT_HZ).clamp(max=values.shape[1] - 1.001)
+    before = torch.floor(at).long()
+    share = (at - before)[:, None].to(values.dtype)
+    return torch.lerp(values.index_select(1, before), values.index_select(1, before + 1), share)
+
+
 def knots(duration_s: float) -> Tensor:
     """Instants of the knots of a clip, with some beyond its end."""
     return torch.arange(round(duration_s * KNOT_HZ) + 8, dtype=torch.float64) / KNOT_HZ
