@@ -240,7 +240,7 @@ _TOPPLING_STEP_S = 0.00025
 _TOPPLING = toppling_angles(_TOPPLING_STEP_S, smooth_s=0.125)
 
 
-def _toppling(since: Tensor, height_m: Tensor) -> Tensor:
+def toppling(since: Tensor, height_m: Tensor) -> Tensor:
     """Degrees from the vertical, ``since`` seconds (B, T) after the fall of bodies of a height (B,) begins."""
     at = since / (height_m[:, None] / 1.75).sqrt() / _TOPPLING_STEP_S
     at = at.clamp(0.0, len(_TOPPLING) - 1.001)
@@ -252,7 +252,7 @@ def walk_to_fall(time: Tensor, who: People) -> Act:
     """Walks, stumbles, topples forward like a rod about the feet, and stays down."""
     v = Vary(who)
     trip = v(1.55)
-    down = _toppling(time - trip, who.height_m) / 88
+    down = toppling(time - trip, who.height_m) / 88
     give = bell(time, trip, trip + 1.1)
     arms = 2 + 170 * minimum_jerk(down)
     rest = 1 - 0.4 * down

@@ -1,0 +1,1 @@
+"""How far networks that saw simulated radar only go on measured radar."""

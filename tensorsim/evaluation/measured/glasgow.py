@@ -1,0 +1,186 @@
+"""Glasgow, 5.8 GHz FMCW: CFAR masks of Doppler-time maps of six activities.
+
+The measured masks were made by others (2-D cell-averaging CFAR on the decibels of the spectrogram, 256 x 256, a whole
+clip). The simulation repeats their chain: sweeps, high-pass over pulses, short-time Fourier transform of every range
+bin, sum of bins, decibels, CFAR.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from tensorsim.config import RadarConfig
+from tensorsim.evaluation.measured.motions import (
+    Draw,
+    Unrest,
+    act_out,
+    add_unrest,
+    at_instants,
+    knots,
+    linear,
+    place,
+    stage_people,
+    to_and_fro,
+)
+from tensorsim.motion.exercises import drink, fall_down, pick_up
+from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.people import PeopleConfig
+from tensorsim.motion.scripts import sit_down, stand_up, walk
+from tensorsim.radar.processing.cfar import CfarDetector
+from tensorsim.radar.processing.doppler import DopplerTimeMap
+from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
+
+CLASSES = ("walking", "sitting_down", "standing_up", "pick_up", "drinking", "falling")
+
+#: Every other sweep of the measured 1000 per second: nobody is beyond +-250 Hz (6.3 m/s), and half the work remains.
+RADAR = RadarConfig(
+    carrier_hz=5.8e9,
+    bandwidth_hz=400e6,
+    chirp_s=1e-3,
+    prf_hz=500.0,
+    sample_rate_hz=128e3,
+    tx_m=(-0.2, 0.0, 1.0),
+    rx_m=(0.2, 0.0, 1.0),
+    antenna_gain_dbi=17.0,
+    isolation_db=40.0,
+)
+#: Rows of the measured masks (3.9 Hz each) within +-250 Hz.
+ROWS = slice(64, 192)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What the simulation has beside bodies that move, each to be left out for an ablation."""
+
+    to_and_fro: bool = True
+    unrest: bool = True
+    residue: bool = True
+    lines: bool = True
+    dim_limbs: bool = True
+    levels: bool = True
+    image: bool = True
+
+
+class Glasgow:
+    """Simulated and measured masks; rows ascend from approaching to receding, as in the files."""
+
+    def __init__(self, effects: Effects | None = None) -> None:
+        self.effects = Effects() if effects is None else effects
+        profile = RangeProfile(RADAR, window=None, gate_m=(3.4, 7.6))
+        self.bins = profile.last_bin - profile.first_bin + 1
+        self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
+        self.scatterers = LimbScatterers(RADAR.tx_m, RADAR.rx_m, per_segment=2)
+        self.mti = MovingTargetIndicator("high-pass", RADAR, cutoff_m_s=3.75 * RADAR.doppler_wavelength_m / 2)
+        self.maps = DopplerTimeMap(RADAR, window_s=0.2, overlap=0.9)
+        self.cfar = CfarDetector(
+            guard=(10, 2), training=(50, 10), false_alarm=0.31, edges=("reflect", "circular")
+        )
+
+    def motion(self, label: int, count: int, generator: torch.Generator) -> tuple[Tensor, float]:
+        """Joints (count, K, 14, 3) at ``KNOT_HZ`` and the length of the clips in s."""
+        draw = Draw(count, generator)
+        config = PeopleConfig(heading_rad=0.4, facing_radar_share=1.0, speed_m_s=(0.7, 1.35))
+        people = stage_people(count, draw, config, None)
+        range_m = draw(4.2, 5.6)
+        if label == 0:
+            duration = 10.0
+            time = knots(duration).expand(count, -1)
+            people = people._replace(
+                heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5)
+            )
+            leg = draw(1.6, 3.2)
+            if self.effects.to_and_fro:
+                joints = to_and_fro(walk, time, people, draw, leg, draw(0.9, 2.2), draw(0.0, 1.0) * leg)
+            else:
+                joints = act_out(walk, time, people)
+            y = joints[:, :, (8, 11), 1].mean(-1)
+            joints = place(joints, draw(-0.3, 0.3), range_m + 0.4 + y[:, :1] - y.mean(1, keepdim=True))
+        else:
+            duration = 5.0
+            time = knots(duration).expand(count, -1)
+            script, first_s, start, rate = {
+                1: (sit_down, 0.8, (0.3, 2.6), (0.85, 1.7)),
+                2: (stand_up, 0.7, (0.2, 2.2), (0.85, 1.7)),
+                3: (pick_up, 0.0, (-0.1, 2.2), (0.75, 1.5)),
+                4: (drink, 0.0, (-0.2, 1.8), (0.7, 1.5)),
+                5: (fall_down, 0.0, (-0.1, 2.6), (0.55, 1.1)),
+            }[label]
+            joints = act_out(script, (time - draw(*start)) * draw(*rate) + first_s, people)
+            joints = place(joints, draw(-0.3, 0.3), range_m)
+        if self.effects.unrest:
+            joints = add_unrest(joints, draw, Unrest((0.002, 0.015), (0.0, 0.07)))
+        return joints, duration
+
+    def masks(self, joints: Tensor, duration: float, generator: torch.Generator) -> Tensor:
+        """Masks (N, 128, 256) bool of people (N, K, 14, 3)."""
+        draw = Draw(joints.shape[0], generator)
+        pulses = round(duration * RADAR.prf_hz)
+        at = torch.arange(pulses, dtype=torch.float64) / RADAR.prf_hz
+        positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
+        if self.effects.dim_limbs:
+            gain_db = draw(-16.0, 0.0) + 3 * draw.normal(len(SEGMENTS))
+            gain_db[:, 1] = 0.0  # the torso
+            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+        positions, rcs = at_instants(positions, at), linear(rcs, at)
+        echo = self.echo(positions, rcs)
+        echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
+        signal_db = draw(28.0, 48.0) if self.effects.levels else draw(38.0, 38.0)
+        if self.effects.image:
+            # Both senses of motion in each frame: the image of imperfect quadrature and of scattered paths.
+            image_db = draw(-34.0, -8.0)
+            echo = echo + 10 ** (image_db / 20).float().unsqueeze(-1) * echo.conj()
+        x = echo * 10 ** (signal_db / 20).float().unsqueeze(-1)
+        x = x + self._receiver(draw, pulses)
+        moving = self.mti(x.to(torch.complex64))
+        level_db = draw(45.0, 75.0) if self.effects.levels else draw(60.0, 60.0)
+        return self._detected(self.maps(moving), level_db)
+
+    def _receiver(self, draw: Draw, pulses: int) -> Tensor:
+        """White noise of power 1, residue of what stands still, and lines at fixed Doppler (N, M, R)."""
+        shape = (pulses, self.bins)
+        noise = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float()) / 2**0.5
+        rate = RADAR.prf_hz
+        frequency = torch.fft.fftfreq(pulses, 1 / rate)
+        if self.effects.residue:
+            # Phase noise of antenna leakage, walls and furniture, highest next to the carrier.
+            corner, strength_db = draw(3.0, 7.0).float(), draw(14.0, 38.0).float()
+            spectrum = 10 ** (strength_db / 20) / (1 + (frequency / corner).abs() ** 3)
+            white = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float())
+            noise = noise + torch.fft.ifft(torch.fft.fft(white, dim=1) * spectrum[..., None], dim=1) / 2**0.5
+        if self.effects.lines:
+            time = torch.arange(pulses) / rate
+            for base, chance in ((100.0, 0.5), (124.0, 0.25)):
+                on = (draw(0, 1) < chance).float()
+                hz = (base + draw(-6.0, 6.0)).float()
+                for order in (-2, -1, 1, 2):
+                    db = draw(-22.0, -4.0).float() - 5 * (abs(order) - 1)
+                    tone = torch.exp(2j * torch.pi * (order * hz * time + draw(0, 1).float()))
+                    noise = noise + (on * 10 ** (db / 20) * tone)[..., None]
+        return noise
+
+    def _detected(self, maps: Tensor, level_db: Tensor) -> Tensor:
+        """CFAR on the decibels of maps (N, F, K), resized to 128 x 256."""
+        db = 20 * maps.clamp(min=1e-6).log10()
+        db = db - db.median(dim=-1)[0].median(dim=-1)[0][:, None, None] + level_db.float().unsqueeze(-1)
+        db = F.interpolate(db.flip(-2)[:, None], (128, 256), mode="bilinear", antialias=True)[:, 0]
+        return self.cfar(db.clamp(min=0.0))
+
+    def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:
+        """Masks (count, 128, 256) bool of one class."""
+        joints, duration = self.motion(label, count, generator)
+        return self.masks(joints, duration, generator)
+
+
+def read(folder: Path) -> tuple[Tensor, Tensor]:
+    """Masks (N, 128, 256) bool and labels (N,) of a folder of measured masks."""
+    with np.load(folder / "masks.npz") as file:
+        masks = torch.from_numpy(np.unpackbits(file["dt_packed"], axis=-1).astype(bool))
+        labels = torch.from_numpy(file["label"].astype(np.int64))
+    return masks[:, ROWS], labels

@@ -1,0 +1,154 @@
+"""People who move as those before the measured radars did, at any instants."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tensorsim.body.kinematics import rotation
+from tensorsim.body.skeleton import mirror
+from tensorsim.motion.activities import perform
+from tensorsim.motion.act import Act
+from tensorsim.motion.people import People, PeopleConfig, draw_people
+from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature
+
+#: Joints are worked out at this rate and interpolated by a C2 spline.
+KNOT_HZ = 120.0
+
+Script = Callable[[Tensor, People], Act]
+
+
+class Draw:
+    """Uniform and normal random numbers (N, 1) float64, from one generator."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        self.count, self.generator = count, generator
+
+    def __call__(self, low: float, high: float, columns: int = 1) -> Tensor:
+        """Uniform (N, columns)."""
+        share = torch.rand(self.count, columns, generator=self.generator, dtype=torch.float64)
+        return low + (high - low) * share
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal (N, *shape)."""
+        return torch.randn(self.count, *shape, generator=self.generator, dtype=torch.float64)
+
+
+def smooth_noise(draw: Draw, frames: int, rate_hz: float, band_hz: Tensor, columns: int) -> Tensor:
+    """Gaussian noise (N, frames, columns) of deviation 1 with the spectrum ``1 / (1 + (f / band)^4)``, band (N, 1)."""
+    white = draw.normal(frames, columns)
+    frequency = torch.fft.rfftfreq(frames, 1 / rate_hz, dtype=torch.float64)
+    shape = 1 / (1 + (frequency / band_hz) ** 4)
+    noise = torch.fft.irfft(torch.fft.rfft(white, dim=1) * shape[..., None].sqrt(), n=frames, dim=1)
+    return noise / noise.std(dim=1, keepdim=True).clamp(min=1e-9)
+
+
+@dataclass(frozen=True)
+class Unrest:
+    """Small movements that people make besides what they do.
+
+    Attributes:
+        sway_m: deviation of the whole body, (low, high).
+        limbs_m: deviation of wrists, less of elbows and head, (low, high).
+    """
+
+    sway_m: tuple[float, float] = (0.002, 0.008)
+    limbs_m: tuple[float, float] = (0.0, 0.03)
+
+
+#: How much of the limbs' unrest each of the 14 joints takes part in.
+_LIMB_SHARE = (0.5, 0.2, 0.2, 0.6, 1.0, 0.2, 0.6, 1.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.0)
+
+
+def add_unrest(joints: Tensor, draw: Draw, unrest: Unrest) -> Tensor:
+    """Sway of the body and unrest of the limbs on top of joints (N, K, 14, 3) at ``KNOT_HZ``."""
+    frames = joints.shape[1]
+    sway = smooth_noise(draw, frames, KNOT_HZ, draw(0.2, 0.6), 3) * draw(*unrest.sway_m)[..., None]
+    limbs = smooth_noise(draw, frames, KNOT_HZ, draw(0.3, 1.0), 14 * 3).unflatten(-1, (14, 3))
+    share = torch.tensor(_LIMB_SHARE, dtype=torch.float64)[:, None]
+    height = (joints[..., 2:] / 1.4).clamp(0.0, 1.0)  # feet stand
+    lively = draw(*unrest.limbs_m)[..., None, None] * draw(0.0, 1.0)[..., None, None]
+    return joints + height * sway[:, :, None] + lively * share * limbs
+
+
+def stage_people(count: int, draw: Draw, config: PeopleConfig, speed_m_s: tuple[float, float] | None) -> People:
+    """Draw people; speeds beyond those of ``PeopleConfig`` by ``speed_m_s``."""
+    people = draw_people(count, config, draw.generator)
+    if speed_m_s is not None:
+        people = people._replace(speed_m_s=draw(*speed_m_s)[:, 0])
+    return people
+
+
+def act_out(script: Script, time: Tensor, people: People) -> Tensor:
+    """Joints (N, K, 14, 3) of people who follow a script from the origin, heading as drawn, half of them mirrored."""
+    joints = perform(script, time, people)
+    joints = torch.where(people.left_handed[:, None, None, None], mirror(joints), joints)
+    return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
+
+
+def place(joints: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
+    """Move people (N, K, 14, 3) to (N, 1) x and y at the first knot."""
+    hips = joints[:, :1, (8, 11), :].mean(dim=2)
+    shift = torch.stack([x_m - hips[..., 0], y_m - hips[..., 1], torch.zeros_like(x_m)], dim=-1)
+    return joints + shift[:, :, None]
+
+
+def to_and_fro(
+    script: Script, time: Tensor, people: People, draw: Draw, leg_m: Tensor, turn_s: Tensor, first_m: Tensor
+) -> Tensor:
+    """People (N, K, 14, 3) who go straight for ``leg_m``, turn round in ``turn_s`` and come back, and so on.
+
+    Args:
+        script: a gait along +y at the person's speed.
+        time: (N, K) s.
+        people: N people; their heading is that at the start.
+        draw: random numbers.
+        leg_m, turn_s: (N, 1).
+        first_m: (N, 1) of the first leg gone at time 0.
+    """
+    speed = people.speed_m_s[:, None]
+    straight = leg_m / speed
+    cycle = straight + turn_s
+    since = time + first_m / speed
+    number = torch.floor(since / cycle)
+    within = since - number * cycle
+    turning = ((within - straight) / turn_s).clamp(0.0, 1.0)
+    eased = turning**2 * (3 - 2 * turning)
+    sense = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0)
+    heading = math.pi * (number + eased) * sense
+    # Slower through the turn: the clock of the gait runs at this pace.
+    pace = 1 - draw(0.55, 0.9) * torch.sin(math.pi * turning).square()
+    step = 1 / KNOT_HZ
+    clock = torch.cumsum(pace, dim=1) * step
+    joints = perform(script, clock, people)
+    gone = speed * clock
+    velocity = speed * pace
+    x = torch.cumsum(-velocity * torch.sin(heading), dim=1) * step
+    y = torch.cumsum(velocity * torch.cos(heading), dim=1) * step
+    back = torch.stack([torch.zeros_like(gone), -gone, torch.zeros_like(gone)], dim=-1)
+    turned = (rotation(2, heading)[:, :, None] @ (joints + back[:, :, None])[..., None])[..., 0]
+    path = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
+    joints = turned + path[:, :, None]
+    return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
+
+
+def at_instants(joints: Tensor, time_s: Tensor) -> Tensor:
+    """Joints (N, K, 14, 3) at ``KNOT_HZ`` to (N, M, 14, 3) at instants (M,) s after the first."""
+    return evaluate_cubic(
+        joints, natural_spline_curvature(joints, 1 / KNOT_HZ), 1 / KNOT_HZ, time_s.double() * KNOT_HZ
+    )
+
+
+def linear(values: Tensor, time_s: Tensor) -> Tensor:
+    """Values (N, K, S) at ``KNOT_HZ`` to (N, M, S) at instants (M,), by straight lines."""
+    at = (time_s * KNOT_HZ).clamp(max=values.shape[1] - 1.001)
+    before = torch.floor(at).long()
+    share = (at - before)[:, None].to(values.dtype)
+    return torch.lerp(values.index_select(1, before), values.index_select(1, before + 1), share)
+
+
+def knots(duration_s: float) -> Tensor:
+    """Instants of the knots of a clip, with some beyond its end."""
+    return torch.arange(round(duration_s * KNOT_HZ) + 8, dtype=torch.float64) / KNOT_HZ

@@ -1,0 +1,310 @@
+"""More movements than the twelve activities: everyday ones, ways of going, and gymnastics.
+
+Scripts as in :mod:`.scripts`: joint angles over time, one function per movement. They take any times: those that
+happen once begin at 0 and stay as they ended, the others go on for as long as they are asked.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot
+from tensorsim.motion.people import People
+from tensorsim.motion.scripts import toppling
+from tensorsim.motion.timing import bell, segment
+
+#: Gravity in m/s^2.
+_GRAVITY = 9.81
+#: Softness of the change from one carrying leg to the other, 1/m.
+_LEG_SHARPNESS = 60.0
+
+
+def _there_and_back(time: Tensor, out: Tensor, hold: Tensor, back: Tensor) -> Tensor:
+    """From 0 to 1 in ``out`` seconds from time 0, there for ``hold``, and back in ``back``."""
+    zero = torch.zeros_like(out)
+    return segment(time, zero, out) - segment(time, out + hold, out + hold + back)
+
+
+def _cycle_share(time: Tensor, period: Tensor, who: People) -> Tensor:
+    """Where in a movement that repeats a person is, in [0, 1)."""
+    return torch.remainder(time / period + who.gait_phase[:, None], 1.0)
+
+
+def pick_up(time: Tensor, who: People) -> Act:
+    """Picks something up from the floor and stands again; some stoop and some squat."""
+    v = Vary(who)
+    down = _there_and_back(time, v(1.1), v(0.3), v(1.2))
+    squat = (0.5 + (v(1.0) - 1) / 0.25).clamp(0.0, 1.0)
+    knee = REST_KNEE + (v(30.0) + 80 * squat - REST_KNEE) * down
+    hip = REST_HIP + (8 + 70 * squat - REST_HIP) * down
+    bow = v(80.0) - 35 * squat
+    pose = make_pose(
+        time,
+        who,
+        pitch=bow * down,
+        nod=-0.3 * bow * down,
+        hip=(hip, hip),
+        knee=(knee, knee),
+        flexion=(2 + v(70.0) * down, 2 + v(30.0) * down),
+        elbow=(12 + 5 * down, 12 + v(20.0) * down),
+    )
+    return on_the_spot(time, pose)
+
+
+def drink(time: Tensor, who: People) -> Act:
+    """Lifts a cup to the mouth, tips head and cup back, and puts the hand down again."""
+    v = Vary(who)
+    out, hold, back = v(1.0), v(1.2), v(1.0)
+    up = _there_and_back(time, out, hold, back)
+    tip = bell(time, 0.8 * out, out + hold + 0.2 * back)
+    pose = make_pose(
+        time,
+        who,
+        pitch=v(6.0) * up - v(8.0) * tip,
+        twist=v(8.0) * up,
+        nod=-v(18.0) * tip,
+        flexion=(2 + v(48.0) * up + v(12.0) * tip, 2.0),
+        abduction=(8 + v(15.0) * up, 8.0),
+        inward=(15 + v(30.0) * up, 15.0),
+        elbow=(12 + v(112.0) * up + 6 * tip, 12.0),
+    )
+    return on_the_spot(time, pose)
+
+
+def fall_down(time: Tensor, who: People) -> Act:
+    """Gives way at the knees and topples forward like a rod about the feet, from standing; stays down."""
+    v = Vary(who)
+    down = toppling(time, who.height_m) / 88
+    give = bell(time, 0.0 * v(1.0), v(1.1))
+    arms = 2 + v(110.0) * down
+    rest = 1 - 0.4 * down
+    pose = make_pose(
+        time,
+        who,
+        lean=88 * down,
+        pitch=v(12.0) * give,
+        nod=-40 * down,
+        hip=(rest * REST_HIP + v(25.0) * give, rest * REST_HIP + v(22.0) * give),
+        knee=(rest * REST_KNEE + v(45.0) * give, rest * REST_KNEE + v(40.0) * give),
+        flexion=(arms, arms),
+        elbow=(12 + v(40.0) * down, 12 + v(40.0) * down),
+    )
+    act = on_the_spot(time, pose)
+    upright = 1 - segment(time, 0.0 * v(1.0) + 0.3, v(0.9))
+    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+
+
+def squat(time: Tensor, who: People) -> Act:
+    """Knee bends with the arms stretched forward, one after the other."""
+    v = Vary(who)
+    down = torch.sin(math.pi * _cycle_share(time, v(2.6), who)).square()
+    knee, hip = REST_KNEE + v(85.0) * down, REST_HIP + v(62.0) * down
+    pose = make_pose(
+        time,
+        who,
+        pitch=v(30.0) * down,
+        hip=(hip, hip),
+        knee=(knee, knee),
+        flexion=(2 + v(80.0) * down, 2 + v(80.0) * down),
+    )
+    return on_the_spot(time, pose)
+
+
+def jump(time: Tensor, who: People) -> Act:
+    """Jumps on the spot, one after the other: bends the knees, takes off, lands."""
+    v = Vary(who)
+    height = v(0.12)
+    flight = 2 * (2 * height / _GRAVITY).sqrt()
+    period = v(0.95)
+    since = period * _cycle_share(time, period, who) - 0.5 * period
+    aloft = (1 - (2 * since / flight).square()).clamp(min=0.0)
+    dip = bell(since, -0.5 * period, -0.5 * flight + 0.04) + bell(since, 0.5 * flight - 0.04, 0.5 * period)
+    knee, hip = REST_KNEE + v(38.0) * dip, REST_HIP + v(26.0) * dip
+    pose = make_pose(
+        time,
+        who,
+        pitch=v(12.0) * dip,
+        hip=(hip, hip),
+        knee=(knee, knee),
+        flexion=(2 + v(25.0) * dip, 2 + v(25.0) * dip),
+        elbow=(35.0, 35.0),
+    )
+    return _in_the_air(on_the_spot(time, pose), height * aloft)
+
+
+def jumping_jack(time: Tensor, who: People) -> Act:
+    """Jumps with arms and legs apart and together, the arms meeting over the head."""
+    v = Vary(who)
+    period, height = v(1.05), v(0.04)
+    share = _cycle_share(time, period, who)
+    apart = torch.sin(math.pi * share).square()
+    arms = 8 + v(140.0) * apart
+    spread = math.radians(1.0) * v(19.0) * apart
+    pose = make_pose(time, who, abduction=(arms, arms), inward=(0.0, 0.0), elbow=(18.0, 18.0))
+    legs = torch.stack([spread, spread], dim=-1)
+    pose = pose._replace(hip=torch.stack([pose.hip[..., 0], legs], dim=-1))
+    return _in_the_air(on_the_spot(time, pose), height * torch.sin(2 * math.pi * share).square())
+
+
+def _in_the_air(act: Act, height_m: Tensor) -> Act:
+    """Raise a body by ``height_m`` (B, T); nothing holds its feet."""
+    zero = torch.zeros_like(height_m)
+    return act._replace(
+        offset=torch.stack([zero, zero, height_m], dim=-1), hold=torch.zeros_like(act.hold), level=zero
+    )
+
+
+def box(time: Tensor, who: People) -> Act:
+    """Boxes: straight punches right and left in turn out of a low stance, the trunk turning and swaying along."""
+    v = Vary(who)
+    every = v(0.55)
+    beat = torch.remainder(time + 2 * every * who.gait_phase[:, None], 2 * every)
+
+    def fist(start: Tensor | float) -> Tensor:
+        since = torch.remainder(beat - start, 2 * every)
+        out, back = 0.34 * every, 0.46 * every
+        return segment(since, 0 * out, out) - segment(since, out, out + back)
+
+    right, left = fist(0.0), fist(every)
+    twist = v(28.0) * (right - left)
+    bent = v(24.0)
+    sway = v(0.05) * torch.sin(math.pi * time / every + 2 * math.pi * who.gait_phase[:, None])
+    guard, fold = v(40.0), v(118.0)
+    pose = make_pose(
+        time,
+        who,
+        pitch=v(10.0) + 4 * (right + left),
+        twist=twist,
+        look=-twist,
+        hip=(bent / 2, bent / 2),
+        knee=(bent, bent),
+        flexion=(guard + 48 * right, guard + 48 * left),
+        abduction=(14 * (1 - right), 14 * (1 - left)),
+        inward=(25 * (1 - right), 25 * (1 - left)),
+        elbow=(fold - 105 * right, fold - 105 * left),
+    )
+    zero = torch.zeros_like(time)
+    return on_the_spot(time, pose)._replace(offset=torch.stack([zero, sway, zero], dim=-1))
+
+
+def _step_out(
+    time: Tensor,
+    who: People,
+    cycle_s: Tensor,
+    *,
+    fold: Tensor,
+    bent: Tensor,
+    arms: Tensor,
+    elbow: Tensor,
+    pitch: Tensor,
+    stance: float,
+    flight_m: Tensor | float = 0.0,
+) -> Act:
+    """A gait along +y at the person's speed.
+
+    A foot that stands goes evenly back under the hips, at the speed of the body; in the rest of the cycle it comes
+    forward on the cubic that goes on with that speed at both ends. The lower foot is on the floor.
+
+    Args:
+        time: (B, T) s.
+        who: B people.
+        cycle_s: (B, 1) length of a cycle, two steps.
+        fold: (B, 1) degrees by which the knee of the swinging leg bends further.
+        bent: (B, 1) degrees of the bent knees that carry the body.
+        arms: (B, 1) degrees to which the upper arms swing to either side.
+        elbow, pitch: (B, 1) degrees.
+        stance: the part of a cycle that a foot stands.
+        flight_m: (B, 1) height of the flight between two steps, of a gait with ``stance`` below one half.
+    """
+    phase = torch.stack([time / cycle_s, time / cycle_s + 0.5], dim=-1) + who.gait_phase[:, None, None]
+    at = torch.remainder(phase, 1.0)
+    thigh, shank = (torch.as_tensor(x)[:, None] * who.height_m[:, None] for x in who.proportions[1::-1])
+    half = 0.5 * stance * who.speed_m_s[:, None] * cycle_s / (thigh + shank)  # half of a step, in leg lengths
+    half = half.clamp(max=0.62)[..., None]
+    swung = ((at - stance) / (1 - stance)).clamp(min=0.0)
+    slope = -2 * (1 - stance) / stance
+    forward = -1 + slope * swung + (6 - 3 * slope) * swung**2 + (2 * slope - 4) * swung**3
+    ahead = half * torch.where(at < stance, 1 - 2 * at / stance, forward)
+    knee = bent[..., None] + fold[..., None] * torch.sin(math.pi * swung) ** 2
+    hip = torch.rad2deg(torch.asin(ahead.clamp(-0.9, 0.9))) + 0.45 * knee
+    back = arms[..., None] * torch.cos(2 * math.pi * phase)
+    twist = 0.2 * arms * torch.cos(2 * math.pi * phase[..., 0])
+    pose = make_pose(
+        time,
+        who,
+        pitch=pitch,
+        twist=twist,
+        look=-twist,
+        hip=(hip[..., 0], hip[..., 1]),
+        knee=(knee[..., 0], knee[..., 1]),
+        flexion=(5 - back[..., 0], 5 - back[..., 1]),
+        elbow=(elbow, elbow),
+    )
+    carried = make_pose(time, who, hip=(0.5 * bent, 0.5 * bent), knee=(bent, bent))
+
+    def reach(hip: Tensor, knee: Tensor) -> Tensor:
+        """How far down an ankle is from the hips."""
+        hip, knee = torch.deg2rad(hip), torch.deg2rad(knee)
+        return thigh[..., None] * torch.cos(hip) + shank[..., None] * torch.cos(hip - knee)
+
+    lowest = torch.logsumexp(_LEG_SHARPNESS * reach(hip, knee), dim=-1) / _LEG_SHARPNESS
+    rise = lowest - reach(0.5 * bent[..., None], bent[..., None])[..., 0]
+    if stance < 0.5:
+        rise = rise + flight_m * torch.sin(math.pi * _flight_share(at[..., 0], stance)).square()
+    zero = torch.zeros_like(time)
+    act = on_the_spot(time, pose)
+    return act._replace(
+        stance=carried,
+        offset=torch.stack([zero, zero, rise], dim=-1),
+        path=who.speed_m_s[:, None] * time,
+        hold=torch.zeros_like(act.hold),
+    )
+
+
+def _flight_share(at: Tensor, stance: float) -> Tensor:
+    """Share of the flight gone, 0 while a foot stands, at places of the cycle of the right leg."""
+    return ((torch.remainder(at, 0.5) - stance) / (0.5 - stance)).clamp(0.0, 1.0)
+
+
+def run(time: Tensor, who: People) -> Act:
+    """Runs: short contact with the floor, folded swinging legs, bent elbows."""
+    v = Vary(who)
+    return _step_out(
+        time, who, v(0.72), fold=v(62.0), bent=v(28.0), arms=v(30.0), elbow=v(85.0), pitch=v(9.0), stance=0.36,
+        flight_m=v(0.05),
+    )  # fmt: skip
+
+
+def stride(time: Tensor, who: People) -> Act:
+    """Strides: long, brisk steps with arms that swing far."""
+    v = Vary(who)
+    cycle = v(1.1) * (1.7 / who.speed_m_s[:, None]).clamp(0.7, 1.3)
+    return _step_out(
+        time, who, cycle, fold=v(45.0), bent=v(14.0), arms=v(36.0), elbow=v(22.0), pitch=v(4.0), stance=0.58
+    )
+
+
+def creep(time: Tensor, who: People) -> Act:
+    """Sneaks on foot: short slow steps on bent knees, bowed, the arms still."""
+    v = Vary(who)
+    cycle = v(1.15) * (0.75 / who.speed_m_s[:, None]).clamp(0.7, 1.4)
+    return _step_out(
+        time, who, cycle, fold=v(34.0), bent=v(30.0), arms=v(5.0), elbow=v(45.0), pitch=v(18.0), stance=0.62
+    )
+
+
+#: The movements of this file by name.
+EXERCISES: dict[str, Callable[[Tensor, People], Act]] = {
+    "picking up": pick_up,
+    "drinking": drink,
+    "falling": fall_down,
+    "squats": squat,
+    "jumping": jump,
+    "jumping jacks": jumping_jack,
+    "boxing": box,
+    "running": run,
+    "striding": stride,
+    "creeping": creep,
+}

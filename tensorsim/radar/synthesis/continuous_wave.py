@@ -1,0 +1,74 @@
+"""Echoes before a radar of one constant frequency: no range, one complex number at each instant."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import SPEED_OF_LIGHT_M_S, Vector
+from tensorsim.errors import check_positive
+from tensorsim.motion.scatterers import check_antenna
+from tensorsim.radar.synthesis.echo import check_scene, phasor
+
+
+def continuous_wave(path_m: Tensor, amplitude: Tensor, wavelength_m: float) -> Tensor:
+    """``sum over scatterers of a exp(+j 2 pi R / lambda)``, transmitted times conjugate received wave.
+
+    Args:
+        path_m: (..., S) float64 R, from the transmitter over the scatterer to the receiver.
+        amplitude: (..., S) a.
+        wavelength_m: lambda.
+
+    Returns:
+        (...) complex in the precision of ``amplitude``; the phase of an approaching target decreases.
+    """
+    cycles = path_m / wavelength_m
+    # Whole cycles go in float64: a phase in float32 would leave a floor near -60 dB.
+    return (amplitude * phasor((cycles - cycles.round()).to(amplitude.dtype))).sum(-1)
+
+
+class ContinuousWaveEcho(nn.Module):
+    """What a continuous-wave radar receives of a scene, mixed to baseband, free of noise.
+
+    Equals the first sample of each pulse of :class:`~tensorsim.radar.EchoSynthesizer` with the same carrier and
+    antennas in free space. Instants are those of the positions and need not be evenly spaced.
+
+    Args:
+        carrier_hz: transmitted frequency.
+        tx_m, rx_m: transmitter and receiver in metres.
+        antenna_gain_dbi: of each antenna, the same in all directions.
+
+    Shapes: positions (..., M, S, 3) m and rcs (..., S), (..., M, S) or (S,) m^2 -> (..., M) complex64, or complex128
+    after ``.double()``. Differentiable by both.
+
+    Raises:
+        TensorsimError: a carrier that is not positive, an antenna without three finite numbers, shapes that do not go
+            together.
+    """
+
+    tx: Tensor
+    rx: Tensor
+    precision: Tensor
+
+    def __init__(
+        self, carrier_hz: float, tx_m: Vector, rx_m: Vector, antenna_gain_dbi: float = 0.0
+    ) -> None:
+        super().__init__()
+        check_positive(carrier_hz, "carrier_hz")
+        check_antenna("tx_m", tx_m)
+        check_antenna("rx_m", rx_m)
+        self.wavelength_m = SPEED_OF_LIGHT_M_S / carrier_hz
+        gain = 10 ** (antenna_gain_dbi / 10)
+        self.scale = gain * self.wavelength_m / (4 * math.pi) ** 1.5
+        self.register_buffer("tx", torch.tensor(tx_m, dtype=torch.float64), persistent=False)
+        self.register_buffer("rx", torch.tensor(rx_m, dtype=torch.float64), persistent=False)
+        self.register_buffer("precision", torch.zeros(()), persistent=False)
+
+    def forward(self, positions: Tensor, rcs: Tensor) -> Tensor:
+        """Scatterers (..., M, S, 3) m with (..., M, S) m^2 to the baseband signal (..., M)."""
+        rcs = check_scene(positions, rcs)
+        exact = positions.double()
+        there = (exact - self.tx.double()).norm(dim=-1)
+        back = (exact - self.rx.double()).norm(dim=-1)
+        amplitude = self.scale * rcs.double().clamp(min=0.0).sqrt() / (there * back)
+        return continuous_wave(there + back, amplitude.to(self.precision.dtype), self.wavelength_m)
