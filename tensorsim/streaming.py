@@ -7,7 +7,7 @@ from tqdm import tqdm
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
-from tensorsim.types import Detections, Pose, RadarMaps
+from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 
 
 def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
@@ -20,6 +20,21 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
 
     Returns:
         The Pose of one clip (B = 1) on the CPU; equal to ``stage(video, fps)`` of the whole film.
+
+    Raises:
+        TensorsimError: the film has fewer than 2 frames.
+    """
+    detections, observed = detections_of_film(stage, reader, device, quiet)
+    tracks = stage.follow(detections, observed)
+    keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet)
+    pose = stage.lift(tracks, keypoints, scores, reader.height, reader.width, reader.fps)
+    return Pose(*(field.cpu() for field in pose))
+
+
+def detections_of_film(
+    stage: VideoToPose, reader: VideoReader, device: torch.device, quiet: bool = False
+) -> tuple[Detections, Tensor]:
+    """Detections (n, K) of the observed frames of a film, and which frames were observed (1, T).
 
     Raises:
         TensorsimError: the film has fewer than 2 frames.
@@ -44,25 +59,26 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
     if (count - 1) % interval:
         found.append(stage.detect(last.to(device)))
     whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-    observed = stage.observed_frames(stage.frames_present(1, count, None, whole.boxes.device))
-    tracks = stage.follow(whole, observed)
+    return whole, stage.observed_frames(stage.frames_present(1, count, None, whole.boxes.device))
 
+
+def keypoints_of_film(
+    stage: VideoToPose, reader: VideoReader, tracks: Tracks, device: torch.device, quiet: bool = False
+) -> tuple[Tensor, Tensor]:
+    """COCO keypoints (1, P, T, 17, 2) of tracked people of a film and their scores (1, P, T, 17)."""
     boxes, valid = tracks.boxes[0].transpose(0, 1), tracks.valid[0].transpose(0, 1)
     keypoints: list[Tensor] = []
     scores: list[Tensor] = []
     done = 0
-    with progress_bar("pose", count, quiet) as bar:
-        for frames in reader.chunks(size):
+    with progress_bar("pose", boxes.shape[0], quiet) as bar:
+        for frames in reader.chunks(stage.frames_per_batch):
             stop = done + frames.shape[0]
             k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
             keypoints.append(k)
             scores.append(s)
             done = stop
             bar.update(frames.shape[0])
-    all_keypoints = torch.cat(keypoints).transpose(0, 1).unsqueeze(0)
-    all_scores = torch.cat(scores).transpose(0, 1).unsqueeze(0)
-    pose = stage.lift(tracks, all_keypoints, all_scores, reader.height, reader.width, reader.fps)
-    return Pose(*(field.cpu() for field in pose))
+    return torch.cat(keypoints).transpose(0, 1).unsqueeze(0), torch.cat(scores).transpose(0, 1).unsqueeze(0)
 
 
 def maps_of_pose(

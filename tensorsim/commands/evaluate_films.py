@@ -1,0 +1,119 @@
+"""``tensorsim evaluate films``: real films of known activity, labelled."""
+
+import csv
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
+from tensorsim.commands.options import RadarOptions, check_seed
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateFilms(NetworkOptions):
+    """Label real films of known activity in each scene, as `tensorsim simulate` would.
+
+    Prints a table and writes films.md, films.json, films.csv and a contact sheet (PNG) per film. What the networks
+    find is kept in cache/.
+    """
+
+    data: Path
+    """Folder of films with labels.json: a list of {"file", "start_s", "end_s", "accept": [activities]}."""
+    out: Path
+    """Folder of the results."""
+    scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    """Radars."""
+    classifier: str | None = None
+    """Activity classifier: path or name. Default: the shipped one."""
+    only: tuple[str, ...] = ()
+    """Names of films, or parts of them; default all."""
+    stride: int = 1
+    """Keep every n-th frame."""
+    seed: int = 0
+    """Of the receiver's noise."""
+    device: str = "auto"
+    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
+    quiet: bool = False
+    """No progress bars."""
+
+    def run(self) -> None:
+        """Do it."""
+        check_seed(self.seed)
+        if self.out.exists() and not self.out.is_dir():
+            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        if self.stride < 1:
+            raise TensorsimError(f"--stride: got {self.stride}, expected 1 or more")
+        if len(self.scenes) == 0:
+            raise TensorsimError("--scenes: got none, expected at least one")
+        networks = default_networks(self.detector, self.pose)
+
+        import torch
+
+        from tensorsim.device import usable_device
+        from tensorsim.errors import collected_warnings
+        from tensorsim.evaluation.labelled_films import FilmReader, Scene, markdown, read_labels
+        from tensorsim.pipeline import VideoToPose
+
+        films = read_labels(self.data)
+        if self.only:
+            films = [film for film in films if any(part in film.path.name for part in self.only)]
+        if not films:
+            raise TensorsimError(f"{self.data}: got no film to label, expected at least one")
+        device = usable_device(self.device)
+        stage = VideoToPose(*load_networks(*networks, self.flip_test)).to(device).eval()
+        reader = FilmReader(stage, networks, self.out / "cache", self.stride)
+        scenes: dict[str, Scene] = {}
+        for name in self.scenes:
+            options = RadarOptions(scene=name, classifier=self.classifier)
+            scene = options.radar_scene()
+            recognizer = options.recognizer(scene)
+            assert recognizer is not None
+            scenes[name] = Scene(options.pose_to_doppler(scene, 0.0).to(device).eval(), recognizer)
+        self.out.mkdir(parents=True, exist_ok=True)
+        rows = []
+        with torch.inference_mode():
+            for film in films:
+                with collected_warnings() as messages:
+                    rows.append(self._row(film, reader, scenes, device) | {"warnings": messages})
+                for message in messages:
+                    print(f"tensorsim: warning: {film.path.name}: {message}", file=sys.stderr)
+        text = markdown(rows)
+        (self.out / "films.md").write_text(text, encoding="utf-8")
+        (self.out / "films.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        write_csv(self.out / "films.csv", rows)
+        print(text, end="")
+
+    def _row(self, film: Any, reader: Any, scenes: dict[str, Any], device: Any) -> dict[str, Any]:
+        """Everything of one film; writes its contact sheet."""
+        from tensorsim import plot, results
+        from tensorsim.evaluation.film_sheet import contact_sheet
+        from tensorsim.evaluation.labelled_films import film_row, followed, judged
+
+        video = reader.open(film)
+        pose = reader.people(film, device, self.quiet)
+        shown = []
+        for name, how in scenes.items():
+            verdict, maps = judged(film, pose, video.fps, name, how, self.seed, device, self.quiet)
+            axes = None if maps is None else results.axes_of(how.stage, maps)
+            shown.append((verdict, maps, axes))
+        figure = contact_sheet(film, video, pose, reader.stage.keypoint_threshold, shown)
+        plot.save_figure(figure, self.out / f"{film.path.stem}.png")
+        verdicts = [verdict for verdict, _, _ in shown]
+        return film_row(film, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """One line per film and scene."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["file", "accept", "scene", "label", "probability", "right", "followed_s", "error"])
+        for row in rows:
+            longest = max((person["followed_s"] for person in row["people"]), default=0.0)
+            for verdict in row["scenes"].values():
+                writer.writerow(
+                    [row["file"], "; ".join(row["accept"]), verdict["scene"], verdict["label"],
+                     verdict["probability"], verdict["right"], longest, verdict["error"]]
+                )  # fmt: skip

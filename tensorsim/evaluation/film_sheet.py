@@ -1,0 +1,138 @@
+"""A contact sheet of a film: pictures with the people found in them, Doppler-time maps, and where people are."""
+
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from tensorsim import plot
+from tensorsim.data.video import VideoReader
+from tensorsim.evaluation.labelled_films import LabelledFilm, Verdict
+from tensorsim.results import Axes
+from tensorsim.types import Pose, RadarMaps
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+    from matplotlib.figure import Figure
+
+_COLUMNS, _ROWS = 4, 2
+#: At most so many people stand in the legend.
+_NAMED = 5
+
+
+def contact_sheet(
+    film: LabelledFilm,
+    reader: VideoReader,
+    pose: Pose,
+    threshold: float,
+    scenes: list[tuple[Verdict, RadarMaps | None, Axes | None]],
+) -> "Figure":
+    """Draw the sheet.
+
+    Args:
+        film: what is known of the film.
+        reader: of the frames that ``pose`` is of.
+        pose: the people found, one clip.
+        threshold: score from which a key point is drawn.
+        scenes: per scene the verdict, and its maps with their axes where there are any.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(16, 11), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(_ROWS + 1, 12, height_ratios=[1.0] * _ROWS + [1.3])
+    count = pose.valid.shape[2]
+    chosen = np.unique(np.linspace(0, count - 1, _ROWS * _COLUMNS).round().astype(int))
+    for place, (index, picture) in enumerate(_pictures(reader, pose, threshold, set(chosen.tolist()))):
+        row, column = divmod(place, _COLUMNS)
+        axes = figure.add_subplot(grid[row, 3 * column : 3 * column + 3])
+        axes.imshow(picture)
+        axes.set_title(f"{film.start_s + index / reader.fps:.2f} s", fontsize=9)
+        axes.set_axis_off()
+    width = 12 // (len(scenes) + 1)
+    for place, (verdict, maps, map_axes) in enumerate(scenes):
+        axes = figure.add_subplot(grid[_ROWS, place * width : (place + 1) * width])
+        _draw_map(axes, verdict, maps, map_axes)
+    _draw_places(figure.add_subplot(grid[_ROWS, len(scenes) * width :]), pose, reader.fps)
+    figure.suptitle(f"{film.path.name}: {' or '.join(film.accept)}")
+    return figure
+
+
+def _pictures(
+    reader: VideoReader, pose: Pose, threshold: float, chosen: set[int]
+) -> list[tuple[int, np.ndarray]]:
+    """The chosen frames by number, people drawn on them."""
+    boxes, keypoints, scores, valid = (
+        part[0].numpy() for part in (pose.boxes, pose.keypoints, pose.keypoint_scores, pose.valid)
+    )
+    drawn = []
+    index = 0
+    for frames in reader.chunks(16):
+        for frame in frames:
+            if index in chosen:
+                picture = _small(frame)
+                scale = picture.shape[1] / frame.shape[-1]
+                drawn.append(
+                    (
+                        index,
+                        plot.draw_people(
+                            picture,
+                            boxes[:, index] * scale,
+                            keypoints[:, index] * scale,
+                            scores[:, index],
+                            valid[:, index],
+                            threshold,
+                        ),
+                    )
+                )
+            index += 1
+    return drawn
+
+
+def _small(frame: Tensor, width: int = 640) -> np.ndarray:
+    """A frame (3, H, W) as (h, w, 3), not wider than ``width``."""
+    import cv2
+
+    picture = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+    if picture.shape[1] <= width:
+        return picture
+    height = round(picture.shape[0] * width / picture.shape[1])
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _draw_map(
+    axes: "matplotlib.axes.Axes", verdict: Verdict, maps: RadarMaps | None, map_axes: Axes | None
+) -> None:
+    said = "no map" if verdict.label is None else f"{verdict.label} {verdict.probability:.2f}"
+    axes.set_title(f"{verdict.scene}: {said}", fontsize=10, color="tab:green" if verdict.right else "tab:red")
+    if maps is None or map_axes is None:
+        axes.text(0.5, 0.5, fill(verdict.error or "", 60), ha="center", va="center", fontsize=8)
+        axes.set_axis_off()
+        return
+    speed = map_axes.doppler_hz * map_axes.speed_per_hz
+    level = plot.decibels(maps.doppler_time.numpy(), 40.0)
+    extent = (map_axes.time_s[0], map_axes.time_s[-1], speed[0], speed[-1])
+    axes.imshow(level, origin="lower", aspect="auto", cmap="turbo", extent=extent, vmin=-40, vmax=0)
+    span = min(6.0, float(speed[-1]))
+    axes.set(ylim=(-span, span), xlabel="time in s", ylabel="radial speed in m/s")
+
+
+def _draw_places(axes: "matplotlib.axes.Axes", pose: Pose, fps: float) -> None:
+    """Range and height of the hips and height of the head of every person over time."""
+    time_s = np.arange(pose.valid.shape[2]) / fps
+    for person in range(pose.valid.shape[1]):
+        there = pose.valid[0, person].numpy()
+        joints = pose.joints[0, person].numpy()
+        hips = joints[:, (8, 11)].mean(axis=1)
+        colour = np.array(plot.PERSON_COLOURS[person % len(plot.PERSON_COLOURS)]) / 255
+        label = f"person {person + 1}" if person < _NAMED else None
+        axes.plot(time_s, np.where(there, hips[:, 1], np.nan), "-", color=colour, label=label)
+        axes.plot(time_s, np.where(there, joints[:, 0, 2], np.nan), ":", color=colour)
+        axes.plot(time_s, np.where(there, hips[:, 2], np.nan), "--", color=colour)
+    axes.set_title("range (line), height of head (dots) and hips (dashes)", fontsize=10)
+    axes.set(xlabel="time in s", ylabel="m", ylim=(-0.5, 10.0))
+    axes.grid(visible=True, alpha=0.3)
+    if pose.valid.shape[1]:
+        axes.legend(fontsize=7, loc="upper right")

@@ -1,0 +1,229 @@
+"""Real films of known activity: who is found in them, and what the maps of each scene are taken for.
+
+``labels.json`` of a folder lists its films: ``file``, the seconds ``start_s`` to ``end_s`` in which the activity
+happens, and the activities that count as right (``accept``).
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.data.video import VideoReader
+from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
+from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
+from tensorsim.recognition import ActivityRecognizer
+from tensorsim.results import label_of, people_of
+from tensorsim.streaming import detections_of_film, keypoints_of_film, maps_of_pose
+from tensorsim.types import Detections, Pose, RadarMaps
+
+
+@dataclass(frozen=True)
+class LabelledFilm:
+    """A film of known activity.
+
+    Attributes:
+        path: of the film.
+        start_s, end_s: the seconds in which the activity happens.
+        accept: labels that are right, of ``tensorsim.ACTIVITIES``.
+    """
+
+    path: Path
+    start_s: float
+    end_s: float
+    accept: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the maps of one scene are taken for.
+
+    Attributes:
+        scene: name of the scene.
+        label: the most probable activity; None where the simulation refused the film.
+        probability: of the label.
+        right: whether the label is accepted.
+        error: why there is no label.
+    """
+
+    scene: str
+    label: str | None
+    probability: float | None
+    right: bool
+    error: str | None = None
+
+
+class Scene(NamedTuple):
+    """How a scene is simulated and recognised."""
+
+    stage: PoseToDoppler
+    recognizer: ActivityRecognizer
+
+
+def read_labels(folder: Path) -> list[LabelledFilm]:
+    """The films that ``labels.json`` of a folder lists.
+
+    Raises:
+        TensorsimError: no such file, not such a list, an unknown activity, a film that is not there.
+    """
+    table = folder / "labels.json"
+    try:
+        listed = json.loads(table.read_text(encoding="utf-8"))
+        films = [
+            LabelledFilm(
+                folder / row["file"], float(row["start_s"]), float(row["end_s"]), tuple(row["accept"])
+            )
+            for row in listed
+        ]
+    except FileNotFoundError:
+        raise TensorsimError(f"{folder}: got no labels.json, expected a folder of labelled films") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise TensorsimError(
+            f"{table}: got {type(error).__name__} ({error}), expected a list of objects with file, start_s, end_s "
+            "and accept"
+        ) from None
+    for film in films:
+        for label in film.accept:
+            if label not in ACTIVITIES:
+                raise TensorsimError(
+                    f"{table}: {film.path.name}: got {label!r}, expected one of the 12 activities"
+                )
+        if not film.path.is_file():
+            raise TensorsimError(f"{table}: {film.path.name}: no such file beside it")
+    return films
+
+
+class FilmReader:
+    """Finds the people of films; what the networks gave is kept in a folder and used again.
+
+    Detections are kept by film, cut and detector, key points by these, the tracks and the pose network; tracking,
+    lifting and smoothing run anew.
+
+    Args:
+        stage: with the networks.
+        networks: files of detector and pose network.
+        cache: the folder.
+        stride: keep every n-th frame of the films.
+    """
+
+    def __init__(self, stage: VideoToPose, networks: tuple[Path, Path], cache: Path, stride: int = 1) -> None:
+        self.stage, self.cache, self.stride = stage, cache, stride
+        self.detector, self.pose = (_digest(path.read_bytes()) for path in networks)
+
+    def open(self, film: LabelledFilm) -> VideoReader:
+        """The labelled seconds of a film."""
+        return VideoReader(film.path, start_s=film.start_s, end_s=film.end_s, stride=self.stride)
+
+    def people(self, film: LabelledFilm, device: torch.device, quiet: bool = False) -> Pose:
+        """The Pose of a film (B = 1) on the CPU."""
+        stage, reader = self.stage, self.open(film)
+        cut = f"{film.start_s} {film.end_s} {self.stride} {stage.detection_interval}"
+        key = _digest(film.path.read_bytes(), cut.encode(), self.detector.encode())
+
+        def detect() -> tuple[Tensor, ...]:
+            found, looked = detections_of_film(stage, reader, device, quiet)
+            return *found, looked
+
+        *detections, observed = self._kept(f"detections-{key}", detect)
+        tracks = stage.follow(Detections(*(part.to(device) for part in detections)), observed.to(device))
+        flip = str(getattr(stage.pose, "flip_test", None))
+        boxes = tracks.boxes.cpu().numpy().tobytes()
+        key = _digest(key.encode(), self.pose.encode(), flip.encode(), boxes)
+        keypoints, scores = self._kept(
+            f"keypoints-{key}", lambda: keypoints_of_film(stage, reader, tracks, device, quiet)
+        )
+        pose = stage.lift(
+            tracks, keypoints.to(device), scores.to(device), reader.height, reader.width, reader.fps
+        )
+        warn_of_empty_clips(pose.valid)
+        return Pose(*(field.cpu() for field in pose))
+
+    def _kept(self, name: str, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        """Tensors of a file of the cache, made and written first if it is not there."""
+        path = self.cache / f"{name}.npz"
+        if path.is_file():
+            with np.load(path, allow_pickle=False) as arrays:
+                return tuple(torch.from_numpy(arrays[key]) for key in arrays)
+        made = tuple(tensor.cpu() for tensor in make())
+        with complete_file(path) as scratch, scratch.open("wb") as file:
+            np.savez(file, *(tensor.numpy() for tensor in made))
+        return made
+
+
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:20]
+
+
+def judged(
+    film: LabelledFilm,
+    pose: Pose,
+    fps: float,
+    scene: str,
+    how: Scene,
+    seed: int,
+    device: torch.device,
+    quiet: bool = False,
+) -> tuple[Verdict, RadarMaps | None]:
+    """The verdict on a film in one scene, and its maps; None where the simulation refuses its motion."""
+    torch.manual_seed(seed)
+    try:
+        maps = maps_of_pose(how.stage, pose, fps, device, quiet)
+    except TensorsimError as error:
+        return Verdict(scene, None, None, False, str(error)), None
+    told = label_of(how.recognizer, maps)
+    label = told["label"]
+    return Verdict(scene, label, told["probabilities"][label], label in film.accept), maps
+
+
+def followed(pose: Pose, fps: float) -> list[dict[str, Any]]:
+    """A row per person: those of :func:`~tensorsim.results.people_of`, for how long, and the fastest joint."""
+    rows = people_of(pose, fps)
+    for row in rows:
+        person = row["id"] - 1
+        there = pose.valid[0, person]
+        row["followed_s"] = round(float(there.sum()) / fps, 2)
+        moved = pose.joints[0, person].diff(dim=0).norm(dim=-1).amax(dim=-1) * fps
+        row["fastest_joint_m_s"] = round(float((moved * (there[1:] & there[:-1])).max()), 1)
+    return rows
+
+
+def film_row(
+    film: LabelledFilm, people: list[dict[str, Any]], frames: int, fps: float, verdicts: Iterable[Verdict]
+) -> dict[str, Any]:
+    """What ``films.json`` says of a film."""
+    return {
+        "file": film.path.name,
+        "seconds": round(frames / fps, 2),
+        "accept": list(film.accept),
+        "people": people,
+        "scenes": {verdict.scene: asdict(verdict) for verdict in verdicts},
+    }
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """The table of the films, and how many are right in each scene."""
+    scenes = list(rows[0]["scenes"])
+    heads = ["film", "right is", *scenes, "followed"]
+    lines = [heads, ["---"] * len(heads)]
+    for row in rows:
+        followed_s = ", ".join(f"{p['followed_s']:.1f}" for p in row["people"]) or "nobody"
+        verdicts = [_said(row["scenes"][scene]) for scene in scenes]
+        right = " or ".join(name.split()[0] for name in row["accept"])
+        lines.append([row["file"], right, *verdicts, f"{followed_s} of {row['seconds']:.1f} s"])
+    counts = [f"**{sum(row['scenes'][scene]['right'] for row in rows)} of {len(rows)}**" for scene in scenes]
+    lines.append(["right", "", *counts, ""])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _said(verdict: Mapping[str, Any]) -> str:
+    if verdict["label"] is None:
+        return "no map"
+    return f"{verdict['label'].split()[0]} {verdict['probability']:.2f}{' right' if verdict['right'] else ''}"

@@ -1,0 +1,177 @@
+"""``tensorsim evaluate films``: labels are read and checked, networks run once per film, tables say what was found."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim import cli
+from tensorsim.commands import evaluate_films
+from tensorsim.config import ACTIVITIES, RadarConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.labelled_films import LabelledFilm, Scene, followed, judged, markdown, read_labels
+from tensorsim.pipeline import PoseToDoppler
+from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.types import Detections, Pose, RadarMaps
+from tests.film import RectangleDetector, StandingPose, film, walker
+
+FPS = 10.0
+
+
+class CountingDetector(RectangleDetector):
+    """Counts the frames that it has seen."""
+
+    frames = 0
+
+    def forward(self, images: Tensor) -> Detections:
+        type(self).frames += images.shape[0]
+        return super().forward(images)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """Two seconds of somebody who walks away, and two of an empty room."""
+    folder = tmp_path / "films"
+    folder.mkdir()
+    away = film(*walker(20, FPS, 4.0, 1.2, 0.3))
+    for name, frames in (("walk.avi", away), ("room.avi", torch.zeros_like(away))):
+        size = (frames.shape[3], frames.shape[2])
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter_fourcc(*"FFV1"), FPS, size)
+        for frame in frames.permute(0, 2, 3, 1).numpy():
+            writer.write(np.ascontiguousarray(frame[..., ::-1]))
+        writer.release()
+    rows = [
+        {"file": "walk.avi", "start_s": 0.2, "end_s": 2, "accept": [ACTIVITIES[7]]},
+        {"file": "room.avi", "start_s": 0, "end_s": 2, "accept": [ACTIVITIES[0]]},
+    ]
+    (folder / "labels.json").write_text(json.dumps(rows))
+    return folder
+
+
+def test_the_command_labels_films_and_runs_the_networks_once(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = tmp_path / "w.onnx"
+    weights.write_text("")
+    monkeypatch.setattr(evaluate_films, "load_networks", lambda *_: (CountingDetector(), StandingPose()))
+    out = tmp_path / "out"
+    arguments = ["evaluate", "films", "--data", str(data), "--out", str(out), "--scenes", "through-wall"]
+    arguments += ["--detector", str(weights), "--pose", str(weights), "--quiet"]
+    CountingDetector.frames = 0
+    cli.main(arguments)
+    walk, room = json.loads((out / "films.json").read_text())
+    assert walk["seconds"] == pytest.approx(1.8)
+    assert walk["people"][0]["followed_s"] == pytest.approx(1.8)
+    assert walk["people"][0]["mean_approach_m_s"] == pytest.approx(-1.2, abs=0.2)
+    assert 0.5 < walk["people"][0]["fastest_joint_m_s"] < 4.0
+    assert room["people"] == []
+    assert "no person found" in " ".join(room["warnings"])
+    verdict = walk["scenes"]["through-wall"]
+    assert verdict["label"] in ACTIVITIES
+    assert verdict["right"] == (verdict["label"] == ACTIVITIES[7])
+    for name in ("walk", "room"):
+        picture = cv2.imread(str(out / f"{name}.png"))
+        assert picture is not None
+        assert picture.shape[1] > 1500
+    with (out / "films.csv").open() as file:
+        assert [line["file"] for line in csv.DictReader(file)] == ["walk.avi", "room.avi"]
+    table = capsys.readouterr().out
+    assert "| walk.avi | S8 |" in table
+    assert table == (out / "films.md").read_text()
+
+    seen = CountingDetector.frames
+    assert seen == 10 + 11  # every second frame and the last
+    cli.main([*arguments, "--only", "walk"])
+    assert CountingDetector.frames == seen, "kept in cache/"
+    assert json.loads((out / "films.json").read_text()) == [walk]
+
+
+@pytest.mark.parametrize(
+    ("rows", "why"),
+    [
+        ([{"file": "walk.avi", "start_s": 0}], r"KeyError \('end_s'\), expected a list"),
+        ([{"file": "walk.avi", "start_s": 0, "end_s": 1, "accept": ["Walk"]}], "got 'Walk', expected one of"),
+        ([{"file": "run.avi", "start_s": 0, "end_s": 1, "accept": []}], "run.avi: no such file"),
+    ],
+)
+def test_bad_labels_are_refused(data: Path, rows: list[dict[str, Any]], why: str) -> None:
+    (data / "labels.json").write_text(json.dumps(rows))
+    with pytest.raises(TensorsimError, match=why):
+        read_labels(data)
+    with pytest.raises(TensorsimError, match=r"no labels\.json"):
+        read_labels(data.parent)
+
+
+class Always(nn.Module):
+    """Takes every map for one activity."""
+
+    def __init__(self, index: int) -> None:
+        super().__init__()
+        self.index = index
+
+    def forward(self, maps: RadarMaps) -> Tensor:
+        return torch.nn.functional.one_hot(torch.tensor(self.index), len(ACTIVITIES)).double().mul(4)
+
+
+def somebody(speed_m_s: float, frames: int = 20) -> Pose:
+    """A body that moves away as a whole."""
+    joints = torch.rand(14, 3, generator=torch.Generator().manual_seed(0)).expand(1, 1, frames, 14, 3).clone()
+    joints[..., 1] += 3.0 + speed_m_s * torch.arange(frames)[:, None] / FPS
+    there = torch.ones(1, 1, frames, dtype=torch.bool)
+    there[..., 0] = False
+    return Pose(
+        torch.zeros(1, 1, frames, 4),
+        torch.zeros(1, 1, frames, 17, 2),
+        torch.zeros(1, 1, frames, 17),
+        joints,
+        there,
+    )
+
+
+def test_a_verdict_is_right_where_the_label_is_accepted() -> None:
+    stage = PoseToDoppler(RadarSimulator(RadarConfig.through_wall(), snr_db=50.0))
+    known = LabelledFilm(Path("walk.avi"), 0.0, 2.0, (ACTIVITIES[7],))
+    cpu = torch.device("cpu")
+    for index, right in ((7, True), (1, False)):
+        how = Scene(stage, Always(index))  # type: ignore[arg-type]
+        verdict, maps = judged(known, somebody(1.0), FPS, "through-wall", how, 0, cpu, quiet=True)
+        assert maps is not None
+        assert (verdict.label, verdict.right) == (ACTIVITIES[index], right)
+        assert verdict.probability == pytest.approx(np.exp(4) / (np.exp(4) + 11), abs=1e-3)
+    verdict, maps = judged(known, somebody(10.0), FPS, "through-wall", how, 0, cpu, quiet=True)
+    assert maps is None
+    assert not verdict.right
+    assert "radial speed" in (verdict.error or "")
+
+
+def test_who_was_followed_for_how_long() -> None:
+    row = followed(somebody(2.0), FPS)[0]
+    assert row["followed_s"] == pytest.approx(1.9)
+    assert row["fastest_joint_m_s"] == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_table_counts_what_is_right() -> None:
+    verdicts = [
+        {"label": ACTIVITIES[7], "probability": 0.9, "right": True},
+        {"label": None, "probability": None, "right": False},
+    ]
+    rows = [
+        {
+            "file": f"{i}.avi",
+            "accept": [ACTIVITIES[7]],
+            "people": [],
+            "seconds": 4.0,
+            "scenes": {"s": verdict},
+        }
+        for i, verdict in enumerate(verdicts)
+    ]
+    lines = markdown(rows).splitlines()
+    assert lines[2] == "| 0.avi | S8 | S8 0.90 right | nobody of 4.0 s |"
+    assert lines[3].split("|")[3].strip() == "no map"
+    assert "**1 of 2**" in lines[4]
