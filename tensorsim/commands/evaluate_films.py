@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, check_seed
+from tensorsim.commands.options import RadarOptions, check_seed, load_recognizer
 from tensorsim.errors import TensorsimError
 
 
@@ -55,7 +55,7 @@ class EvaluateFilms(NetworkOptions):
         from tensorsim.device import usable_device
         from tensorsim.errors import collected_warnings
         from tensorsim.evaluation.labelled_films import FilmReader, Scene, markdown, read_labels
-        from tensorsim.pipeline import VideoToPose
+        from tensorsim.pipeline import PoseToDoppler, VideoToPose
 
         films = read_labels(self.data)
         if self.only:
@@ -67,11 +67,11 @@ class EvaluateFilms(NetworkOptions):
         reader = FilmReader(stage, networks, self.out / "cache", self.stride)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:
-            options = RadarOptions(scene=name, classifier=self.classifier)
-            scene = options.radar_scene()
-            recognizer = options.recognizer(scene)
-            assert recognizer is not None
-            scenes[name] = Scene(options.pose_to_doppler(scene, 0.0).to(device).eval(), recognizer)
+            config = RadarOptions(scene=name, classifier=self.classifier).configuration()
+            recognizer = load_recognizer(config)
+            if recognizer is None:
+                raise TensorsimError("--classifier: got 'none', expected weights")
+            scenes[name] = Scene(PoseToDoppler.from_config(config).to(device), recognizer)
         self.out.mkdir(parents=True, exist_ok=True)
         rows = []
         with torch.inference_mode():

@@ -51,7 +51,7 @@ def test_a_yaml_file_holds_everything(tmp_path: Path) -> None:
         ("tracking: {max_tracks: 1.5}", r"tracking: max_tracks: got 1.5, expected a whole number"),
         ("pose: {flip_test: 1}", r"pose: flip_test: got 1, expected true or false"),
         ("seed: -1", r"seed: got -1, expected an integer from 0"),
-        ("scene: {radar: {carrier_hz: .nan}}", r"scene: radar: RadarConfig.carrier_hz: got nan"),
+        ("scene: {radar: {carrier_hz: .nan}}", r"scene: radar: carrier_hz: got .*nan"),
     ],
 )  # fmt: skip
 def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: Path) -> None:

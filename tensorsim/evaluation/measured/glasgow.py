@@ -76,7 +76,7 @@ class Glasgow:
         profile = RangeProfile(RADAR, window=None, gate_m=(3.4, 7.6))
         self.bins = profile.last_bin - profile.first_bin + 1
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
-        self.scatterers = LimbScatterers(RADAR.tx_m, RADAR.rx_m, per_segment=2)
+        self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)
         self.mti = MovingTargetIndicator("high-pass", RADAR, cutoff_m_s=3.75 * RADAR.doppler_wavelength_m / 2)
         self.maps = DopplerTimeMap(RADAR, window_s=0.2, overlap=0.9)
         self.cfar = CfarDetector(
@@ -92,9 +92,7 @@ class Glasgow:
         if label == 0:
             duration = 10.0
             time = knots(duration).expand(count, -1)
-            people = people._replace(
-                heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5)
-            )
+            people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
             leg = draw(1.6, 3.2)
             if self.effects.to_and_fro:
                 joints = to_and_fro(walk, time, people, draw, leg, draw(0.9, 2.2), draw(0.0, 1.0) * leg)

@@ -1,6 +1,7 @@
 """The small network of the measured sets, and how it is trained on pictures that fit the memory."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -26,7 +27,7 @@ class PictureNet(nn.Module):
         super().__init__()
         sizes = (channels, width, 2 * width, 3 * width, 4 * width)
         layers: list[nn.Module] = []
-        for i, (before, after) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        for i, (before, after) in enumerate(pairwise(sizes)):
             layers += [nn.Conv2d(before, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU()]
             if i < 3:
                 layers.append(nn.MaxPool2d(2))

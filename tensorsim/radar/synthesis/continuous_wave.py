@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from tensorsim.config import SPEED_OF_LIGHT_M_S, Vector
 from tensorsim.errors import check_positive
 from tensorsim.motion.scatterers import check_antenna
-from tensorsim.radar.synthesis.echo import check_scene, phasor
+from tensorsim.radar.synthesis.dechirp import phasor
+from tensorsim.radar.synthesis.echo import check_scene
 
 
 def continuous_wave(path_m: Tensor, amplitude: Tensor, wavelength_m: float) -> Tensor:
@@ -50,9 +51,7 @@ class ContinuousWaveEcho(nn.Module):
     rx: Tensor
     precision: Tensor
 
-    def __init__(
-        self, carrier_hz: float, tx_m: Vector, rx_m: Vector, antenna_gain_dbi: float = 0.0
-    ) -> None:
+    def __init__(self, carrier_hz: float, tx_m: Vector, rx_m: Vector, antenna_gain_dbi: float = 0.0) -> None:
         super().__init__()
         check_positive(carrier_hz, "carrier_hz")
         check_antenna("tx_m", tx_m)
