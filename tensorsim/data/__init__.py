@@ -1,5 +1,6 @@
 """Films and motion files in, rendered people, films and sound out."""
 
+from tensorsim.data.clip import Clip, read_video
 from tensorsim.data.motion_files import Keypoints2D, Motion, load_coco_keypoints, load_motion, place
 from tensorsim.data.sound import Sound, doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import VideoReader, write_video
@@ -7,6 +8,7 @@ from tensorsim.geometry.framing import camera_on
 from tensorsim.render.renderer import PersonRenderer, RenderedVideo
 
 __all__ = [
+    "Clip",
     "Keypoints2D",
     "Motion",
     "PersonRenderer",
@@ -18,6 +20,7 @@ __all__ = [
     "load_coco_keypoints",
     "load_motion",
     "place",
+    "read_video",
     "slow_time_signal",
     "write_sound",
     "write_video",
