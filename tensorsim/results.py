@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
-from tensorsim.config import ACTIVITIES, SimulationConfig
+from tensorsim.config import SimulationConfig
+from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import write_video
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
@@ -58,15 +59,45 @@ def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
     )
 
 
-def write_maps(folder: Path, maps: RadarMaps, axes: Axes, truth: RadarMaps | None = None) -> None:
-    """Write ``maps.npz`` and a PNG per map.
+@dataclass(frozen=True)
+class Pictures:
+    """How the maps of a run are drawn.
+
+    Attributes:
+        style: colours and dynamic range.
+        suffix: file format, one of ``tensorsim.plot.FIGURE_FORMATS``.
+        subtitle: a line below the titles.
+        peaks: magnitudes of 0 dB by map, for a scene without people; None: each map's own peak.
+    """
+
+    style: plot.MapStyle = field(default_factory=plot.MapStyle)
+    suffix: str = "png"
+    subtitle: str | None = None
+    peaks: dict[str, float] | None = None
+
+    def options(self, name: str) -> dict[str, Any]:
+        """Arguments of :func:`tensorsim.plot.map_figure` for this map."""
+        peak = None if self.peaks is None else self.peaks[name]
+        note = None if self.peaks is None else "no person in the scene"
+        return {"style": self.style, "subtitle": self.subtitle, "peak": peak, "note": note}
+
+
+def write_maps(
+    folder: Path,
+    maps: RadarMaps,
+    axes: Axes,
+    truth: RadarMaps | None = None,
+    pictures: Pictures = Pictures(),  # immutable
+) -> None:
+    """Write ``maps.npz`` and a picture per map.
 
     Args:
         folder: where to.
         maps: on the CPU, without batch dimensions.
         axes: of the maps.
         truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
-            every PNG.
+            every picture.
+        pictures: how they are drawn.
     """
     save_maps(folder / "maps.npz", maps, axes)
     if truth is not None:
@@ -81,8 +112,16 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes, truth: RadarMaps | Non
         time_s = (np.arange(magnitude.shape[1]) + offset) / axes.range_time_rate_hz
         reference = None if truth is None else getattr(truth, name).numpy()
         plot.save_figure(
-            plot.map_figure(magnitude, time_s, axes.range_m, title, "range in m", reference=reference),
-            folder / f"{name}.png",
+            plot.map_figure(
+                magnitude,
+                time_s,
+                axes.range_m,
+                title,
+                "range in m",
+                reference=reference,
+                **pictures.options(name),
+            ),
+            folder / f"{name}.{pictures.suffix}",
         )
     both = [maps] if truth is None else [maps, truth]
     plot.save_figure(
@@ -97,8 +136,9 @@ def write_maps(folder: Path, maps: RadarMaps, axes: Axes, truth: RadarMaps | Non
             half_span=max(_doppler_span(one, axes) for one in both),
             reference=None if truth is None else truth.doppler_time.numpy(),
             reference_ridges=None if truth is None else _strong_ridges(truth, axes),
+            **pictures.options("doppler_time"),
         ),
-        folder / "doppler_time.png",
+        folder / f"doppler_time.{pictures.suffix}",
     )
 
 
@@ -152,7 +192,22 @@ def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float |
     return table
 
 
-def write_pose(folder: Path, pose: Pose, fps: float) -> None:
+def write_doppler_sound(
+    folder: Path, stage: PoseToDoppler, pose: Pose, fps: float, device: torch.device
+) -> None:
+    """Write ``doppler.wav``, the micro-Doppler of the scene as sound: approaching left, receding right."""
+    joints, valid = pose.joints[:1].to(device), pose.valid[:1].to(device)
+    coefficients = stage.resampler.coefficients(joints, fps)
+
+    def source(start: int, stop: int) -> tuple[Tensor, Tensor]:
+        points, rcs = stage.scene(coefficients, valid, fps, start, stop)
+        return points[0], rcs[0]
+
+    signal = slow_time_signal(stage.simulator, source, stage.resampler.pulses(joints.shape[2], fps))
+    write_sound(folder / "doppler.wav", doppler_sound(signal.cpu(), stage.simulator.radar.prf_hz))
+
+
+def write_pose(folder: Path, pose: Pose, fps: float, pictures: Pictures = Pictures()) -> None:
     """Write ``pose.npz`` and a picture of the skeletons in the world."""
     joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
     np.savez(
@@ -164,7 +219,8 @@ def write_pose(folder: Path, pose: Pose, fps: float) -> None:
         valid=valid,
         fps=fps,
     )
-    plot.save_figure(plot.skeleton_figure(joints, valid, fps), folder / "skeleton.png")
+    figure = plot.skeleton_figure(joints, valid, fps, subtitle=pictures.subtitle)
+    plot.save_figure(figure, folder / f"skeleton.{pictures.suffix}")
 
 
 def write_overlay(
@@ -196,12 +252,11 @@ def write_overlay(
 def simulate(
     source: "Source", stage: PoseToDoppler, folder: Path, seed: int, device: torch.device, quiet: bool = False
 ) -> tuple[Pose, RadarMaps]:
-    """Find the people of a source, simulate their maps, and write all but the maps: pose, skeleton and overlay."""
+    """Find the people of a source and simulate their maps; writes the overlay film."""
     pose = source.pose(quiet)
     warn_of_empty_clips(pose.valid)
     torch.manual_seed(seed)
     maps = maps_of_pose(stage, pose, source.fps, device, quiet)
-    write_pose(folder, pose, source.fps)
     write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
     return pose, maps
 
@@ -248,7 +303,7 @@ def label_of(recognizer: ActivityRecognizer | None, maps: RadarMaps) -> dict[str
     if recognizer is None:
         return {"label": None, "probabilities": None}
     probabilities = recognizer(maps).softmax(-1).tolist()
-    by_name = {name: round(p, 4) for name, p in zip(ACTIVITIES, probabilities, strict=True)}
+    by_name = {name: round(p, 4) for name, p in zip(recognizer.class_names, probabilities, strict=True)}
     return {"label": max(by_name, key=by_name.__getitem__), "probabilities": by_name}
 
 

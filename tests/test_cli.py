@@ -283,5 +283,5 @@ def test_a_classifier_of_other_classes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "five.safetensors"
     save_weights(ts.recognition.SPGNet(5), path, {"network": "SPGNet", "size": "32"})
     config = RadarOptions(classifier=str(path)).configuration()
-    with pytest.raises(ts.TensorsimError, match=r"--classifier: .* 5 classes, expected the 12 activities"):
+    with pytest.raises(ts.TensorsimError, match=r"--classifier: .* 5 classes, expected 12"):
         load_recognizer(config)

@@ -107,7 +107,15 @@ class Demo(NetworkOptions, RadarOptions):
                     device,
                     self.quiet,
                 )
-                results.write_maps(folder, maps, results.axes_of(maps_stage, maps), true_maps)
+                label = results.label_of(recognizer, maps)
+                somebody = bool(truth.valid.any() | pose.valid.any())
+                pictures = self.pictures(
+                    maps_stage, label["label"], f"demo: {ACTIVITIES[activity]}", somebody
+                )
+                results.write_maps(folder, maps, results.axes_of(maps_stage, maps), true_maps, pictures)
+                results.write_pose(folder, pose, FILM_FPS, pictures)
+                if self.sound:
+                    results.write_doppler_sound(folder, maps_stage, pose, FILM_FPS, device)
                 np.savez(
                     folder / "pose_truth.npz",
                     joints_m=film.joints.numpy(),
@@ -118,7 +126,8 @@ class Demo(NetworkOptions, RadarOptions):
                     fps=FILM_FPS,
                 )
                 likeness = results.similarity(maps, true_maps)
-                label = results.label_of(recognizer, maps)
+                empty = maps._replace(**{name: torch.zeros_like(getattr(maps, name)) for name in likeness})
+                empty_likeness = results.similarity(empty, true_maps)
                 summary = (
                     label
                     | results.summary_of(source, config, pose, maps)
@@ -127,6 +136,7 @@ class Demo(NetworkOptions, RadarOptions):
                         "person_height_m": round(height_m, 4),
                         **drawn_by(camera, (HEIGHT, WIDTH)),
                         "film_against_truth": likeness | joint_errors(pose, film),
+                        "empty_map_against_truth": empty_likeness,
                         "options": self.described(),
                         "warnings": messages,
                     }
@@ -138,7 +148,8 @@ class Demo(NetworkOptions, RadarOptions):
         people_found = int(pose.valid[0].any(1).sum())
         print(
             f"{self.out}: {ACTIVITIES[activity]}, {people_found} people found; Doppler-time map from the film "
-            f"against that of the true motion: PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']}"
+            f"against that of the true motion: PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']} "
+            f"(an empty map: PSNR {empty_likeness['doppler_time']['psnr_linear_db']} dB)"
         )
 
     def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":

@@ -112,8 +112,13 @@ class Simulate(NetworkOptions, RadarOptions):
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
                 pose, maps = results.simulate(source, stage, folder, config.seed, device, self.quiet)
-                results.write_maps(folder, maps, results.axes_of(stage, maps))
                 label = results.label_of(recognizer, maps)
+                somebody = bool(pose.valid.any())
+                pictures = self.pictures(stage, label["label"], self.source.name, somebody)
+                results.write_maps(folder, maps, results.axes_of(stage, maps), pictures=pictures)
+                results.write_pose(folder, pose, source.fps, pictures)
+                if self.sound:
+                    results.write_doppler_sound(folder, stage, pose, source.fps, device)
                 summary = label | results.summary_of(source, config, pose, maps)
                 results.write_summary(folder, summary | {"options": self.described(), "warnings": messages})
         for message in messages:

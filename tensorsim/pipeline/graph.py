@@ -13,6 +13,7 @@ from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.pipeline.networks import pretrained_pose
 from tensorsim.pipeline.pose import VideoToPose
+from tensorsim.protocols import check_part
 from tensorsim.radar.presets import radar_scene
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.recognition.recognizer import ActivityRecognizer
@@ -168,7 +169,7 @@ class VideoToActivity(nn.Module):
     def __init__(self, video_to_doppler: VideoToDoppler, recognizer: nn.Module) -> None:
         super().__init__()
         self.video_to_doppler = video_to_doppler
-        self.recognizer = recognizer
+        self.recognizer = check_part(recognizer, "recognizer")
 
     @classmethod
     def from_pretrained(

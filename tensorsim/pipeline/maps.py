@@ -13,6 +13,7 @@ from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
+from tensorsim.protocols import check_part
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import RadarMaps
 
@@ -49,9 +50,9 @@ class PoseToDoppler(nn.Module):
         # Pulses beside a piece of motion that the filter needs to give the same values as on the whole.
         self.halo = 0 if pulse_smoother is None else pulse_smoother.window
         self.pulse_smoother = pulse_smoother if pulse_smoother is not None else nn.Identity()
-        self.scatterers = scatterers if scatterers is not None else JointScatterers()
+        self.scatterers = check_part(JointScatterers() if scatterers is None else scatterers, "scatterers")
         self.denoises = denoiser is not None
-        self.denoiser = denoiser if denoiser is not None else nn.Identity()
+        self.denoiser = check_part(nn.Identity() if denoiser is None else denoiser, "denoiser")
         if len(rcs_scale) == 0 or not all(scale > 0 for scale in rcs_scale):
             raise TensorsimError(f"rcs_scale: got {rcs_scale}, expected positive factors, one per person")
         self.register_buffer("rcs_scale", torch.tensor(rcs_scale, dtype=torch.float64), persistent=False)

@@ -1,13 +1,11 @@
 """Pose networks as the pipeline takes them."""
 
-import inspect
 import os
 from pathlib import Path
-from typing import Any
 
-import torch
 from torch import nn
 
+from tensorsim.protocols import check_part, is_pose_estimator
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
@@ -16,12 +14,9 @@ from tensorsim.vision.pose2d.topdown import TopDownPose
 
 def top_down(pose: nn.Module, flip_test: bool = True) -> nn.Module:
     """A heat-map network as a stage (frames, boxes, valid) -> (key points, scores); such a stage stays as it is."""
-    forward: Any = pose.forward
-    if isinstance(pose, torch.jit.ScriptModule):
-        arguments = len(forward.schema.arguments) - 1
-    else:
-        arguments = len(inspect.signature(forward).parameters)
-    return pose if arguments == 3 else TopDownPose(pose, flip_test=flip_test)
+    if is_pose_estimator(pose):
+        return check_part(pose, "pose")
+    return TopDownPose(check_part(pose, "network"), flip_test=flip_test)
 
 
 def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: bool = True) -> TopDownPose:

@@ -7,6 +7,7 @@ from tensorsim.body.skeleton import coco_to_body
 from tensorsim.config import CameraConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, check_positive, check_rank, check_size
 from tensorsim.pipeline.networks import pretrained_pose, top_down
+from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
@@ -68,17 +69,17 @@ class VideoToPose(nn.Module):
         ):
             if value < 1:
                 raise TensorsimError(f"{name}: got {value}, expected at least 1")
-        self.detector = detector
+        self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
-        self.tracker = tracker if tracker is not None else GNNTracker()
-        self.lifter = lifter if lifter is not None else NearestPoseLifter()
+        self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
+        self.lifter = check_part(NearestPoseLifter() if lifter is None else lifter, "lifter")
         self.metric_pose = (
             metric_pose
             if metric_pose is not None
             else MetricPose(camera, person_height_m, initial_distance_m, keypoint_threshold)
         )
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
-        self.smoother = smoother if smoother is not None else KalmanSmoother()
+        self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
         self.fewest_joints = fewest_joints
@@ -192,6 +193,8 @@ class VideoToPose(nn.Module):
         valid: list[Tensor] = []
         for start in range(0, frames.shape[0], self.frames_per_batch):
             found = self.detector(frames[start : start + self.frames_per_batch])
+            if not torch.jit.is_scripting():
+                check_detections(found)
             boxes.append(found.boxes)
             scores.append(found.scores)
             labels.append(found.labels)
