@@ -16,6 +16,11 @@ from tensorsim.errors import (
     check_size,
 )
 
+#: Arms and legs by the indices of their joints, upper segment first.
+LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
+#: Segments of constant length by their ends; 14 is the middle of the hips. The neck, joint 1, is that of the shoulders.
+BONES = ((0, 1), (2, 5), *LIMBS[:4], (8, 11), *LIMBS[4:], (1, 14))
+
 
 def mid_hips(joints: Tensor) -> Tensor:
     """Middle of the hips, the root of the skeleton: (..., 14, D) -> (..., D)."""

@@ -98,16 +98,33 @@ def distances_to_boxes(distances: Tensor, stride: int) -> Tensor:
     return torch.stack([x - left, y - top, x + right, y + bottom], -1).flatten(1, 2)
 
 
+def xyxy_to_center(boxes: Tensor) -> Tensor:
+    """``xyxy`` boxes (..., 4) as centre u, centre v, width, height."""
+    low, high = boxes[..., :2], boxes[..., 2:]
+    return torch.cat([(low + high) / 2.0, high - low], dim=-1)
+
+
+def center_to_xyxy(boxes: Tensor) -> Tensor:
+    """The inverse of :func:`xyxy_to_center`."""
+    center, half = boxes[..., :2], boxes[..., 2:] / 2.0
+    return torch.cat([center - half, center + half], dim=-1)
+
+
 def box_area(boxes: Tensor) -> Tensor:
     """Area (...) of boxes (..., 4)."""
     return (boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1])
 
 
-def box_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Intersection over union (...) of boxes (..., 4) and (..., 4), broadcast; 0 where both are empty."""
+def box_intersection(a: Tensor, b: Tensor) -> Tensor:
+    """Area (...) that boxes (..., 4) and (..., 4), broadcast, have in common."""
     x1, y1 = torch.maximum(a[..., 0], b[..., 0]), torch.maximum(a[..., 1], b[..., 1])
     x2, y2 = torch.minimum(a[..., 2], b[..., 2]), torch.minimum(a[..., 3], b[..., 3])
-    intersection = (x2 - x1).clamp(min=0) * (y2 - y1).clamp(min=0)
+    return (x2 - x1).clamp(min=0) * (y2 - y1).clamp(min=0)
+
+
+def box_iou(a: Tensor, b: Tensor) -> Tensor:
+    """Intersection over union (...) of boxes (..., 4) and (..., 4), broadcast; 0 where both are empty."""
+    intersection = box_intersection(a, b)
     union = box_area(a) + box_area(b) - intersection
     return intersection / union.clamp(min=1e-12)
 

@@ -1,4 +1,4 @@
-"""The pinhole camera: where it stands, what a pixel sees, where a point lands."""
+"""The pinhole camera: its pose, projection of points to pixels, and back-projection of pixels to points."""
 
 import math
 
@@ -6,6 +6,21 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import CameraConfig
+
+#: Points nearer to the camera than this are not projected, nor drawn.
+NEAR_M = 0.1
+
+
+def focal_length(camera: CameraConfig, width: int) -> float:
+    """Focal length in pixels for images of ``width`` pixels, from the field of view unless it is given."""
+    if camera.focal_px is not None:
+        return camera.focal_px
+    return width / 2 / math.tan(camera.horizontal_fov_rad / 2)
+
+
+def principal_point(camera: CameraConfig, height: int, width: int) -> tuple[float, float]:
+    """Principal point (u, v) in pixels: the centre of the image unless it is given. Pixel centres are integers."""
+    return ((width - 1) / 2, (height - 1) / 2) if camera.center_px is None else camera.center_px
 
 
 def camera_to_world(camera: CameraConfig) -> Tensor:
@@ -18,12 +33,31 @@ def camera_to_world(camera: CameraConfig) -> Tensor:
     return torch.stack([right, torch.linalg.cross(forward, right), forward, position], dim=1)
 
 
-def back_project(image: Tensor, reach: Tensor, focal: Tensor, center: Tensor, pose: Tensor) -> Tensor:
-    """World points on lines of sight of a pinhole camera.
+def project(points: Tensor, focal: float, center: tuple[float, float], pose: Tensor) -> tuple[Tensor, Tensor]:
+    """Projection of a pinhole camera: ``u = cu + f x / z``, ``v = cv + f y / z`` with (x, y, z) right, down, forward.
+
+    Args:
+        points: (..., 3) world metres.
+        focal: f, focal length in pixels.
+        center: (cu, cv), principal point in pixels.
+        pose: (3, 4) world from camera, see :func:`camera_to_world`.
+
+    Returns:
+        (..., 2) pixels and (...) depth z in metres. Pixels are meaningless where the depth is below ``NEAR_M``, to
+        which it is clamped.
+    """
+    local = torch.matmul(points - pose[:, 3], pose[:, :3])
+    depth = local[..., 2]
+    scale = focal / depth.clamp(min=NEAR_M)
+    return local[..., :2] * scale[..., None] + torch.tensor(center).to(local), depth
+
+
+def back_project(image: Tensor, depth: Tensor, focal: Tensor, center: Tensor, pose: Tensor) -> Tensor:
+    """The inverse of :func:`project`: world points on the lines of sight of pixels.
 
     Args:
         image: (..., J, 2) pixels.
-        reach: (..., J) metres along the optical axis.
+        depth: (..., J) metres along the optical axis.
         focal: (...) pixels.
         center: (2,) pixels, the principal point.
         pose: (..., 3, 4) world from camera (right, down, forward).
@@ -31,6 +65,6 @@ def back_project(image: Tensor, reach: Tensor, focal: Tensor, center: Tensor, po
     Returns:
         (..., J, 3) metres.
     """
-    across = (image - center) * (reach / focal[..., None])[..., None]
-    points = torch.cat([across, reach[..., None]], dim=-1)
+    across = (image - center) * (depth / focal[..., None])[..., None]
+    points = torch.cat([across, depth[..., None]], dim=-1)
     return torch.matmul(points, pose[..., :3].transpose(-1, -2)) + pose[..., None, :, 3]

@@ -1,7 +1,6 @@
-"""A camera that has everybody in its picture, and what it would see of them without anything in the way."""
+"""A camera that keeps everybody in its picture, and the keypoints it would see without occlusion."""
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -9,7 +8,7 @@ from torch import Tensor
 from tensorsim.body.skeleton import body_to_coco
 from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.render.cast import NEAR_M, View
+from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 
 #: A body reaches beyond its joints by so much, upwards from the nose and downwards from the ankles.
 _ABOVE_M, _BELOW_M = 0.25, 0.10
@@ -45,10 +44,8 @@ def camera_on(
         raise TensorsimError(f"camera: got nobody in front of {position_m}, expected somebody at larger y")
     yaw = _middle(torch.atan2(points[:, 0], points[:, 1]))
     pitch = _middle(torch.atan2(points[:, 2], points[:, :2].norm(dim=-1)))
-    camera = CameraConfig(focal_px=1.0, center_px=(0.0, 0.0), pitch_rad=pitch, yaw_rad=yaw)
-    tangents, depth = View.of_camera(replace(camera, position_m=(0.0, 0.0, 0.0)), 1, 1, points).project(
-        points
-    )
+    pose = camera_to_world(CameraConfig(position_m=(0.0, 0.0, 0.0), pitch_rad=pitch, yaw_rad=yaw))
+    tangents, depth = project(points, 1.0, (0.0, 0.0), pose.to(points))
     u, v = tangents[depth > NEAR_M].abs().amax(dim=0).tolist()
     half_width = max(u, v * width / height) / (1 - margin)
     fov = max(2 * math.atan(half_width), _NARROWEST_RAD)
@@ -62,7 +59,7 @@ def _middle(angle: Tensor) -> float:
 def seen_keypoints(
     joints: Tensor, valid: Tensor, camera: CameraConfig, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
-    """COCO keypoints of bodies that nothing hides.
+    """COCO keypoints of bodies without occlusion.
 
     Args:
         joints: (..., 14, 3) world metres.
@@ -74,7 +71,8 @@ def seen_keypoints(
         (..., 17, 2) pixels and scores (..., 17): 1 in the picture, else 0. Who is not there is at 0 with score 0.
     """
     points = torch.where(valid[..., None, None], body_to_coco(joints), 0.0)
-    pixels, depth = View.of_camera(camera, height, width, joints).project(points)
+    focal, center = focal_length(camera, width), principal_point(camera, height, width)
+    pixels, depth = project(points, focal, center, camera_to_world(camera).to(points))
     inside = (pixels >= -0.5).all(dim=-1) & (pixels[..., 0] < width - 0.5) & (pixels[..., 1] < height - 0.5)
     there = valid[..., None] & (depth > NEAR_M)
     return torch.where(there[..., None], pixels, 0.0), (there & inside).to(joints.dtype)
@@ -85,9 +83,9 @@ def keypoint_boxes(keypoints: Tensor, scores: Tensor, margin: float = 0.12) -> T
 
     Keypoints lie inside of bodies: boxes are wider by ``margin`` of their longer side all around.
     """
-    told = (scores > 0)[..., None]
-    low = torch.where(told, keypoints, math.inf).amin(dim=-2)
-    high = torch.where(told, keypoints, -math.inf).amax(dim=-2)
+    visible = (scores > 0)[..., None]
+    low = torch.where(visible, keypoints, math.inf).amin(dim=-2)
+    high = torch.where(visible, keypoints, -math.inf).amax(dim=-2)
     extra = margin * (high - low).amax(dim=-1, keepdim=True)
     boxes = torch.cat([low - extra, high + extra], dim=-1)
-    return torch.where(told.any(dim=-2), boxes, 0.0)
+    return torch.where(visible.any(dim=-2), boxes, 0.0)

@@ -12,10 +12,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import CameraConfig
-from tensorsim.geometry.camera import camera_to_world
-
-#: Nothing nearer to the camera than this is drawn.
-NEAR_M = 0.1
+from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 
 
 class Volumes(NamedTuple):
@@ -87,10 +84,7 @@ class View(NamedTuple):
     @classmethod
     def of_camera(cls, camera: CameraConfig, height: int, width: int, like: Tensor) -> "View":
         """The rays through the pixel centres of a pinhole camera; the ray parameter is depth in metres."""
-        focal = camera.focal_px
-        if focal is None:
-            focal = width / 2 / math.tan(camera.horizontal_fov_rad / 2)
-        center = ((width - 1) / 2, (height - 1) / 2) if camera.center_px is None else camera.center_px
+        focal, center = focal_length(camera, width), principal_point(camera, height, width)
         axes, position = camera_to_world(camera)[:, :3].T.to(like), like.new_tensor(camera.position_m)
         across = _grid(height, width, center, like) / focal
         directions = across @ axes[:2] + axes[2]
@@ -109,10 +103,11 @@ class View(NamedTuple):
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3) -> pixels (..., 2) and depth (...)."""
+        if self.pinhole:
+            pose = torch.cat([self.axes.mT, self.position[:, None]], dim=-1)
+            return project(points, self.scale, self.center, pose)
         local = (points - self.position) @ self.axes.mT
-        depth = local[..., 2]
-        scale = self.scale / depth.clamp(min=NEAR_M) if self.pinhole else torch.full_like(depth, self.scale)
-        return local[..., :2] * scale[..., None] + depth.new_tensor(self.center), depth
+        return local[..., :2] * self.scale + local.new_tensor(self.center), local[..., 2]
 
     def windows(self, volumes: Volumes) -> Tensor:
         """Pixels that may see each of (S) volumes: (S, 4) int64 left, top, right, bottom, the last two

@@ -8,13 +8,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tensorsim.geometry.boxes import (
+    box_intersection,
     box_iou,
+    center_to_xyxy,
     distances_to_boxes,
     letterbox,
     letterbox_size,
     non_maximum_suppression,
     resize_8bit,
     undo_letterbox,
+    xyxy_to_center,
 )
 
 SIZES = [
@@ -130,6 +133,14 @@ def test_iou_counts_pixels() -> None:
     np.testing.assert_allclose(actual.numpy(), expected, rtol=1e-12)
     assert max(expected) > 0.4
     assert box_iou(torch.zeros(4), torch.zeros(4)) == 0
+
+
+def test_intersection_and_centres_by_hand() -> None:
+    a, b = torch.tensor([0.0, 0, 4, 4]), torch.tensor([2.0, 3, 6, 9])
+    assert box_intersection(a, b) == 2
+    assert box_intersection(a, b + 10) == 0
+    assert xyxy_to_center(b).tolist() == [4, 6, 4, 6]
+    assert torch.equal(center_to_xyxy(xyxy_to_center(b)), b)
 
 
 # ---- suppression -----------------------------------------------------------------------------------------

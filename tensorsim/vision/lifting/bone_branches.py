@@ -113,7 +113,7 @@ def choose_branches(
     Args:
         distance: (S, T, 13) from the camera.
         lines: (S, T, 13, 3) unit lines of sight.
-        lengths: (S, 8) in metres, in the order of ``tensorsim.vision.lifting.bone_fit.LENGTH_SHARES``.
+        lengths: (S, 8) in metres, in the order of ``tensorsim.vision.lifting.bone_cost.LENGTH_SHARES``.
         given: (S, T, 13) distances that the lifter gave.
         trust: weight of these.
         spread_m: their deviation about the hips.

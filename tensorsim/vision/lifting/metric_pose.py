@@ -3,6 +3,7 @@
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
@@ -30,6 +31,40 @@ from tensorsim.vision.smoothing.along_time import (
 PANEL_DISTANCES_M = (4.00, 0.50)
 
 
+def metres_per_pixel(height_m: Tensor, height_px: Tensor) -> Tensor:
+    """Scale of a body in the image, ``alpha = H / h``: standing height (m) over height in pixels."""
+    return height_m / height_px
+
+
+def camera_range(focal_px: Tensor, height_m: Tensor, height_px: Tensor) -> Tensor:
+    """Distance along the optical axis of a pinhole camera, ``y = f H / h``, in metres.
+
+    Args:
+        focal_px: f, focal length in pixels.
+        height_m: H, height of the body in metres.
+        height_px: h, height in pixels of the body if it stood upright.
+    """
+    return focal_px * height_m / height_px
+
+
+def accumulated_displacement(u: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+    """The paper's position: displacement of every frame times the scale of that frame, accumulated.
+
+        x(0) = 0,   x(t) = x(t - 1) + alpha(t) (u(t) - u(t - 1))
+
+    Args:
+        u: (..., T) pixels.
+        alpha: (..., T) metres per pixel.
+        valid: (..., T) bool; other frames are filled with the nearest valid one.
+
+    Returns:
+        (..., T) metres, 0 up to the first valid frame.
+    """
+    u, alpha = fill_gaps(u, valid), fill_gaps(alpha, valid)
+    steps = alpha[..., 1:] * (u[..., 1:] - u[..., :-1])
+    return F.pad(steps.cumsum(dim=-1), [1, 0])
+
+
 def lowest_ankle(joints: Tensor) -> Tensor:
     """Height of the lower ankle (joints 10 and 13): (..., 14, 3) -> (...)."""
     return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])
@@ -43,33 +78,32 @@ def lowered(joints: Tensor, drop: Tensor) -> Tensor:
 def paper_pose(image: Tensor, lifted: Lifted, valid: Tensor, height: Tensor, distance: Tensor) -> Tensor:
     """Joints (..., P, T, 14, 2) of the image to the world as in the paper; see :class:`MetricPose`."""
     v = image[..., 1]
-    alpha = height / (v.amax(dim=-1) - v.amin(dim=-1)).clamp(min=1.0)
+    alpha = metres_per_pixel(height, (v.amax(dim=-1) - v.amin(dim=-1)).clamp(min=1.0))
     root = mid_hips(image)
-    first = valid.to(torch.int64).argmax(dim=-1, keepdim=True)
-    start = root[..., 0].gather(-1, first)
-    x = alpha * (root[..., 0] - start)
+    x = accumulated_displacement(root[..., 0], alpha, valid)
     across = alpha[..., None, None] * (image - root[..., None, :])
     depth = alpha[..., None] * 0.2 * lifted.scale[..., None] * lifted.depth
-    away = distance[..., None] + depth
-    joints = torch.stack([x[..., None] + across[..., 0], away, -across[..., 1]], dim=-1)
+    y = distance[..., None] + depth
+    joints = torch.stack([x[..., None] + across[..., 0], y, -across[..., 1]], dim=-1)
     return lowered(joints, lowest_ankle(joints))
 
 
 class MetricPose(nn.Module):
     """Places lifted people in the world.
 
-    ``mode="camera"``: a pinhole camera. A standing person of height H at range y takes ``s = f H / y``
-    pixels, and the lifter gives s whatever the pose, so the hips are at range ``y = H (f / s - d)``, d the
-    mean depth of the joints beyond the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm.
-    Each joint lies on its line of sight at its own depth. Frames that show fewer than ten joints tell no size: they
-    take that of the others, and one whose joints would make a body of less than 0.65 of it is not believed (a leg at
-    the edge of the picture, taken for a whole person). The floor follows the lower ankle as a low running
-    quantile, so that a jump leaves it and a wrong ankle does not move it.
+    ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
+    pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
+    joints relative to the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm. Each joint lies on
+    its line of sight at its own depth. Frames with fewer than ten visible joints do not give a reliable size: they
+    take that of the others, and one whose joints would make a body of less than 0.65 of it is discarded (a leg at
+    the edge of the picture, taken for a whole person). The floor is a low running quantile of the height of the lower
+    ankle, so that it stays through a jump and an outlier does not move it.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
-    joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips displaced sideways
-    by alpha times their way in the image, range constant, the lower ankle at z = 0 in every frame. Kept to
-    reproduce the published results: nobody can walk towards the radar in it, and who sits down grows.
+    joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
+    sum of their displacements in the image, each times the alpha of its frame, range constant, the lower ankle at
+    z = 0 in every frame. Kept to reproduce the published results: motion along the optical axis is not possible in
+    it, and the body grows when the person sits down.
 
     Args:
         camera: pinhole camera; None is the default one, at the radar.
@@ -80,16 +114,17 @@ class MetricPose(nn.Module):
         keypoint_threshold: score from which a joint counts as seen.
         mode: ``"camera"`` or ``"paper"``.
         range_smoothing_s: standard deviation of the smoothing kernel of the range.
-        floor_window_s: window in which the floor is looked for; longer than people stay in the air.
-        calibrated: height and tilt of the camera are known well: people stay at the height at which it sees them.
+        floor_window_s: window of the quantile that gives the floor; longer than a jump.
+        calibrated: height and tilt of the camera are known well: no floor is estimated, joints keep the heights that
+            the camera gives.
 
     Shape:
         joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
         (..., P, T) bool, image height and width in pixels, frames per second and, where the camera moves, its
         world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward) -> world joints
         (..., P, T, 14, 3) in metres and whether each was seen (..., P, T, 14). What was not seen is filled: a
-        hidden joint from the pose that the lifter found, a frame that is invalid or not believed from the
-        nearest other one; people without any are zeros. Differentiable.
+        hidden joint from the pose that the lifter found, an invalid or discarded frame from the nearest other one;
+        people without any are zeros. Differentiable.
 
     Raises:
         TensorsimError: heights or distances that are not positive, an unknown mode, wrong shapes, NaN, or a
@@ -121,8 +156,8 @@ class MetricPose(nn.Module):
         self.range_smoothing_s = range_smoothing_s
         self.floor_window_s = floor_window_s
         self.calibrated = calibrated
-        self.whole_body_joints = 10  # seen joints that make a body whole enough to tell its size
-        self.squeezed = 0.65  # of the size that whole bodies tell: below, a part was taken for a whole
+        self.whole_body_joints = 10  # visible joints from which the size of a body is reliable
+        self.least_size = 0.65  # of the size in reliable frames: below, a part was taken for a whole body
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
         camera = CameraConfig() if camera is None else camera
@@ -151,31 +186,7 @@ class MetricPose(nn.Module):
         camera_pose: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Joints, scores, Lifted, valid, image size, fps, camera poses -> world joints and what was seen."""
-        layout = "(..., P, T, 14, 2) joints in pixels"
-        check_floating(keypoints, "keypoints")
-        check_min_rank(keypoints, 4, "keypoints", layout)
-        check_size(keypoints, -2, 14, "keypoints", layout)
-        check_size(keypoints, -1, 2, "keypoints", layout)
-        shape = keypoints.shape
-        for name, size, expected in (
-            ("scores", scores.shape, shape[:-1]),
-            ("lifted.depth", lifted.depth.shape, shape[:-1]),
-            ("lifted.scale", lifted.scale.shape, shape[:-2]),
-            ("lifted.keypoints", lifted.keypoints.shape, shape),
-            ("valid", valid.shape, shape[:-2]),
-        ):
-            if list(size) != list(expected):
-                raise TensorsimError(f"{name}: got shape {list(size)}, expected {list(expected)}")
-        if valid.dtype != torch.bool:
-            raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
-        if shape[-3] < 1:
-            raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
-        check_finite(keypoints, "keypoints")
-        check_finite(scores, "scores")
-        if image_height < 1 or image_width < 1:
-            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
-        check_positive(fps, "fps")
-
+        _check(keypoints, scores, lifted, valid, image_height, image_width, fps)
         seen = (scores >= self.keypoint_threshold) & valid[..., None]
         height = self._of_each(self.heights, keypoints)
         distance = self._of_each(self.distances, keypoints)
@@ -185,49 +196,56 @@ class MetricPose(nn.Module):
             image = torch.where(seen[..., None], keypoints, lifted.keypoints)
             joints = paper_pose(image, lifted, valid, height, distance)
         else:
-            pose = self.camera_pose.to(keypoints.dtype)
-            if camera_pose is not None:
-                expected_pose = list(shape[:-4])
-                expected_pose.extend([shape[-3], 3, 4])
-                if list(camera_pose.shape) != expected_pose:
-                    raise TensorsimError(
-                        f"camera_pose: got shape {list(camera_pose.shape)}, expected {expected_pose}"
-                    )
-                pose = camera_pose.to(keypoints.dtype).unsqueeze(-4)
-            center = self.center_px
-            if center is None:
-                center = ((image_width - 1) / 2, (image_height - 1) / 2)
-            focal_px = self.focal_px
-            if focal_px is None:
-                focal_px = image_width / 2 / self.half_width
-
-            # The fitted scale is that at the mean depth of the joints, not of the hips.
+            pose = self._pose(keypoints, camera_pose)
             weights = scores.clamp(min=0.0)
             weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
-            beyond = (weights * lifted.depth).sum(dim=-1)
+            # The fitted scale is that at the mean depth of the joints, not of the hips.
+            offset = fill_gaps((weights * lifted.depth).sum(dim=-1), valid)
             scale = fill_gaps(lifted.scale, valid).clamp(min=1e-3)
-            beyond = fill_gaps(beyond, valid)
-            focal = torch.full_like(scale, focal_px)
+            focal = torch.full_like(scale, self._focal_px(image_width))
             if self.distance_gives_focal:
-                focal = self._focal_from(distance, height, scale, beyond, valid, fps)
-            # The size of a body that is half out of the picture is a guess: those frames follow the others.
+                focal = self._focal_from(distance, height, scale, offset, valid, fps)
+            # The size of a body that is half out of the picture is not reliable: those frames follow the others.
             whole = valid & (seen.sum(dim=-1) >= self.whole_body_joints)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
-            root_range = height * robust_smooth(focal / scale - beyond, whole, self.range_smoothing_s * fps)
-            # A network that sees a leg alone may take it for a small body: such a frame says nothing.
-            body_px = focal / (root_range / height + beyond).clamp(min=1e-3)
-            valid = valid & (whole | (scale > self.squeezed * body_px))
+            hips_range = camera_range(focal, height, scale) - height * offset
+            hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps)
+            # A network that sees a leg alone may take it for a small body: such a frame is discarded.
+            body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
+            valid = valid & (whole | (scale > self.least_size * body_px))
             seen = seen & valid[..., None]
-            # Hidden joints are where the pose has them, at the size that the other frames tell.
+            # Hidden joints are where the lifted pose has them, at the size of the reliable frames.
             middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)
             placed = middle + (body_px / scale)[..., None, None] * (lifted.keypoints - middle)
             image = torch.where(seen[..., None], keypoints, placed)
-            reach = root_range[..., None] + height[..., None] * lifted.depth
-            joints = back_project(image, reach, focal, torch.tensor(center).to(image), pose)
+            depth = hips_range[..., None] + height[..., None] * lifted.depth
+            joints = back_project(
+                image, depth, focal, self._center_px(image, image_height, image_width), pose
+            )
             if not self.calibrated:
                 joints = lowered(joints, self._floor(joints, valid, fps))
         joints = joints.gather(-3, nearest_valid(valid)[..., None, None].expand_as(joints))
         return joints * valid.any(dim=-1)[..., None, None, None], seen
+
+    def _pose(self, keypoints: Tensor, camera_pose: Tensor | None) -> Tensor:
+        """World-from-camera pose, broadcast to (..., P, T, 3, 4)."""
+        if camera_pose is None:
+            return self.camera_pose.to(keypoints.dtype)
+        expected = list(keypoints.shape[:-4])
+        expected.extend([keypoints.shape[-3], 3, 4])
+        if list(camera_pose.shape) != expected:
+            raise TensorsimError(f"camera_pose: got shape {list(camera_pose.shape)}, expected {expected}")
+        return camera_pose.to(keypoints.dtype).unsqueeze(-4)
+
+    def _center_px(self, like: Tensor, image_height: int, image_width: int) -> Tensor:
+        center = self.center_px
+        if center is None:
+            center = ((image_width - 1) / 2, (image_height - 1) / 2)
+        return torch.tensor(center).to(like)
+
+    def _focal_px(self, image_width: int) -> float:
+        focal = self.focal_px
+        return image_width / 2 / self.half_width if focal is None else focal
 
     def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
         """A value per person, (P, 1): the last one serves all further people."""
@@ -235,12 +253,12 @@ class MetricPose(nn.Module):
         return values.to(like.dtype)[person][:, None]
 
     def _focal_from(
-        self, distance: Tensor, height: Tensor, scale: Tensor, beyond: Tensor, valid: Tensor, fps: float
+        self, distance: Tensor, height: Tensor, scale: Tensor, offset: Tensor, valid: Tensor, fps: float
     ) -> Tensor:
         """Focal length (..., P, T) that puts each person at its distance in its first half second."""
         since = valid.to(torch.int64).cumsum(dim=-1)
         early = valid & (since <= max(int(0.5 * fps), 1))
-        return masked_median(scale * (distance / height + beyond), early).clamp(min=1.0).expand_as(scale)
+        return masked_median(scale * (distance / height + offset), early).clamp(min=1.0).expand_as(scale)
 
     def _floor(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
         """Height of the floor under each person, (..., P, T)."""
@@ -248,3 +266,39 @@ class MetricPose(nn.Module):
         window = int(self.floor_window_s * fps)
         low = running_quantile(low, window, 0.15)
         return local_linear(low, torch.ones_like(low), max(0.2 * window, 0.5))
+
+
+def _check(
+    keypoints: Tensor,
+    scores: Tensor,
+    lifted: Lifted,
+    valid: Tensor,
+    image_height: int,
+    image_width: int,
+    fps: float,
+) -> None:
+    """Refuse inputs that do not fit together."""
+    layout = "(..., P, T, 14, 2) joints in pixels"
+    check_floating(keypoints, "keypoints")
+    check_min_rank(keypoints, 4, "keypoints", layout)
+    check_size(keypoints, -2, 14, "keypoints", layout)
+    check_size(keypoints, -1, 2, "keypoints", layout)
+    shape = keypoints.shape
+    for name, size, expected in (
+        ("scores", scores.shape, shape[:-1]),
+        ("lifted.depth", lifted.depth.shape, shape[:-1]),
+        ("lifted.scale", lifted.scale.shape, shape[:-2]),
+        ("lifted.keypoints", lifted.keypoints.shape, shape),
+        ("valid", valid.shape, shape[:-2]),
+    ):
+        if list(size) != list(expected):
+            raise TensorsimError(f"{name}: got shape {list(size)}, expected {list(expected)}")
+    if valid.dtype != torch.bool:
+        raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
+    if shape[-3] < 1:
+        raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
+    check_finite(keypoints, "keypoints")
+    check_finite(scores, "scores")
+    if image_height < 1 or image_width < 1:
+        raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+    check_positive(fps, "fps")

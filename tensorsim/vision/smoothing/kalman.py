@@ -198,14 +198,14 @@ class KalmanSmoother(nn.Module):
 
     Args:
         process_noise: m^2 per frame^3 at 30 fps; None estimates it.
-        measurement_noise: variance of a measured coordinate, m^2; None estimates it.
+        measurement_noise: variance of a measured coordinate, m^2; it replaces ``noise_std_m`` too. None estimates it.
         mode: "rts", the Rauch-Tung-Striebel smoother, or "forward", the causal filter alone: it cannot look at
             the whole clip, and takes the panel's 0.001 and 0.01 where none are given.
         initial_speed: prior standard deviation of a joint's velocity at the first frame, m/s.
 
     Raises:
         TensorsimError: noise that is not positive, an unknown mode, wrong shapes, T = 0, fps not positive, a NaN or
-            infinite coordinate where ``valid``, or ``noise_std_m`` for a measurement noise that is given or fixed.
+            infinite coordinate where ``valid``.
     """
 
     process_density: float | None
@@ -271,8 +271,6 @@ class KalmanSmoother(nn.Module):
         """Variance of measured coordinates in m^2, broadcast to tracks (..., J, T, 3)."""
         given = self.measurement_noise
         if noise_std_m is not None:
-            if given is not None:
-                raise TensorsimError("noise_std_m: got it beside a measurement noise, expected one of them")
             check_floating(noise_std_m, "noise_std_m")
             sizes = list(valid.transpose(-1, -2).shape)
             coordinates = noise_std_m.shape[-1]

@@ -1,4 +1,4 @@
-"""Optimal rectangular assignment with gating: who is who from one frame to the next."""
+"""Hungarian assignment (global nearest neighbour) with gating: who is who from one frame to the next."""
 
 import math
 
@@ -9,10 +9,10 @@ from tensorsim.errors import TensorsimError, check_finite, check_floating, check
 
 
 def assign(cost: Tensor, allowed: Tensor, unassigned_cost: float) -> Tensor:
-    """The matching of rows to columns with the least total cost.
+    """Hungarian assignment: the matching of rows to columns with the least total cost.
 
     Total cost is the sum of ``cost`` over matched pairs plus ``unassigned_cost`` for every row left without a
-    column; columns may be left over for nothing, and pairs not ``allowed`` are never matched. It is the
+    column; columns may stay unmatched at no cost, and pairs not ``allowed`` are never matched. It is the
     square problem on ``cost`` extended by one private column per row at ``unassigned_cost``. A large
     ``unassigned_cost`` (above ``2 n max|cost|``) matches as many pairs as possible.
 

@@ -1,10 +1,10 @@
-"""Global nearest neighbour tracking of people through whole clips.
+"""Global nearest neighbour (GNN) tracking of people through whole clips.
 
 The state of a track is its box (centre u, centre v, width, height) and their velocities, 8 numbers, moving
 with constant velocity. Noise is stated in sizes of the box (its longer side), so that pixels do not matter,
-and alike for the four coordinates, so that they share one 2 x 2 covariance. Frame by frame: predict, assign
-detections to tracks at the least total cost, correct, confirm, delete. A clip is known whole, so the boxes
-handed out are then smoothed in both directions.
+and alike for the four coordinates, so that they share one 2 x 2 covariance. Frame by frame: Kalman prediction,
+Hungarian assignment of detections to tracks, Kalman update, confirmation (M of N), deletion. As the whole clip is
+known, the boxes returned are then smoothed in both directions.
 """
 
 from typing import NamedTuple
@@ -20,69 +20,49 @@ from tensorsim.errors import (
     check_rank,
     check_size,
 )
+from tensorsim.geometry.boxes import box_area, box_intersection, box_iou, center_to_xyxy, xyxy_to_center
 from tensorsim.types import Detections, Tracks
-from tensorsim.vision.smoothing.kalman import smooth_constant_velocity
+from tensorsim.vision.smoothing.kalman import (
+    KalmanState,
+    constant_velocity_predict,
+    kalman_update,
+    smooth_constant_velocity,
+)
 from tensorsim.vision.tracking.assignment import assign
 
 
-def box_overlap(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Overlap (n, m) of ``xyxy`` boxes (n, 4) and (m, 4): over their union, and over the area of ``b``."""
-    low = torch.maximum(a[:, None, :2], b[None, :, :2])
-    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
-    intersection = (high - low).clamp(min=0.0).prod(-1)
-    area_a = (a[:, 2:] - a[:, :2]).prod(-1).unsqueeze(1)
-    area_b = (b[:, 2:] - b[:, :2]).prod(-1).unsqueeze(0)
-    return intersection / (area_a + area_b - intersection), intersection / area_b
-
-
-def xyxy_to_center(boxes: Tensor) -> Tensor:
-    """``xyxy`` boxes (..., 4) as centre u, centre v, width, height."""
-    low, high = boxes[..., :2], boxes[..., 2:]
-    return torch.cat([(low + high) / 2.0, high - low], dim=-1)
-
-
-def center_to_xyxy(boxes: Tensor) -> Tensor:
-    """The inverse of :func:`xyxy_to_center`."""
-    center, half = boxes[..., :2], boxes[..., 2:] / 2.0
-    return torch.cat([center - half, center + half], dim=-1)
-
-
 class _Living(NamedTuple):
-    """The n tracks that may still be matched; ``p00, p01, p11`` is the covariance in squared sizes."""
+    """The n tracks that may still be matched."""
 
     rows: Tensor  # (n,) row of each in the table of all tracks
-    x: Tensor  # (n, 4) box as centre and sides
-    v: Tensor  # (n, 4) its velocity, per frame
-    p00: Tensor
-    p01: Tensor
-    p11: Tensor
+    box: KalmanState  # (n, 4) centre and sides, and their velocities per frame; variances (n, 1)
     history: Tensor  # (n, window) bool, hit or not in the observed frames, newest first
     age: Tensor  # (n,) observed frames since the start
 
 
 class GNNTracker(nn.Module):
-    """Follows people through clips: which detection is whom, and a box for every frame in between.
+    """Tracks people through clips: which detection belongs to whom, and a box for every frame in between.
 
     Input: :class:`Detections` with ``boxes`` (B, T, K, 4), the rest (B, T, K), and ``observed`` (T,) or (B,
-    T) bool, false in frames in which the detector was not run: there tracks coast and no miss is counted
+    T) bool, false in frames in which the detector was not run: there tracks are predicted and no miss is counted
     (None: it was run in every frame). Output: :class:`Tracks`, P the largest number of people in a clip,
     possibly 0; in each clip ordered by first frame, then larger first. Association runs on the CPU in float64
     whatever the device; the stage is not differentiable.
 
-    1. Detections count that are people (label 0), score at least ``detection_threshold`` and measure
-       ``min_box_px`` both ways.
-    2. Cost of a pair is ``(1 - IoU) + d^2 / assignment_threshold``, d the Mahalanobis distance of the
-       detection to the predicted box: IoU decides, distance where boxes do not overlap. A pair needs
-       ``d^2 <= assignment_threshold`` and centres within ``reach`` sizes (the covariance of a coasting track
-       soon spans the picture); a detection below ``start_score`` also an IoU of ``weak_iou``, lest a lost
-       person be found in a piece of furniture. Any such pair is better than none.
-    3. A detection left over, of at least ``start_score``, starts a track, unless it overlaps a better or
+    1. Detections are used that are people (label 0), score at least ``detection_threshold`` and measure at least
+       ``min_box_px`` in width and height.
+    2. Hungarian assignment: the cost of a pair is ``(1 - IoU) + d^2 / assignment_threshold``, d the Mahalanobis
+       distance of the detection to the predicted box, so that the distance decides where boxes do not overlap. A
+       pair needs ``d^2 <= assignment_threshold`` and centres within ``reach`` sizes (the covariance of a track
+       without detections soon spans the picture); a detection below ``start_score`` also needs an IoU of
+       ``weak_iou``, so that a lost person is not found in a piece of furniture. Any such pair is better than none.
+    3. An unmatched detection of at least ``start_score`` starts a track, unless it overlaps a better or
        matched one by an IoU above ``duplicate_iou``, or with more than ``duplicate_part`` of its own area:
-       one person seen twice.
+       one person detected twice.
     4. A track is confirmed by ``confirm_hits`` within ``confirm_window`` observed frames (else dropped) and
        ends after ``delete_misses`` within ``delete_window``.
     5. People are the confirmed tracks with at least ``min_hits`` detections of ``start_score`` or more (in a clip
-       with fewer observed frames: one in each): what a detector doubts most of the time is nobody. Of more than
+       with fewer observed frames: one in each), as tracks of low scores are mostly false. Of more than
        ``max_tracks`` at a time the best, by sum of scores, are kept.
     6. A person is valid from first to last detection, gaps included, and in unobserved frames next to these.
        The boxes are Rauch-Tung-Striebel smoothed; they may reach beyond the image a little.
@@ -102,7 +82,7 @@ class GNNTracker(nn.Module):
         process_noise: density of the acceleration noise, size^2 / frame^3.
         measurement_noise: variance of a detected coordinate, size^2.
         initial_speed: prior standard deviation of the velocities, sizes / frame.
-        reach: largest distance of a detection from the predicted centre, sizes.
+        reach: largest distance of a detection from the predicted centre, in sizes of the box.
         duplicate_iou: IoU with a better detection above which one starts no track.
         duplicate_part: part of its area inside a better detection above which one starts no track.
 
@@ -205,9 +185,9 @@ class GNNTracker(nn.Module):
         matched = which >= 0
         index = which.clamp(min=0).transpose(1, 2).unsqueeze(-1).expand(clips, frames, people, 4)
         measured = xyxy_to_center(boxes.gather(2, index).transpose(1, 2))
-        q = torch.full([1], self.process_noise, dtype=torch.float64)
-        r = torch.full([1], self.measurement_noise, dtype=torch.float64)
-        smooth = smooth_constant_velocity(measured, matched, q, r, self.initial_speed, 1.0)
+        smooth = smooth_constant_velocity(
+            measured, matched, self._process_noise(), self._measurement_noise(), self.initial_speed, 1.0
+        )
         smooth = torch.cat([smooth[..., :2], smooth[..., 2:].clamp(min=self.min_box_px)], dim=-1)
         valid = _presence(matched, looked)
         tracked = center_to_xyxy(smooth) * valid.unsqueeze(-1)
@@ -220,7 +200,8 @@ class GNNTracker(nn.Module):
         confirmed = torch.zeros(0, dtype=torch.bool)
         living = self._start(torch.zeros(0, dtype=torch.int64), boxes.new_zeros(0, 4))
         for t in range(frames):
-            living = self._predict(living)
+            predicted = constant_velocity_predict(living.box, self._process_noise(), 1.0)
+            living = _Living(living.rows, predicted, living.history, living.age)
             if not bool(looked[t]):
                 continue
             best_first = scores[t].argsort(descending=True, stable=True)
@@ -247,64 +228,61 @@ class GNNTracker(nn.Module):
             start = self._start(born, xyxy_to_center(box[new]))
             living = _Living(
                 torch.cat([living.rows[alive], start.rows]),
-                torch.cat([living.x[alive], start.x]),
-                torch.cat([living.v[alive], start.v]),
-                torch.cat([living.p00[alive], start.p00]),
-                torch.cat([living.p01[alive], start.p01]),
-                torch.cat([living.p11[alive], start.p11]),
+                KalmanState(
+                    torch.cat([living.box.position[alive], start.box.position]),
+                    torch.cat([living.box.velocity[alive], start.box.velocity]),
+                    torch.cat([living.box.p00[alive], start.box.p00]),
+                    torch.cat([living.box.p01[alive], start.box.p01]),
+                    torch.cat([living.box.p11[alive], start.box.p11]),
+                ),
                 torch.cat([living.history[alive], start.history]),
                 torch.cat([living.age[alive], start.age]),
             )
         return table[confirmed]
 
+    def _process_noise(self) -> Tensor:
+        return torch.full([1], self.process_noise, dtype=torch.float64)
+
+    def _measurement_noise(self) -> Tensor:
+        return torch.full([1], self.measurement_noise, dtype=torch.float64)
+
     def _start(self, rows: Tensor, z: Tensor) -> _Living:
         """Tracks that begin with boxes ``z``."""
-        p00 = torch.full_like(z[:, 0], self.measurement_noise)
-        p11 = torch.full_like(z[:, 0], self.initial_speed**2)
+        p00 = torch.full_like(z[:, :1], self.measurement_noise)
+        p11 = torch.full_like(z[:, :1], self.initial_speed**2)
         history = torch.zeros(z.shape[0], max(self.confirm_window, self.delete_window), dtype=torch.bool)
         history[:, 0] = True
-        return _Living(
-            rows, z, torch.zeros_like(z), p00, torch.zeros_like(p00), p11, history, torch.ones_like(rows)
-        )
-
-    def _predict(self, s: _Living) -> _Living:
-        """One frame ahead: the constant-velocity model of :mod:`tensorsim.vision.smoothing.kalman` with dt = 1."""
-        q = self.process_noise
-        p00, p01, p11 = s.p00 + 2.0 * s.p01 + s.p11 + q / 3.0, s.p01 + s.p11 + q / 2.0, s.p11 + q
-        return _Living(s.rows, s.x + s.v, s.v, p00, p01, p11, s.history, s.age)
+        state = KalmanState(z, torch.zeros_like(z), p00, torch.zeros_like(p00), p11)
+        return _Living(rows, state, history, torch.ones_like(rows))
 
     def _correct(self, s: _Living, z: Tensor, column: Tensor) -> _Living:
         """The Kalman update of matched tracks, and one more hit or miss for all."""
         hit = column >= 0
-        gain = hit / (s.p00 + self.measurement_noise)
-        k0, k1 = gain * s.p00, gain * s.p01
-        innovation = torch.zeros_like(s.x)
-        innovation[hit] = z[column[hit]] - s.x[hit]
+        measured = torch.zeros_like(s.box.position)
+        measured[hit] = z[column[hit]]
         return _Living(
             s.rows,
-            s.x + k0.unsqueeze(-1) * innovation,
-            s.v + k1.unsqueeze(-1) * innovation,
-            (1.0 - k0) * s.p00,
-            (1.0 - k0) * s.p01,
-            s.p11 - k1 * s.p01,
+            kalman_update(s.box, measured, self._measurement_noise(), hit.unsqueeze(-1)),
             torch.cat([hit.unsqueeze(-1), s.history[:, :-1]], dim=-1),
             s.age + 1,
         )
 
     def _assign(self, s: _Living, box: Tensor, strong: Tensor) -> Tensor:
         """Detection of each living track among the boxes of a frame (n,), -1 for none."""
-        size = s.x[:, 2:].amax(-1).clamp(min=self.min_box_px)
-        offset = (xyxy_to_center(box).unsqueeze(0) - s.x.unsqueeze(1)) / size[:, None, None]
-        distance = offset.square().sum(-1) / (s.p00 + self.measurement_noise).unsqueeze(-1)
-        x = torch.cat([s.x[:, :2], s.x[:, 2:].clamp(min=self.min_box_px)], dim=-1)
-        iou, _ = box_overlap(center_to_xyxy(x), box)
+        x = s.box.position
+        size = x[:, 2:].amax(-1).clamp(min=self.min_box_px)
+        offset = (xyxy_to_center(box).unsqueeze(0) - x.unsqueeze(1)) / size[:, None, None]
+        distance = offset.square().sum(-1) / (s.box.p00 + self.measurement_noise)
+        x = torch.cat([x[:, :2], x[:, 2:].clamp(min=self.min_box_px)], dim=-1)
+        iou = box_iou(center_to_xyxy(x)[:, None], box[None])
         near = torch.linalg.vector_norm(offset[..., :2], dim=-1) <= self.reach
         allowed = near & (distance <= self.assignment_threshold) & (strong | (iou >= self.weak_iou))
         return assign(1.0 - iou + distance / self.assignment_threshold, allowed, 2.0)
 
     def _newcomers(self, box: Tensor, strong: Tensor, taken: Tensor) -> Tensor:
         """Which detections of a frame, best first, start tracks."""
-        iou, part = box_overlap(box, box)
+        iou = box_iou(box[:, None], box[None])
+        part = box_intersection(box[:, None], box[None]) / box_area(box)
         double = (iou > self.duplicate_iou) | (part > self.duplicate_part)
         blocked = ~strong | double[taken].any(0)
         new: list[int] = []
@@ -338,7 +316,7 @@ class GNNTracker(nn.Module):
 
 
 def _presence(matched: Tensor, looked: Tensor) -> Tensor:
-    """Frames (B, P, T) of presence: between matches, and parted from them by no look in vain."""
+    """Frames (B, P, T) of presence: from the first match to the last, and unobserved frames next to these."""
     looks = looked.to(torch.int64).unsqueeze(1).expand_as(matched)
     until = looks.cumsum(-1)
     before = until - looks

@@ -13,16 +13,29 @@ from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.lifting.block_tridiagonal import solve_block_tridiagonal
 from tensorsim.vision.lifting.bone_branches import choose_branches, smoothest_sequence
-from tensorsim.vision.lifting.bone_fit import (
-    BONES,
-    LENGTH_OF_BONE,
-    LENGTH_SHARES,
-    BoneFit,
-    expected_acceleration,
-)
+from tensorsim.vision.lifting.bone_cost import expected_acceleration
+from tensorsim.vision.lifting.bone_fit import BoneFit
 from tests.stage import StageTester
 
 CAMERA = (0.1, -2.0, 1.1)
+#: Bones by their ends, 14 the middle of the hips, and which length each has: nose to neck, shoulders, upper arm,
+#: forearm, hips, thigh, shank, trunk as shares of the standing height (Winter, after Drillis and Contini).
+BONES = [
+    (0, 1),
+    (2, 5),
+    (2, 3),
+    (3, 4),
+    (5, 6),
+    (6, 7),
+    (8, 11),
+    (8, 9),
+    (9, 10),
+    (11, 12),
+    (12, 13),
+    (1, 14),
+]
+LENGTH_OF_BONE = [0, 1, 2, 3, 2, 3, 4, 5, 6, 5, 6, 7]
+LENGTH_SHARES = [0.1253, 0.210, 0.186, 0.146, 0.12, 0.245, 0.246, 0.288]
 FREE = [0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13]
 FPS = 30.0
 

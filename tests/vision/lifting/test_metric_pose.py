@@ -16,7 +16,13 @@ from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
-from tensorsim.vision.lifting.metric_pose import MetricPose, lowest_ankle
+from tensorsim.vision.lifting.metric_pose import (
+    MetricPose,
+    accumulated_displacement,
+    camera_range,
+    lowest_ankle,
+    metres_per_pixel,
+)
 from tests.stage import StageTester
 
 WIDTH, HEIGHT, FPS, TALL = 1280, 720, 30.0, 1.75
@@ -259,19 +265,41 @@ def test_a_jump_leaves_the_floor_and_a_wrong_ankle_does_not_move_it() -> None:
     assert float(lowest_ankle(papers).abs().max()) < 1e-9
 
 
-def test_papers_position_is_pixels_times_alpha_at_constant_range() -> None:
+def test_papers_position_adds_pixels_times_alpha_at_constant_range() -> None:
     world = walker((-0.5, 4.0), (0.6, 0.0))
     image, lifted = film(world)
     paper = place(MetricPose(person_height_m=(TALL,), mode="paper", initial_distance_m=(2.5,)), image, lifted)
     extent = image[..., 1].amax(dim=-1) - image[..., 1].amin(dim=-1)
     alpha = TALL / extent
     root = mid_hips(image)
-    torch.testing.assert_close(mid_hips(paper)[:, 0], alpha * (root[:, 0] - root[0, 0]))
+    x = np.zeros(90)
+    for t in range(1, 90):
+        x[t] = x[t - 1] + float(alpha[t]) * float(root[t, 0] - root[t - 1, 0])
+    np.testing.assert_allclose(mid_hips(paper)[:, 0].numpy(), x, rtol=0, atol=1e-9)
     torch.testing.assert_close(mid_hips(paper)[:, 1], torch.full((90,), 2.5, dtype=torch.float64))
     depth = 0.2 * alpha[:, None] * lifted.scale[:, None] * lifted.depth
     torch.testing.assert_close(paper[..., 1] - 2.5, depth)
     with pytest.raises(TensorsimError, match="the paper has no camera"):
         place(MetricPose(mode="paper"), image, lifted, camera_pose=torch.zeros(90, 3, 4))
+
+
+def test_papers_position_stays_where_the_hips_stay_while_the_scale_changes() -> None:
+    """Across the picture, then down into a squat with the hips in place."""
+    u = torch.cat([torch.linspace(100, 500, 20), torch.full((20,), 500.0)]).double()
+    size = torch.cat([torch.full((20,), 450.0), torch.linspace(450, 260, 20)]).double()
+    alpha, valid = metres_per_pixel(torch.tensor(1.75), size), torch.ones(40, dtype=torch.bool)
+    x = accumulated_displacement(u, alpha, valid)
+    assert x[0] == 0
+    assert x[19:].tolist() == pytest.approx([400 * 1.75 / 450] * 21)
+    valid[5:9] = valid[:2] = False  # frames without a pose change nothing of where it ends
+    x = accumulated_displacement(torch.where(valid, u, 1e6), alpha, valid)
+    assert x[:3].tolist() == [0, 0, 0]
+    assert float(x[-1]) == pytest.approx(float(u[-1] - u[2]) * 1.75 / 450)
+
+
+def test_range_of_a_pinhole_camera() -> None:
+    focal, height = torch.tensor(1000.0), torch.tensor(1.8)
+    assert float(camera_range(focal, height, torch.tensor(450.0))) == pytest.approx(4.0)
 
 
 def test_the_last_height_serves_all_further_people() -> None:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.geometry.boxes import box_iou, center_to_xyxy, xyxy_to_center
 from tensorsim.types import Detections, Tracks
-from tensorsim.vision.tracking.tracker import GNNTracker, box_overlap, center_to_xyxy, xyxy_to_center
+from tensorsim.vision.tracking.tracker import GNNTracker
 from tests.stage import StageTester
 
 
@@ -52,7 +53,7 @@ def hidden(boxes: Tensor, frames: slice) -> Tensor:
 
 def overlap(tracks: Tracks, person: int, truth: Tensor) -> Tensor:
     """IoU (T,) of one person's boxes with the truth, zero where not valid."""
-    return box_overlap(tracks.boxes[0, person].double(), truth)[0].diagonal() * tracks.valid[0, person]
+    return box_iou(tracks.boxes[0, person].double(), truth) * tracks.valid[0, person]
 
 
 class TestGNNTracker(StageTester):
@@ -182,7 +183,7 @@ def test_unobserved_frames_are_not_read() -> None:
 
 def test_fast_small_person_whose_boxes_do_not_overlap() -> None:
     runner = walker(50, 950, 40, height=50)  # 23 px a frame, the box is 20 px wide
-    assert box_overlap(runner[:1], runner[1:2])[0] == 0
+    assert box_iou(runner[0], runner[1]) == 0
     tracks = GNNTracker()(film([runner], jitter=0.5))
     assert tracks.boxes.shape[1] == 1
     assert tracks.valid.all()
@@ -331,15 +332,6 @@ def test_smoothed_boxes_are_nearer_the_truth_than_the_detections() -> None:
     assert (tracks.boxes[0, 0] - truth).square().mean() < 0.8 * raw
 
 
-@pytest.mark.parametrize("boxes", [([0.0, 0, 4, 4], [2.0, 2, 6, 4])])
-def test_box_overlap_by_hand(boxes: tuple[list[float], list[float]]) -> None:
-    a, b = (torch.tensor([box]) for box in boxes)
-    iou, part = box_overlap(a, b)
-    assert iou.item() == pytest.approx(4 / 20)
-    assert part.item() == pytest.approx(4 / 8)
-    assert torch.equal(center_to_xyxy(xyxy_to_center(b)), b)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -428,7 +420,7 @@ def test_two_people_who_hug_keep_their_ids(shared_data: Path) -> None:
         for start in range(4, 48, 8):
             cut = detections.valid.clone()
             for t in range(start, start + 20):
-                iou = box_overlap(tracks.boxes[0, :, t], detections.boxes[0, t])[0].nan_to_num()
+                iou = box_iou(tracks.boxes[0, :, None, t], detections.boxes[0, t])
                 cut[0, t] &= (iou.argmax(0) != person) | (iou.amax(0) < 0.3)
             again = GNNTracker()(detections._replace(valid=cut), observed)
             assert again.boxes.shape[1] == 2
