@@ -7,6 +7,10 @@ and ``enhance`` hold the stages.
 Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where they are (see ``tensorsim.paper``):
 """
 
+# isort: off
+from tensorsim import process  # noqa: F401  # first: the command settles its threads before torch is loaded
+
+# isort: on
 from tensorsim import data, enhance, export, motion, radar, recognition, vision
 from tensorsim.config import (
     ACTIVITIES,

@@ -8,6 +8,7 @@ from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
+from tensorsim import process
 from tensorsim.commands.check import Check
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_classifier import EvaluateClassifier
@@ -108,8 +109,8 @@ def _one_line_of_why() -> Iterator[None]:
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        # Who reads the lines has seen enough (`| head`). Python would try to flush them once more at the exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Who reads the lines has seen enough (`| head`).
+        _drop_output()
         sys.exit(141)
     except TensorsimError as error:
         _stop(2, f"error: {error}")
@@ -119,7 +120,16 @@ def _one_line_of_why() -> Iterator[None]:
         _stop(130, "interrupted")
 
 
+def _drop_output() -> None:
+    """Leave what is not yet printed: Python would try to flush it once more at the exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _stop(status: int, why: str) -> NoReturn:
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _drop_output()
     print(f"tensorsim: {' '.join(why.split())}", file=sys.stderr)
     sys.exit(status)
 
@@ -138,10 +148,10 @@ def parse(arguments: list[str] | None = None) -> Any:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the ``tensorsim`` command.
 
-    Exit status: 0 done, 2 bad input or a file that cannot be read or written, 130 interrupted, 141 nobody reads the
-    output.
+    Exit status: 0 done, 2 bad input or a file that cannot be read or written, 129 and 143 ended by SIGHUP and SIGTERM,
+    130 interrupted, 141 nobody reads the output.
     """
-    with _one_line_of_why():
+    with process.ending_cleanly(), _one_line_of_why():
         parse(arguments).run()
 
 

@@ -14,7 +14,12 @@ def usable_device(name: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise TensorsimError(f"--device: {name!r} is not usable here: {str(error).splitlines()[0]}") from None
-    return torch.device(name)
+        device = torch.device(name)
+        # Some devices have tensors but no values (meta), or a name but no library.
+        usable = float(torch.ones(2, device=device).sum()) == 2.0
+    except Exception as error:  # each backend has errors of its own
+        why = (str(error) or type(error).__name__).splitlines()[0]
+        raise TensorsimError(f"--device: {name!r} is not usable here: {why}") from None
+    if not usable:
+        raise TensorsimError(f"--device: {name!r} is not usable here: it does not add up")
+    return device

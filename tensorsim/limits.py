@@ -24,7 +24,9 @@ RANGES: dict[str, Range] = {
     "time": Range(0.0, 1e6, "s"),
     "stride": Range(1, 100_000, "frames"),
     "image side": Range(2, 8190, "pixels"),
-    "people": Range(1, 64, "people"),
+    "people in a frame": Range(1, 64, "people"),
+    "people": Range(1, 256, "people"),
+    "size of a file": Range(0, 1e9, "bytes"),
     # bodies and places
     "body height": Range(0.3, 3.0, "m"),
     "distance": Range(0.1, 1000.0, "m"),

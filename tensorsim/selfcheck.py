@@ -2,11 +2,13 @@
 
 import hashlib
 import importlib
+import os
 from collections.abc import Callable
 
 import torch
 
 from tensorsim.config import RadarConfig
+from tensorsim.process import cpu_quota
 
 _LIBRARIES = (
     "torch",
@@ -64,11 +66,23 @@ def _device() -> str:
     return f"{torch.cuda.get_device_name()} and CPU with {torch.get_num_threads()} threads"
 
 
+def _threads() -> str:
+    """How threads wait for one another; those that spin for long stop each other on a busy machine."""
+    waits = ", ".join(
+        f"{name}={os.environ[name]}" for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT") if name in os.environ
+    )
+    return (
+        f"{torch.get_num_threads()} threads, {cpu_quota()} of {os.cpu_count()} processors usable, "
+        f"waiting: {waits or 'the default of OpenMP, slow on a busy machine; set OMP_WAIT_POLICY=PASSIVE'}"
+    )
+
+
 def run_checks() -> bool:
     """Run every check and print a line for each; True if all pass."""
     checks: dict[str, Callable[[], str]] = {
         "libraries": _libraries,
         "device": _device,
+        "threads": _threads,
         "shipped files": _shipped_files,
         "radar chain": _radar_chain,
     }

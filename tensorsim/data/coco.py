@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tensorsim.errors import TensorsimError, check_finite
 from tensorsim.files import reading
+from tensorsim.limits import check_range
 
 
 class Keypoints2D(NamedTuple):
@@ -46,12 +47,15 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     size = None
     for number, file in enumerate(files):
         with reading(file, "JSON of COCO keypoints"):
+            check_range(file.stat().st_size, "size of a file", str(file))
             content = json.loads(file.read_text(encoding="utf-8"))
             whole = isinstance(content, dict)
             for image in content.get("images", []) if whole else []:
                 people.setdefault(number if path.is_dir() else image["id"], [])
                 if "height" in image and "width" in image:
                     size = (int(image["height"]), int(image["width"]))
+                    for side in size:
+                        check_range(side, "image side", f"{file}: size of the images")
             people.setdefault(number, []) if path.is_dir() else None
             for person in content.get("annotations", []) if whole else content:
                 numbers = person.get("keypoints") if isinstance(person, dict) else None
@@ -73,6 +77,8 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
         frames = [people[frame] for frame in sorted(people)]
         tracks = sorted({person["track_id"] for person in everybody if tracked})
         count = len(tracks) or max(len(frame) for frame in frames)
+        check_range(max(len(frame) for frame in frames), "people in a frame", str(path))
+        check_range(count, "people", str(path))
         data = torch.zeros(len(frames), count, 17, 3)
         valid = torch.zeros(len(frames), count, dtype=torch.bool)
         for t, frame in enumerate(frames):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_finite, check_positive
+from tensorsim.limits import check_range
 
 #: What skeletons call a joint, best first, after the side: Mixamo and CMU name bones by where they start.
 _ALIASES = {
@@ -116,6 +117,7 @@ def motion_of(
     if fps is None:
         raise TensorsimError(f"{path}: got no frame rate in the file, expected one as fps")
     check_positive(fps, f"{path}: fps")
+    check_range(fps, "frame rate", f"{path}: fps")
     if positions.shape[-3] < 1:
         raise TensorsimError(f"{path}: got no frames, expected at least one")
     check_finite(positions, str(path))
@@ -125,6 +127,7 @@ def motion_of(
         raise TensorsimError(f"{path}: {error}") from error
     if joints.dim() == 3:
         joints = joints[None]
+    check_range(joints.shape[0], "people in a frame", str(path))
     if valid is None:
         valid = torch.ones(joints.shape[:2], dtype=torch.bool)
     if valid.shape != joints.shape[:2]:

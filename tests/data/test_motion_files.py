@@ -362,6 +362,27 @@ def test_bad_coco_is_refused(text: str, tmp_path: Path) -> None:
         load_coco_keypoints(path)
 
 
+def test_more_people_than_a_scene_has_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "many.json"
+    for people, message in (
+        ([entry(1, image_id=1)] * 200, "got 200, expected people in a frame from 1 to 64"),
+        ([entry(1, image_id=i, track_id=i) for i in range(1500)], "got 1500, expected people from 1 to 256"),
+    ):
+        path.write_text(json.dumps(people))
+        with pytest.raises(TensorsimError, match=f"many.json: {message}"):
+            load_coco_keypoints(path)
+    images = [{"id": 1, "height": 100_000, "width": 100_000}]
+    path.write_text(json.dumps({"images": images, "annotations": [entry(1, image_id=1)]}))
+    with pytest.raises(TensorsimError, match="size of the images: got 100000, expected image side"):
+        load_coco_keypoints(path)
+    np.savez(tmp_path / "many.npz", joints_m=np.zeros((200, 2, 14, 3)), fps=30.0)
+    with pytest.raises(TensorsimError, match=r"many\.npz: got 200, expected people in a frame"):
+        load_motion(tmp_path / "many.npz")
+    np.savez(tmp_path / "slow.npz", joints_m=np.zeros((2, 14, 3)), fps=1e-300)
+    with pytest.raises(TensorsimError, match=r"slow\.npz: fps: got 1e-300, expected frame rate from 0.1"):
+        load_motion(tmp_path / "slow.npz")
+
+
 # ---- placement and refusals ----------------------------------------------------------------------------
 
 

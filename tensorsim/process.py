@@ -1,0 +1,83 @@
+"""The process of the ``tensorsim`` command: threads that do not spin for long, and an end that leaves nothing behind.
+
+``tensorsim/__init__.py`` imports this first, because torch's OpenMP runtime reads its settings when it is loaded. In a
+process that is not the command, nothing is changed.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+#: Rounds that a thread waits busily for its next work before it sleeps. OpenMP's default keeps a core busy for
+#: milliseconds, which makes everything many times slower where another process wants that core; this is the number
+#: that it takes itself once there are more threads than cores.
+SPIN_ROUNDS = 1000
+
+
+def is_command() -> bool:
+    """Whether this process was started as ``tensorsim`` or ``python -m tensorsim.cli``."""
+    return Path(sys.argv[0]).stem == "tensorsim" or "tensorsim.cli" in sys.orig_argv[1:3]
+
+
+def prepare() -> None:
+    """Settle what has to be settled before torch is imported; variables that the user has set stay."""
+    signal.signal(signal.SIGINT, _quit)
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
+        os.environ["GOMP_SPINCOUNT"] = str(SPIN_ROUNDS)
+    quota = cpu_quota()
+    if "OMP_NUM_THREADS" not in os.environ and quota < (os.cpu_count() or 1):
+        os.environ["OMP_NUM_THREADS"] = str(quota)
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        print("tensorsim: error: the working directory was deleted, go to one that exists", file=sys.stderr)
+        os._exit(2)
+
+
+def cpu_quota(limit: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
+    """Processors that this process may use: those it is bound to, and what its container is allowed."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = limit.read_text().split()
+        return count if quota == "max" else max(1, min(count, round(int(quota) / int(period))))
+    except (OSError, ValueError):
+        return count
+
+
+@contextmanager
+def ending_cleanly() -> Iterator[None]:
+    """In the block, SIGTERM and SIGHUP end the process as exceptions do: temporary files are removed.
+
+    Standard output that is closed is replaced by one that nobody reads.
+    """
+    for stream in ("stdin", "stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115  # open till the end
+    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _end}
+    if hasattr(signal, "SIGHUP"):
+        handlers[signal.SIGHUP] = _end
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    signal.signal(number, signal.SIG_IGN)  # once: what follows is the cleaning up
+    sys.exit(128 + number)
+
+
+def _quit(number: int, frame: FrameType | None) -> NoReturn:
+    print("tensorsim: interrupted", file=sys.stderr, flush=True)
+    os._exit(130)  # nothing has been written yet, and libraries turn exceptions in their imports into others
+
+
+if is_command():
+    prepare()

@@ -1,0 +1,105 @@
+"""The process of the command: how it starts and how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tensorsim import process
+from tensorsim.files import complete_or_nothing
+
+
+def run_python(code: str, **options: object) -> subprocess.CompletedProcess[str]:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))}
+    environment["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment, **options
+    )  # type: ignore[call-overload,no-any-return]
+
+
+#: Something to do at the moment at which the package imports torch, and nothing after it.
+AT_IMPORT = """
+import os, signal, sys
+class Watch:
+    def find_spec(self, name, *_):
+        if name == "torch":
+            {action}
+sys.meta_path.insert(0, Watch())
+sys.argv = {argv}
+import tensorsim.cli
+"""
+
+
+def test_an_interrupt_while_torch_is_imported_is_one_line() -> None:
+    interrupt = "os.kill(os.getpid(), signal.SIGINT)"
+    done = run_python(AT_IMPORT.format(action=interrupt, argv=["/usr/bin/tensorsim", "check"]))
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "tensorsim: interrupted\n")
+
+
+def test_threads_are_settled_before_torch_is_imported_and_for_the_command_only() -> None:
+    show = "print(os.environ.get('GOMP_SPINCOUNT')); os._exit(0)"
+    for argv, expected in ((["/usr/bin/tensorsim"], "1000"), (["my_program.py"], "None")):
+        done = run_python(AT_IMPORT.format(action=show, argv=argv))
+        assert done.stdout.strip() == expected, done.stderr
+
+
+def test_a_deleted_working_directory_is_said(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    remove = f"os.rmdir({str(gone)!r})\n"
+    code = "import os\n" + remove + AT_IMPORT.format(action="os._exit(0)", argv=["tensorsim", "check"])
+    done = run_python(code, cwd=gone)
+    assert done.returncode == 2
+    assert done.stderr == "tensorsim: error: the working directory was deleted, go to one that exists\n"
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_signals_leave_nothing_behind(name: str, tmp_path: Path) -> None:
+    number = signal.Signals[name]
+    before = signal.getsignal(number)
+    with (  # noqa: PT012
+        pytest.raises(SystemExit) as exit_,
+        process.ending_cleanly(),
+        complete_or_nothing(tmp_path / "out") as folder,
+    ):
+        (folder / "half").touch()
+        os.kill(os.getpid(), number)
+        time.sleep(5)
+    assert exit_.value.code == 128 + number
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("redirect", [">&-", ">/dev/full"])
+def test_output_that_nobody_can_take(redirect: str) -> None:
+    root = Path(__file__).resolve().parents[1]
+    command = f"exec '{sys.executable}' -m tensorsim.cli models list {redirect}"
+    done = subprocess.run(
+        ["bash", "-c", command],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(root)},
+    )
+    if redirect == ">&-":
+        assert (done.returncode, done.stderr) == (0, "")
+    else:
+        assert (done.returncode, done.stderr) == (2, "tensorsim: error: [Errno 28] No space left on device\n")
+
+
+def test_threads_of_a_container(tmp_path: Path) -> None:
+    here = process.cpu_quota(tmp_path / "none")
+    assert here >= 1
+    for text, expected in (
+        ("max 100000", here),
+        ("50000 100000", 1),
+        ("100000 100000", 1),
+        ("99900000 100000", here),
+        ("rubbish", here),
+    ):
+        (tmp_path / "cpu.max").write_text(text)
+        assert process.cpu_quota(tmp_path / "cpu.max") == expected
