@@ -1,5 +1,6 @@
 """Films and motion files in, rendered people, films and sound out."""
 
+from tensorsim.data.clip import Clip, read_video
 from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
 from tensorsim.data.motion_files import load_motion, place
 from tensorsim.data.skeletons import Motion
@@ -9,6 +10,7 @@ from tensorsim.geometry.framing import camera_on
 from tensorsim.render.renderer import PersonRenderer, RenderedVideo
 
 __all__ = [
+    "Clip",
     "Keypoints2D",
     "Motion",
     "PersonRenderer",
@@ -20,6 +22,7 @@ __all__ = [
     "load_coco_keypoints",
     "load_motion",
     "place",
+    "read_video",
     "slow_time_signal",
     "write_sound",
     "write_video",

@@ -1,13 +1,13 @@
 """Joints at video rate -> scatterers at pulse rate."""
 
 from tensorsim.body.skeleton import body_to_coco
-from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion
+from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion, activity_index
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import People, PeopleConfig
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
-from tensorsim.motion.scatterers import JointScatterers
+from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.motion.shadowing import Shadowing
 from tensorsim.motion.walking import boulic_gait
 
@@ -22,6 +22,8 @@ __all__ = [
     "PoseResampler",
     "SavitzkyGolay",
     "Shadowing",
+    "activity_index",
     "body_to_coco",
     "boulic_gait",
+    "visibility_fade",
 ]

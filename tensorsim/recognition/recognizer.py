@@ -1,23 +1,29 @@
 """Maps of a radar to activities: the picture that a network was trained on, then the network."""
 
 import os
+from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
+from tensorsim.recognition.labels import LabelSet
 from tensorsim.recognition.map_image import MapToImage, ridge_map
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
 from tensorsim.types import RadarMaps
+from tensorsim.weights import read_metadata, save_weights
 
 #: What a network can look at, and how many channels that has.
 INPUTS = {"doppler": 1, "ridges": 1, "merged": 2}
+#: Networks that a weight file can name.
+NETWORKS: dict[str, type[SPNet] | type[SPGNet]] = {"SPNet": SPNet, "SPGNet": SPGNet}
 
 
 class ActivityRecognizer(nn.Module):
-    """Maps of one radar to the logits of activities (order of ``tensorsim.ACTIVITIES``).
+    """Maps of one radar to the logits of activities, or of classes of your own.
 
     Args:
         radar: the radar of the maps, which tells what a Doppler bin is in m/s.
@@ -25,11 +31,17 @@ class ActivityRecognizer(nn.Module):
         inputs: ``"doppler"``, the Doppler-time map; ``"ridges"``, its ridges alone; ``"merged"``, the range-time map
             after moving target indication and the Doppler-time map as two channels.
         size, speed_m_s, range_db: of the picture, see :class:`MapToImage`.
+        class_names: of the network's outputs in their order; by default ``tensorsim.ACTIVITIES``.
 
     Shapes: RadarMaps -> (..., classes). Differentiable by the maps.
 
+    Attributes:
+        class_names: as given.
+        labels: the same as a :class:`LabelSet`.
+
     Raises:
-        TensorsimError: unknown inputs, or a network with another number of input channels.
+        TensorsimError: unknown inputs, a network with another number of input channels, or another number of
+            classes than names.
     """
 
     def __init__(
@@ -40,6 +52,7 @@ class ActivityRecognizer(nn.Module):
         size: int = 224,
         speed_m_s: float = 3.8,
         range_db: float = 40.0,
+        class_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__()
         if inputs not in INPUTS:
@@ -52,7 +65,16 @@ class ActivityRecognizer(nn.Module):
                 f"ActivityRecognizer: got a network of {channels} input channels, expected {INPUTS[inputs]}, as "
                 f"{inputs} has"
             )
+        self.labels = LabelSet() if class_names is None else LabelSet(tuple(class_names))
+        classes = getattr(network, "num_classes", len(self.labels))
+        if classes != len(self.labels):
+            raise TensorsimError(
+                f"ActivityRecognizer: got a network of {classes} classes, expected {len(self.labels)}, one per class "
+                "name"
+            )
+        self.class_names = self.labels.names
         self.inputs = inputs
+        self.size, self.speed_m_s, self.range_db = size, speed_m_s, range_db
         self.doppler_picture = MapToImage.doppler(radar, speed_m_s=speed_m_s, size=size, range_db=range_db)
         self.range_picture = MapToImage.range(radar, size=size, range_db=range_db)
         self.network = network
@@ -72,11 +94,46 @@ class ActivityRecognizer(nn.Module):
             return doppler
         return torch.cat([self.range_picture(maps.range_time_mti), doppler], dim=-3)
 
+    @torch.jit.unused
+    def save_pretrained(self, path: str | os.PathLike[str], class_names: Sequence[str] | None = None) -> None:
+        """Write weights, classes and what the pictures are, for :meth:`from_pretrained`.
+
+        Args:
+            path: ends in ``.safetensors``. Parameters are stored in float16.
+            class_names: instead of those of this recognizer.
+
+        Raises:
+            TensorsimError: a network that is neither SPNet nor SPGNet, another suffix, or another number of classes.
+        """
+        labels = self.labels if class_names is None else LabelSet(tuple(class_names))
+        name = type(self.network).__name__
+        if name not in NETWORKS:
+            raise TensorsimError(
+                f"save_pretrained: got a network of class {name}, expected one of {', '.join(NETWORKS)}; write others "
+                "with tensorsim.weights.save_weights"
+            )
+        if len(labels) != len(self.labels):
+            raise TensorsimError(f"class_names: got {len(labels)}, expected {len(self.labels)}")
+        if Path(path).suffix != ".safetensors":
+            raise TensorsimError(f"{path}: got the suffix {Path(path).suffix!r}, expected .safetensors")
+        save_weights(
+            self.network,
+            path,
+            {
+                "network": name,
+                "inputs": self.inputs,
+                "size": str(self.size),
+                "speed_m_s": repr(self.speed_m_s),
+                "range_db": repr(self.range_db),
+                "class_names": labels.to_text(),
+            },
+        )
+
     @classmethod
     def from_pretrained(
         cls, radar: RadarConfig, source: str | os.PathLike[str] | None = None
     ) -> "ActivityRecognizer":
-        """Build the recognizer of a weight file of SPNet or SPGNet, which says what its pictures were.
+        """Build the recognizer of a weight file of SPNet or SPGNet, which says what its pictures and classes are.
 
         Args:
             radar: of the maps to come.
@@ -86,21 +143,21 @@ class ActivityRecognizer(nn.Module):
             TensorsimError: no such file or name, or a file that does not say what it was trained on.
         """
         from tensorsim.registry import locate
-        from tensorsim.weights import read_metadata
 
         path = locate(source, "SPGNet", "SPNet")
         stated = read_metadata(path)
-        networks: dict[str, type[SPNet] | type[SPGNet]] = {"SPNet": SPNet, "SPGNet": SPGNet}
-        if stated.get("network") not in networks or "size" not in stated:
+        if stated.get("network") not in NETWORKS or "size" not in stated:
             raise TensorsimError(
-                f"{path}: its header says {stated or 'nothing'}, expected network (one of {', '.join(networks)}), "
+                f"{path}: its header says {stated or 'nothing'}, expected network (one of {', '.join(NETWORKS)}), "
                 "size, speed_m_s and range_db"
             )
+        names = stated.get("class_names")
         return cls(
             radar,
-            networks[stated["network"]].from_pretrained(path),
+            NETWORKS[stated["network"]].from_pretrained(path),
             stated.get("inputs", "doppler"),
             int(stated["size"]),
             float(stated.get("speed_m_s", 3.8)),
             float(stated.get("range_db", 40.0)),
+            None if names is None else LabelSet.from_text(names).names,
         ).eval()

@@ -2,6 +2,7 @@
 
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
@@ -14,6 +15,7 @@ from tensorsim.vision.tracking.tracker import GNNTracker
 
 __all__ = [
     "CPM",
+    "BoneFit",
     "GNNTracker",
     "HRNet",
     "KalmanSmoother",

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
-from tensorsim.recognition import ActivityRecognizer, MapToImage, SPGNet, SPNet
+from tensorsim.recognition import ActivityRecognizer, LabelSet, MapToImage, SPGNet, SPNet
 from tensorsim.types import RadarMaps
 from tensorsim.weights import save_weights
 from tests.stage import StageTester
@@ -94,8 +94,14 @@ def test_weights_say_what_they_were_trained_on(tmp_path: Path, network: nn.Modul
     path = tmp_path / "net.safetensors"
     metadata = {"network": type(network).__name__, "size": "32", "speed_m_s": "2.5", "range_db": "30"}
     save_weights(network.eval(), path, metadata)
+    with pytest.raises(TensorsimError, match="a network of 3 classes, expected 12, one per class name"):
+        ActivityRecognizer.from_pretrained(RADAR, path)
+    save_weights(network, path, {**metadata, "class_names": '["a", "b", "c"]'})
     loaded = ActivityRecognizer.from_pretrained(RADAR, path)
-    expected = ActivityRecognizer(RADAR, network, size=32, speed_m_s=2.5, range_db=30.0)
+    expected = ActivityRecognizer(
+        RADAR, network, size=32, speed_m_s=2.5, range_db=30.0, class_names=("a", "b", "c")
+    )
+    assert loaded.class_names == ("a", "b", "c")
     m = maps((2,))
     torch.testing.assert_close(loaded(m), expected(m), rtol=0.01, atol=0.01)
     save_weights(network, path, {"size": "32"})
@@ -120,3 +126,38 @@ def test_the_shipped_network_is_the_small_one() -> None:
     named = ActivityRecognizer.from_pretrained(RADAR, "spnet-activities")
     assert isinstance(named.network, SPNet)
     assert named.doppler_picture.size == 112
+
+
+def test_own_classifiers_are_saved_with_their_class_names(tmp_path: Path) -> None:
+    own = ActivityRecognizer(
+        RADAR, SPGNet(2, 2).eval(), "merged", 16, 2.5, 30.0, class_names=["waving", "walking"]
+    )
+    own.save_pretrained(tmp_path / "own.safetensors")
+    loaded = ActivityRecognizer.from_pretrained(RADAR, tmp_path / "own.safetensors")
+    assert loaded.class_names == ("waving", "walking")
+    m = maps((2,))
+    torch.testing.assert_close(loaded.picture(m), own.picture(m))
+    torch.testing.assert_close(loaded(m), own(m), rtol=0.01, atol=0.01)
+    assert loaded.labels.most_likely(torch.tensor([[0.0, 1.0], [1.0, 0.0]])) == ["walking", "waving"]
+    own.save_pretrained(tmp_path / "own.safetensors", class_names=("a", "b"))
+    assert ActivityRecognizer.from_pretrained(RADAR, tmp_path / "own.safetensors").class_names == ("a", "b")
+    with pytest.raises(TensorsimError, match="class_names: got 1, expected 2"):
+        own.save_pretrained(tmp_path / "own.safetensors", class_names=("a",))
+    with pytest.raises(TensorsimError, match="expected .safetensors"):
+        own.save_pretrained(tmp_path / "own.pth")
+    own.network = nn.Flatten()
+    with pytest.raises(TensorsimError, match="got a network of class Flatten"):
+        own.save_pretrained(tmp_path / "own.safetensors")
+
+
+def test_label_sets_refuse_what_is_not_one_name_per_class() -> None:
+    assert LabelSet().names == ts.ACTIVITIES
+    for names in ((), ("a", "a"), ("a", ""), "walking"):
+        with pytest.raises(TensorsimError, match="class_names: got"):
+            LabelSet(names)  # type: ignore[arg-type]
+    with pytest.raises(TensorsimError, match="expected one of a, b"):
+        LabelSet(("a", "b")).index("c")
+    with pytest.raises(TensorsimError, match=r"expected \(B, 2\)"):
+        LabelSet(("a", "b")).most_likely(torch.zeros(1, 3))
+    with pytest.raises(TensorsimError, match="expected a JSON list"):
+        LabelSet.from_text("waving")

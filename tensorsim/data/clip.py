@@ -1,0 +1,48 @@
+"""A short film as one tensor."""
+
+import os
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.data.video import VideoReader
+
+
+class Clip(NamedTuple):
+    """A film in memory, as :class:`tensorsim.VideoToDoppler` takes it.
+
+    Attributes:
+        video: (1, T, 3, H, W) uint8 RGB.
+        fps: frames per second.
+    """
+
+    video: Tensor
+    fps: float
+
+
+def read_video(
+    path: str | os.PathLike[str],
+    fps: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    stride: int = 1,
+) -> Clip:
+    """Read a film, or a part of it, into memory: 0.9 MB per frame of 640x480 pixels.
+
+    ``tensorsim simulate`` and :class:`VideoReader` read films of any length in pieces.
+
+    Args:
+        path, fps, start_s, end_s, stride: see :class:`VideoReader`.
+
+    Returns:
+        The pair (video (1, T, 3, H, W) uint8 RGB, fps).
+
+    Raises:
+        TensorsimError: see :class:`VideoReader`.
+
+    Example:
+        >>> video, fps = read_video("clip.mp4", end_s=4.0)  # doctest: +SKIP
+    """
+    reader = VideoReader(path, fps, start_s, end_s, stride)
+    return Clip(torch.cat(list(reader.chunks(64))).unsqueeze(0), reader.fps)
