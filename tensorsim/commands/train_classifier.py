@@ -26,6 +26,8 @@ class TrainClassifier(TrainOptions):
             are made first, without rendering.
         film_people: people per scene in it.
         learning_rate: of the first half of the epochs; the second has a tenth of it. Less is better from ``init`` on.
+        masks: largest part of the rows (speeds) and of the columns (time) of a picture that is masked in training, as
+            SpecAugment does; 0 0 masks nothing.
         epochs: passes over the training clips.
         batch: clips per step.
         maps_seed: of people, motion and noise of the maps.
@@ -42,6 +44,7 @@ class TrainClassifier(TrainOptions):
     film_maps: Path | None = None
     film_people: int = 40
     learning_rate: float = 1.47e-3
+    masks: tuple[float, float] = (0.0, 0.0)
     epochs: int = 20
     batch: int = 64
     maps_seed: int = 0
@@ -89,5 +92,6 @@ class TrainClassifier(TrainOptions):
             filmed,
             self.film_people,
             self.learning_rate,
+            self.masks,
         )
         self.train(recipe, loop)

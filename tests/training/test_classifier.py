@@ -18,6 +18,7 @@ from tensorsim.training.classifier import (
     held_out,
     load_classifier,
     logits_of,
+    masked,
     picture,
 )
 from tensorsim.training.loop import LoopConfig, fit
@@ -189,3 +190,30 @@ def test_refuses_bad_settings(store: MapStore) -> None:
         recipe(store, snr_db=(50.0, 10.0))
     with pytest.raises(TensorsimError, match="got 0 people in free-space"):
         clips_of(store, ("free-space",), 2, None)
+
+
+def test_masks_are_bands_within_their_limits_drawn_anew_for_each_look(store: MapStore) -> None:
+    pictures = torch.ones(2, 1, 20, 40)
+    state = torch.get_rng_state()
+    widths = []
+    for seed in range(200):
+        look = masked(pictures, (0.25, 0.5), seed)
+        rows, columns = (look == 0).all(-1)[0, 0], (look == 0).all(-2)[0, 0]
+        covered = rows[:, None] | columns[None, :]
+        assert torch.equal(look, (~covered).float().expand_as(look)), (
+            "bands of rows and columns, nothing else"
+        )
+        for band in (rows, columns):
+            assert int(band.int().diff().clamp_min(0).sum()) + int(band[0]) <= 1, "one band"
+        widths.append((int(rows.sum()), int(columns.sum())))
+    most = [max(w) for w in zip(*widths, strict=True)]
+    assert most[0] in (4, 5)
+    assert most[1] in range(18, 21)
+    assert torch.equal(state, torch.get_rng_state())
+    assert masked(pictures, (0.0, 0.0), 0) is pictures
+    plain, noted = recipe(store), recipe(store, masks=(0.5, 0.5))
+    same = [torch.equal(plain.sample(i)["picture"], noted.sample(i)["picture"]) for i in range(8)]
+    assert not any(same)
+    assert torch.equal(noted.sample(3)["picture"], noted.sample(3)["picture"])
+    with pytest.raises(TensorsimError, match="masks: got"):
+        recipe(store, masks=(0.0, 1.5))
