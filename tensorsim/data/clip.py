@@ -42,7 +42,9 @@ def read_video(
         TensorsimError: see :class:`VideoReader`.
 
     Example:
-        >>> video, fps = read_video("clip.mp4", end_s=4.0)  # doctest: +SKIP
+        >>> video, fps = read_video("clip.mp4", end_s=1.0)
+        >>> video.shape, fps
+        (torch.Size([1, 30, 3, 48, 64]), 30.0)
     """
     reader = VideoReader(path, fps, start_s, end_s, stride)
     return Clip(torch.cat(list(reader.chunks(64))).unsqueeze(0), reader.fps)

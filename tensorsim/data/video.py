@@ -60,8 +60,10 @@ class VideoReader:
 
     Example:
         >>> reader = VideoReader("clip.mp4", start_s=1.0)
-        >>> for frames in reader.chunks(32):  # (n, 3, H, W) uint8 RGB
-        ...     ...
+        >>> for frames in reader.chunks(32):
+        ...     print(frames.dtype, frames.shape)
+        torch.uint8 torch.Size([32, 3, 48, 64])
+        torch.uint8 torch.Size([3, 3, 48, 64])
 
     Raises:
         TensorsimError: no such file, no frame in it that OpenCV decodes, a frame rate that is neither

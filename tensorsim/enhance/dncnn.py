@@ -31,7 +31,8 @@ class DnCNN(nn.Module):
         batch_norm: False builds the network without normalisation, as released weights are.
 
     Example:
-        >>> DnCNN.from_pretrained("dncnn_gray_blind.pth")(images)  # (..., H, W) -> (..., H, W)
+        >>> DnCNN(depth=17)(torch.rand(2, 40, 60)).shape
+        torch.Size([2, 40, 60])
 
     Raises:
         TensorsimError: a depth below 2 or a width below 1.
@@ -160,7 +161,9 @@ class MapDenoiser(nn.Module):
         scale: ``"peak"`` or ``"floor"``.
 
     Example:
-        >>> MapDenoiser.from_pretrained()(maps.doppler_time)  # the shipped weights, which say their scale
+        >>> denoiser = MapDenoiser.from_pretrained()  # the shipped weights, which say their scale
+        >>> denoiser(torch.rand(2, 64, 40)).shape
+        torch.Size([2, 64, 40])
 
     Raises:
         TensorsimError: a tile without columns, an unknown scale.

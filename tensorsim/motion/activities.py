@@ -143,12 +143,8 @@ class ActivityGenerator:
 
     Example:
         >>> motion = ActivityGenerator().generate("walking", batch=8, seed=1, rate_hz=30.0)
-        >>> motion.joints.shape  # (8, 120, 14, 3)
-
-        Each of them alone before a radar, as the 13 scatterers of the original's first version:
-
-        >>> stage = PoseToDoppler(simulator, scatterers=Body13Scatterers())
-        >>> maps = stage(motion.joints[:, None], motion.valid[:, None], 30.0)
+        >>> motion.joints.shape
+        torch.Size([8, 120, 14, 3])
     """
 
     def __init__(self, people: PeopleConfig | None = None) -> None:

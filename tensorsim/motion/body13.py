@@ -51,7 +51,10 @@ class Body13Scatterers(nn.Module):
             :class:`~tensorsim.motion.scatterers.JointScatterers`.
 
     Example:
-        >>> Body13Scatterers()(positions, fade)  # (B, P, M, 14, 3), (B, P, M) -> (B, M, 13 P, 3), (B, M, 13 P)
+        >>> positions, fade = torch.randn(2, 3, 100, 14, 3), torch.ones(2, 3, 100)  # 2 scenes, 3 people, 100 pulses
+        >>> points, rcs = Body13Scatterers()(positions, fade)
+        >>> points.shape, rcs.shape
+        (torch.Size([2, 100, 39, 3]), torch.Size([2, 100, 39]))
     """
 
     nodes: Tensor

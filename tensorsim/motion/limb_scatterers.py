@@ -110,7 +110,10 @@ class LimbScatterers(nn.Module):
             at lower frequencies.
 
     Example:
-        >>> LimbScatterers(radar.tx_m, radar.rx_m)(positions, fade)  # (..., M, 36 P, 3), (..., M, 36 P)
+        >>> positions, fade = torch.randn(3, 100, 14, 3), torch.ones(3, 100)  # 3 people, 100 pulses
+        >>> points, rcs = LimbScatterers(tx_m=(-0.1, 0.0, 1.5), rx_m=(0.1, 0.0, 1.5))(positions, fade)
+        >>> points.shape, rcs.shape
+        (torch.Size([100, 108, 3]), torch.Size([100, 108]))
 
     Raises:
         TensorsimError: an antenna without three finite numbers, ``per_segment`` below 1, ``height_m`` not

@@ -90,10 +90,18 @@ class PoseResampler(nn.Module):
             or ``"linear"`` as in the paper (``numpy.interp``).
 
     Example:
-        >>> PoseResampler(8192.0)(joints, 30.0)  # (..., 120, 14, 3) -> (..., 32768, 14, 3)
-        >>> # the same in pieces, for clips whose pulses do not fit the memory
-        >>> coefficients = resampler.coefficients(joints, fps)
-        >>> piece = resampler.evaluate(coefficients, fps, start, stop)
+        >>> joints = torch.randn(2, 30, 14, 3)  # 1 s at 30 frames per second
+        >>> resampler = PoseResampler(prf_hz=8192.0)
+        >>> whole = resampler(joints, 30.0)
+        >>> whole.shape
+        torch.Size([2, 8192, 14, 3])
+
+        The same in pieces, for clips whose pulses do not fit the memory:
+
+        >>> coefficients = resampler.coefficients(joints, 30.0)
+        >>> piece = resampler.evaluate(coefficients, 30.0, 1000, 1100)
+        >>> torch.allclose(piece, whole[:, 1000:1100])
+        True
 
     Raises:
         TensorsimError: a PRF that is not positive, or an unknown method.

@@ -64,7 +64,8 @@ class SavitzkyGolay(nn.Module):
         dim: the time axis; the default is that of joints (..., T, J, 3).
 
     Example:
-        >>> SavitzkyGolay(11, 3)(joints)  # (..., T, J, 3) -> (..., T, J, 3)
+        >>> SavitzkyGolay(11, 3)(torch.randn(2, 60, 14, 3)).shape  # (..., T, J, 3)
+        torch.Size([2, 60, 14, 3])
 
     Raises:
         TensorsimError: a window that is not odd and positive, or an order that it cannot determine.

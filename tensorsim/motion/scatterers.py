@@ -114,7 +114,10 @@ class JointScatterers(nn.Module):
             is its logarithm ``log_rcs_m2``, so that it stays positive and a step is a step in dB.
 
     Example:
-        >>> JointScatterers()(positions, fade)  # (B, P, M, 14, 3), (B, P, M) -> (B, M, 14 P, 3), (B, M, 14 P)
+        >>> positions, fade = torch.randn(2, 3, 100, 14, 3), torch.ones(2, 3, 100)  # 2 scenes, 3 people, 100 pulses
+        >>> points, rcs = JointScatterers()(positions, fade)
+        >>> points.shape, rcs.shape
+        (torch.Size([2, 100, 42, 3]), torch.Size([2, 100, 42]))
 
     Raises:
         TensorsimError: no joint, or a cross section that is negative or not finite (or 0, if learnable).

@@ -65,7 +65,11 @@ class Shadowing(nn.Module):
             position has no gradient.
 
     Example:
-        >>> Shadowing(JointScatterers(), radar.tx_m, radar.rx_m)(positions, fade)  # shapes as of JointScatterers
+        >>> positions, fade = torch.randn(2, 3, 100, 14, 3), torch.ones(2, 3, 100)  # 2 scenes, 3 people, 100 pulses
+        >>> stage = Shadowing(ts.motion.JointScatterers(), tx_m=(-0.1, 0.0, 1.5), rx_m=(0.1, 0.0, 1.5))
+        >>> points, rcs = stage(positions, fade)
+        >>> points.shape, rcs.shape
+        (torch.Size([2, 100, 42, 3]), torch.Size([2, 100, 42]))
 
     Raises:
         TensorsimError: an antenna without three finite numbers, a loss or an edge below 0, a radius not

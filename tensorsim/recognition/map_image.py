@@ -64,8 +64,9 @@ class MapToImage(nn.Module):
     Shapes: map (..., F, K) magnitude -> picture (..., 1, size, size) in [0, 1]. Differentiable.
 
     Example:
-        >>> MapToImage.doppler(radar)(maps.doppler_time)
-        >>> torch.cat([MapToImage.range(radar)(maps.range_time_mti), doppler_image], dim=-3)  # merged, 2 channels
+        >>> doppler_picture = MapToImage.doppler(RadarConfig.through_wall())
+        >>> doppler_picture(torch.rand(2, 256, 40)).shape  # (B, F, K)
+        torch.Size([2, 1, 224, 224])
 
     Raises:
         TensorsimError: an axis that does not ascend in equal steps, a span without width, a size below 1, an unknown

@@ -117,7 +117,8 @@ class SPNet(nn.Module):
     11 055 660 parameters for 12 classes and 3 channels.
 
     Example:
-        >>> SPNet.from_pretrained(path)(MapToImage.doppler(radar)(maps.doppler_time)).softmax(-1)
+        >>> SPNet(num_classes=12)(torch.rand(2, 1, 112, 112)).shape
+        torch.Size([2, 12])
 
     Raises:
         TensorsimError: fewer than one class or channel, an unknown activation or padding; pictures of other channels
