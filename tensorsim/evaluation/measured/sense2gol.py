@@ -13,6 +13,7 @@ from tensorsim.evaluation.measured.motions import (
     Unrest,
     add_unrest,
     at_instants,
+    in_beam,
     knots,
     linear,
     place,
@@ -109,10 +110,7 @@ class Sense2Gol:
         draw = Draw(joints.shape[0], generator)
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.beam:
-            # Narrow in elevation: near the radar head and legs leave the beam.
-            offset = positions - torch.tensor(ANTENNA_M, dtype=positions.dtype)
-            elevation = torch.rad2deg(torch.asin(offset[..., 2] / offset.norm(dim=-1)))
-            rcs = rcs * torch.exp(-2.77 * (elevation / draw(25.0, 55.0)[..., None]).square())
+            rcs = in_beam(positions, rcs, ANTENNA_M[2], draw(25.0, 55.0))
         if self.effects.dim_limbs:
             gain_db = draw(-10.0, 2.0) + 3 * draw.normal(len(SEGMENTS))
             gain_db[:, 1] = 0.0  # the torso
