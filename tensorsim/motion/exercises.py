@@ -170,7 +170,7 @@ def box(time: Tensor, who: People) -> Act:
     right, left = fist(0.0), fist(every)
     twist = v(28.0) * (right - left)
     bent = v(24.0)
-    sway = v(0.05) * torch.sin(math.pi * time / every + 2 * math.pi * who.gait_phase[:, None])
+    sway = v(0.08) * torch.sin(math.pi * time / every + 2 * math.pi * who.gait_phase[:, None])
     guard, fold = v(40.0), v(118.0)
     pose = make_pose(
         time,

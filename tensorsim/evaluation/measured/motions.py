@@ -143,6 +143,20 @@ def at_instants(joints: Tensor, time_s: Tensor) -> Tensor:
     )
 
 
+def in_beam(positions: Tensor, rcs: Tensor, height_m: float, width_deg: Tensor) -> Tensor:
+    """Cross sections (N, K, S) as a Gaussian beam of two antennas leaves them, narrow in elevation.
+
+    Args:
+        positions: (N, K, S, 3) m.
+        rcs: (N, K, S) m^2.
+        height_m: of the antennas, at x = y = 0.
+        width_deg: (N, 1) full width of the two-way beam at half power.
+    """
+    across = positions[..., 2] - height_m
+    elevation = torch.rad2deg(torch.atan2(across, positions[..., :2].norm(dim=-1)))
+    return rcs * torch.exp(-4 * math.log(2) * (elevation / width_deg[..., None]).square())
+
+
 def linear(values: Tensor, time_s: Tensor) -> Tensor:
     """Values (N, K, S) at ``KNOT_HZ`` to (N, M, S) at instants (M,), by straight lines."""
     at = (time_s * KNOT_HZ).clamp(max=values.shape[1] - 1.001)

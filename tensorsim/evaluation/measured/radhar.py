@@ -1,0 +1,153 @@
+"""RadHAR, TI IWR1443 at 30 frames per second: what of five exercises is left in sparse point clouds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.evaluation.measured.motions import (
+    Draw,
+    Unrest,
+    act_out,
+    add_unrest,
+    at_instants,
+    in_beam,
+    knots,
+    linear,
+    place,
+    stage_people,
+    to_and_fro,
+)
+from tensorsim.motion.exercises import box, jump, jumping_jack, squat
+from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.people import PeopleConfig
+from tensorsim.motion.scripts import walk
+from tensorsim.radar.processing.cfar import CfarDetector
+from tensorsim.radar.processing.point_cloud import local_maxima
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
+
+CLASSES = ("boxing", "jack", "jump", "squats", "walk")
+FRAMES, FRAME_HZ, CHIRPS = 60, 30.0, 16
+SPEED_STEP_M_S, RANGE_STEP_M = 0.6147, 0.0436
+CARRIER_HZ = 77e9
+BANDWIDTH_HZ = SPEED_OF_LIGHT_M_S / (2 * RANGE_STEP_M)
+#: 16 chirps make Doppler bins of ``lambda PRF / (2 16)``.
+PRF_HZ = 2 * CHIRPS * SPEED_STEP_M_S * (CARRIER_HZ + BANDWIDTH_HZ / 2) / SPEED_OF_LIGHT_M_S
+
+RADAR = RadarConfig(
+    carrier_hz=CARRIER_HZ,
+    bandwidth_hz=BANDWIDTH_HZ,
+    chirp_s=51.2e-6,
+    prf_hz=PRF_HZ,
+    sample_rate_hz=5e6,
+    tx_m=(-0.01, 0.0, 1.0),
+    rx_m=(0.01, 0.0, 1.0),
+    antenna_gain_dbi=10.0,
+    isolation_db=30.0,
+)
+
+
+_HANDS = [i for i, part in enumerate(SEGMENTS) if part.name.endswith("forearm")]
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What the simulation has beside bodies that move, each to be left out for an ablation."""
+
+    to_and_fro: bool = True
+    unrest: bool = True
+    dim_limbs: bool = True
+    peaks_only: bool = True
+    levels: bool = True
+    beam: bool = True
+
+
+class RadHar:
+    """Simulated presence maps over Doppler bins and time."""
+
+    def __init__(self, effects: Effects | None = None) -> None:
+        self.effects = Effects() if effects is None else effects
+        profile = RangeProfile(RADAR, window="hamming", gate_m=(0.6, 5.4))
+        self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
+        self.scatterers = LimbScatterers(RADAR.tx_m, RADAR.rx_m, per_segment=2)
+        # Next to a body that fills many range bins the smaller reference cells are those of noise.
+        self.cfar = CfarDetector(
+            (4, 0), (10, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
+        )
+        frames = torch.arange(FRAMES, dtype=torch.float64) / FRAME_HZ
+        self.at = (frames[:, None] + torch.arange(CHIRPS, dtype=torch.float64) / PRF_HZ).flatten()
+
+    def motion(self, label: int, count: int, generator: torch.Generator) -> Tensor:
+        """Joints (count, K, 14, 3) at ``KNOT_HZ``."""
+        draw = Draw(count, generator)
+        people = stage_people(
+            count, draw, PeopleConfig(heading_rad=0.35, facing_radar_share=1.0, speed_m_s=(0.4, 0.95)), None
+        )
+        time = knots(FRAMES / FRAME_HZ).expand(count, -1)
+        if label == 4:
+            people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
+            if self.effects.to_and_fro:
+                leg = draw(1.2, 2.5)
+                joints = to_and_fro(walk, time, people, draw, leg, draw(0.8, 2.0), draw(0.0, 1.0) * leg)
+            else:
+                joints = act_out(walk, time, people)
+            y = joints[:, :, (8, 11), 1].mean(-1)
+            joints = place(joints, draw(-0.4, 0.4), draw(1.6, 3.6) + y[:, :1] - y.mean(1, keepdim=True))
+        else:
+            script = (box, jumping_jack, jump, squat)[label]
+            joints = act_out(script, time * draw(0.7, 1.3) + draw(0.0, 5.0), people)
+            joints = place(joints, draw(-0.3, 0.3), draw(1.3, 3.5))
+        if self.effects.unrest:
+            joints = add_unrest(joints, draw, Unrest((0.001, 0.008), (0.0, 0.02)))
+        return joints
+
+    def maps(self, joints: Tensor, generator: torch.Generator) -> Tensor:
+        """Presence (N, 16, 60) bool, Doppler from approaching to receding, of people (N, K, 14, 3)."""
+        count = joints.shape[0]
+        draw = Draw(count, generator)
+        positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
+        if self.effects.beam:
+            rcs = in_beam(positions, rcs, RADAR.tx_m[2], draw(16.0, 40.0))
+        if self.effects.dim_limbs:
+            gain_db = draw(-8.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
+            gain_db[:, 1] = 0.0  # the torso
+            gain_db[:, _HANDS] += draw(0.0, 14.0)  # seen end-on, a forearm is its hand
+            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+        echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
+        echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
+        shape = (*echo.shape[1:],)
+        noise = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float()) / 2**0.5
+        level_db = draw(10.0, 32.0) if self.effects.levels else draw(20.0, 20.0)
+        echo = echo * 10 ** (level_db / 20).float().unsqueeze(-1) + noise
+        frames = echo.unflatten(1, (FRAMES, CHIRPS)).transpose(2, 3)
+        window = torch.hann_window(CHIRPS, periodic=False)
+        # Negative raw Doppler is approaching, and first.
+        cube = torch.fft.fftshift(torch.fft.fft(frames * window), dim=-1)
+        power = cube.abs().square()
+        scale = 10 ** (draw(0.0, 6.0) / 10).float()[..., None, None]
+        found = power > scale * self.cfar.threshold(power)
+        if self.effects.peaks_only:
+            found = found & local_maxima(power)
+        return found.any(2).transpose(1, 2)
+
+    def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:
+        """Presence maps (count, 16, 60) bool of one class."""
+        return self.maps(self.motion(label, count, generator), generator)
+
+
+def read(folder: Path) -> tuple[Tensor, Tensor]:
+    """Presence maps (N, 16, 60) bool and labels (N,) of a folder of measured windows."""
+    with np.load(folder / "maps.npz") as file:
+        return torch.from_numpy(file["dt"] > 0), torch.from_numpy(file["label"].astype(np.int64))
+
+
+def pictures(maps: Tensor) -> Tensor:
+    """Presence maps (N, 16, 60) to pictures (N, 1, 16, 60) without the row of what stands still."""
+    shown = maps.float()
+    shown[:, CHIRPS // 2] = 0.0
+    return shown.unsqueeze(1)

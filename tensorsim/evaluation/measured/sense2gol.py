@@ -1,0 +1,147 @@
+"""Infineon Sense2GoL, 24 GHz continuous wave: bursts of I/Q of people who come towards the radar in four styles."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tensorsim.evaluation.measured.motions import (
+    KNOT_HZ,
+    Draw,
+    Unrest,
+    add_unrest,
+    at_instants,
+    in_beam,
+    knots,
+    linear,
+    place,
+    stage_people,
+)
+from tensorsim.motion.activities import perform
+from tensorsim.motion.exercises import creep, run, stride
+from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.people import PeopleConfig
+from tensorsim.motion.scripts import walk
+from tensorsim.radar.synthesis.continuous_wave import ContinuousWaveEcho
+
+CLASSES = ("walk", "run", "stride", "creep")
+CARRIER_HZ, SAMPLE_RATE_HZ = 24.125e9, 3000.0
+FRAMES, FRAME_SAMPLES, FRAME_S = 15, 128, 0.2
+ANTENNA_M = (0.0, 0.0, 1.0)
+#: Rows of the Doppler maps within +-750 Hz (4.7 m/s).
+ROWS = slice(32, 96)
+#: Script and speeds in m/s of each style.
+STYLES = (
+    (walk, (0.95, 1.5)),
+    (run, (2.0, 3.1)),
+    (stride, (1.35, 1.95)),
+    (creep, (0.35, 1.1)),
+)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What the simulation has beside bodies that move, each to be left out for an ablation."""
+
+    speeding_up: bool = True
+    unrest: bool = True
+    dim_limbs: bool = True
+    image: bool = True
+    saturation: bool = True
+    beam: bool = True
+
+
+def doppler_maps(iq: Tensor) -> Tensor:
+    """Decibels (N, 128, frames) of the bursts of I/Q (N, 2, 128 frames), Doppler ascending; towards is negative."""
+    signal = torch.complex(iq[:, 0], iq[:, 1]).unflatten(-1, (-1, FRAME_SAMPLES))
+    signal = signal - signal.mean(-1, keepdim=True)
+    window = torch.hamming_window(FRAME_SAMPLES, periodic=False)
+    spectrum = torch.fft.fftshift(torch.fft.fft(signal * window), dim=-1)
+    return 10 * (spectrum.abs().square() + 1).log10().transpose(1, 2)
+
+
+class Sense2Gol:
+    """Simulated bursts of I/Q in counts of the 12-bit converter."""
+
+    def __init__(self, effects: Effects | None = None) -> None:
+        self.effects = Effects() if effects is None else effects
+        self.echo = ContinuousWaveEcho(CARRIER_HZ, ANTENNA_M, ANTENNA_M)
+        self.scatterers = LimbScatterers(ANTENNA_M, ANTENNA_M, per_segment=3)
+        frames = torch.arange(FRAMES, dtype=torch.float64) * FRAME_S
+        self.at = (
+            frames[:, None] + torch.arange(FRAME_SAMPLES, dtype=torch.float64) / SAMPLE_RATE_HZ
+        ).flatten()
+
+    def motion(self, label: int, count: int, generator: torch.Generator) -> Tensor:
+        """Joints (count, K, 14, 3) at ``KNOT_HZ``: people stand, come nearer and stop before the radar."""
+        draw = Draw(count, generator)
+        script, speed = STYLES[label]
+        config = PeopleConfig(heading_rad=0.15, facing_radar_share=1.0)
+        people = stage_people(count, draw, config, speed)
+        time = knots(FRAMES * FRAME_S).expand(count, -1)
+        start_m = draw(4.2, 6.8)
+        pace = torch.ones_like(time)
+        if self.effects.speeding_up:
+            pace = self._pace(time, draw, start_m, people.speed_m_s[:, None])
+        clock = torch.cumsum(pace, dim=1) / KNOT_HZ
+        joints = perform(script, clock, people)
+        joints = torch.stack([-joints[..., 0], -joints[..., 1], joints[..., 2]], dim=-1)  # towards the radar
+        joints = place(joints, draw(-0.3, 0.3), start_m)
+        if self.effects.unrest:
+            joints = add_unrest(joints, draw, Unrest((0.001, 0.006), (0.0, 0.03)))
+        return joints
+
+    def _pace(self, time: Tensor, draw: Draw, start_m: Tensor, speed: Tensor) -> Tensor:
+        """Share (N, K) of the full speed: from rest at the start, to rest about half a metre before the radar."""
+        begin, rise, brake, stop_m = draw(-0.3, 0.5), draw(0.3, 1.0), draw(1.2, 4.0), draw(0.3, 0.8)
+        gained = ((time - begin) / rise).clamp(0.0, 1.0)
+        gained = gained**2 * (3 - 2 * gained)
+        pace, way = [], start_m - stop_m
+        for k in range(time.shape[1]):
+            limit = (2 * brake[:, 0] * way[:, 0].clamp(min=0.0)).sqrt() / speed[:, 0]
+            pace.append(torch.minimum(gained[:, k], limit))
+            way = way - (speed[:, 0] * pace[-1] / KNOT_HZ)[:, None]
+        return torch.stack(pace, dim=1)
+
+    def iq(self, joints: Tensor, generator: torch.Generator) -> Tensor:
+        """Counts (N, 2, 1920) of people (N, K, 14, 3)."""
+        draw = Draw(joints.shape[0], generator)
+        positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
+        if self.effects.beam:
+            rcs = in_beam(positions, rcs, ANTENNA_M[2], draw(25.0, 55.0))
+        if self.effects.dim_limbs:
+            gain_db = draw(-10.0, 2.0) + 3 * draw.normal(len(SEGMENTS))
+            gain_db[:, 1] = 0.0  # the torso
+            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+        echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
+        far = echo[:, : 6 * FRAME_SAMPLES].abs().square().mean(-1, keepdim=True).sqrt()
+        echo = echo / far * 10 ** (draw(36.0, 52.0) / 20).float()
+        if self.effects.image:
+            echo = echo + 10 ** (draw(-13.0, -9.0) / 20).float() * echo.conj()
+        noise = 10 ** (draw(19.0, 24.0) / 20).float()
+        signal = torch.stack([echo.real, echo.imag], dim=1)
+        signal = signal + noise[..., None] / 2**0.5 * draw.normal(2, signal.shape[-1]).float()
+        if self.effects.saturation:
+            signal = (signal + 2090).round().clamp(0, 4095)
+        return signal
+
+    def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:
+        """Doppler maps (count, 64, 15) in dB of one class."""
+        return doppler_maps(self.iq(self.motion(label, count, generator), generator))[:, ROWS]
+
+
+def read(folder: Path) -> tuple[Tensor, Tensor]:
+    """Doppler maps (N, 64, 15) in dB and labels (N,) of a folder of measured clips; empty ones are left out."""
+    with np.load(folder / "clips.npz") as file:
+        names = [str(name) for name in file["classes"]]
+        labels = torch.tensor([CLASSES.index(names[i]) if names[i] in CLASSES else -1 for i in file["label"]])
+        iq = torch.from_numpy(file["iq"].astype(np.float32))
+    seen = labels >= 0
+    return doppler_maps(iq[seen])[:, ROWS], labels[seen]
+
+
+def pictures(maps: Tensor) -> Tensor:
+    """Doppler maps (N, 64, 15) in dB to pictures (N, 1, 64, 15): 40 to 90 dB become 0 to 1."""
+    return ((maps - 40) / 50).clamp(0.0, 1.2).unsqueeze(1)
