@@ -13,7 +13,7 @@ class EvaluateDetector:
     Attributes:
         weights: RTMDet's (.safetensors, .pth, .onnx); the shipped ones if not given.
         against: another detector's, measured alike; needed for films.
-        data: folder of coco_small-*.tar, whose held-out pictures are looked at.
+        data: folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out pictures are looked at.
         coco: folder with one COCO annotation file (*.json) and its pictures in images/.
         films: videos to follow people in.
     """
@@ -28,16 +28,14 @@ class EvaluateDetector:
         """Do it."""
         import torch
 
-        from tensorsim.training.detector import HELD_OUT_PERCENT
         from tensorsim.training.detector_metrics import compare_tracks, measure, tracks_of_film
-        from tensorsim.training.pose_data import split
-        from tensorsim.training.shards import Sample, Shards, find_shards, read_coco_folder
+        from tensorsim.training.shards import Sample, read_coco_folder, read_coco_shards
         from tensorsim.vision.detection.rtmdet import RTMDet
 
         groups: dict[str, list[Sample]] = {}
         if self.data is not None:
-            held_out = split(Shards(find_shards(self.data, "coco_small")), HELD_OUT_PERCENT)[1]
-            groups["coco_small, held out"] = held_out
+            held_out = read_coco_shards(self.data)[1]
+            groups["COCO, held out"] = [sample for sample in held_out if sample.all_labelled]
         if self.coco is not None:
             groups[str(self.coco)] = read_coco_folder(self.coco)
         if not groups and not self.films:

@@ -15,7 +15,9 @@ class EvaluatePose:
 
     Attributes:
         weights: HRNet's (.safetensors, .pth) or any heat-map network's (.onnx); the shipped ones if not given.
-        data: folder of lspet-*.tar and coco_small-*.tar, whose held-out people are looked for.
+        data: folder of the shards coco_small, coco_more, coco_extra and lspet (NAME-*.tar), whose held-out
+            people are looked for; "large" ones have eight labelled keypoints or more and at least a quarter
+            of the height of their picture.
         coco: folder with one COCO annotation file (*.json) and its pictures in images/.
         flip_test: average with the mirror image.
     """
@@ -28,19 +30,21 @@ class EvaluatePose:
     def run(self) -> None:
         """Do it."""
         from tensorsim.pipeline import pretrained_pose
-        from tensorsim.training.pose import HELD_OUT_PERCENT
-        from tensorsim.training.pose_data import Person, people, split, upright
+        from tensorsim.training.pose import held_out_people
+        from tensorsim.training.pose_data import Person, large, people, upright
         from tensorsim.training.pose_metrics import evaluate_cut, evaluate_pose
-        from tensorsim.training.shards import Shards, find_shards, read_coco_folder
+        from tensorsim.training.shards import read_coco_folder
 
         groups: dict[str, list[Person]] = {}
         if self.data is not None:
-            for name, percent in HELD_OUT_PERCENT.items():
-                found = people(split(Shards(find_shards(self.data, name)), percent)[1])
-                groups |= {f"{name}, held out": found, f"{name}, held out, upright": upright(found)}
+            groups |= {f"{name}, held out": found for name, found in held_out_people(self.data).items()}
         if self.coco is not None:
             found = people(read_coco_folder(self.coco))
-            groups |= {str(self.coco): found, f"{self.coco}, upright": upright(found)}
+            groups |= {
+                str(self.coco): found,
+                f"{self.coco}, large": large(found),
+                f"{self.coco}, upright": upright(found),
+            }
         if not groups:
             raise TensorsimError("evaluate pose: got no pictures, expected --data or --coco")
 

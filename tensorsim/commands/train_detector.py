@@ -14,7 +14,8 @@ class TrainDetector(PeopleOptions):
     OUT/detector.safetensors has the best weights with calibrated scores.
 
     Attributes:
-        data: folder of coco_small-*.tar, lspet-*.tar, pedestrian-*.tar and backgrounds-*.tar.
+        data: folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, films_teacher, lspet, pedestrian
+            and backgrounds (NAME-*.tar).
         variant: of RTMDet.
         steps: optimiser steps.
         batch: pictures per step.
@@ -24,9 +25,9 @@ class TrainDetector(PeopleOptions):
 
     data: Path
     variant: str = "small-person"
-    steps: int = 4000
+    steps: int = 5000
     batch: int = 16
-    learning_rate: float = 1.5e-3
+    learning_rate: float = 1e-3
     validate_every: int = 250
 
     def run(self) -> None:
@@ -49,7 +50,7 @@ class TrainDetector(PeopleOptions):
         net = TrainedRTMDet(self.variant)
         self.begin(net)
         sources, held_out = read_sources(self.data)
-        sources = replace(sources, cutouts=self.rendered_people())
+        sources = replace(sources, cutouts=self.rendered_people() or ())
         recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate)
         detector = RTMDet.from_pretrained(self.train(recipe, loop))
         calibrate(detector, held_out)

@@ -1,10 +1,15 @@
 """``tensorsim train pose``: train the small pose network on labelled and rendered people."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tensorsim.commands.training import PeopleOptions
 from tensorsim.errors import check_positive
+
+if TYPE_CHECKING:
+    from tensorsim.training.pose_data import Person
 
 
 @dataclass(frozen=True)
@@ -12,7 +17,8 @@ class TrainPose(PeopleOptions):
     """Train HRNet, small, on tar shards of people; run again with the same arguments, it goes on where it stopped.
 
     Attributes:
-        data: folder of lspet-*.tar, coco_small-*.tar and backgrounds-*.tar.
+        data: folder of the shards coco_small, coco_more, coco_extra, films_teacher, lspet and, for rendered people,
+            backgrounds (NAME-*.tar).
         size: height and width of the crops.
         first_size: height and width of smaller crops to begin with.
         first_steps: steps with those.
@@ -35,8 +41,8 @@ class TrainPose(PeopleOptions):
         """Do it."""
         import torch
 
-        from tensorsim.training.pose import HELD_OUT_PERCENT, PoseRecipe
-        from tensorsim.training.pose_data import RenderedPeople, people, split, upright
+        from tensorsim.training.pose import PoseRecipe, held_out_people, read_people
+        from tensorsim.training.pose_data import RenderedPeople
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 
@@ -45,20 +51,25 @@ class TrainPose(PeopleOptions):
         torch.manual_seed(self.seed)
         net = HRNet(HRNetConfig(self.width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)
         self.begin(net)
-        coco, coco_held_out = split(
-            Shards(find_shards(self.data, "coco_small")), HELD_OUT_PERCENT["coco_small"]
-        )
-        lspet, lspet_held_out = split(Shards(find_shards(self.data, "lspet")), HELD_OUT_PERCENT["lspet"])
-        places = Shards(find_shards(self.data, "backgrounds"))
+        persons = read_people(self.data)
+        cutouts = self.rendered_people()
+        rendered = None
+        if cutouts is not None:
+            rendered = RenderedPeople(cutouts, Shards(find_shards(self.data, "backgrounds")))
+        held_out = held_out_people(self.data)
         recipe = PoseRecipe(
             net,
-            sided=people(coco, least=4, least_px=32),
-            unsided=people(lspet),
-            validation={"coco": people(coco_held_out), "lspet": upright(people(lspet_held_out))},
-            rendered=RenderedPeople(self.rendered_people(), places),
+            persons,
+            {"coco": some(held_out["COCO, large"]), "lspet": some(held_out["LSPE, upright"])},
+            rendered,
             seed=self.seed,
             learning_rate=self.learning_rate,
             first_size=self.first_size,
             first_samples=self.first_steps * self.batch,
         )
         self.train(recipe, loop)
+
+
+def some(persons: "list[Person]", most: int = 240) -> "list[Person]":
+    """At most so many of the people, evenly spread: shards of unlike pictures follow each other."""
+    return persons[:: math.ceil(len(persons) / most)] if persons else persons

@@ -71,8 +71,8 @@ class PeopleOptions(TrainOptions):
 
     cutouts: Path | None = None
     """Folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given."""
-    rendered: int = 3000
-    """Number of rendered people."""
+    rendered: int = 0
+    """Number of rendered people: 3000 take hours."""
     rendered_seed: int = 0
     """Of their poses, looks and cameras."""
 
@@ -81,9 +81,11 @@ class PeopleOptions(TrainOptions):
         check_seed(self.rendered_seed, "--rendered-seed")
         return super().loop(**settings)
 
-    def rendered_people(self) -> "Cutouts":
-        """Rendered people, rendered first where they are missing, which takes hours."""
+    def rendered_people(self) -> "Cutouts | None":
+        """Rendered people, rendered first where they are missing; None if none are wanted."""
         from tensorsim.training.cutouts import Cutouts, render_cutouts
 
+        if self.rendered == 0:
+            return None
         folder = self.out / "cutouts" if self.cutouts is None else self.cutouts
         return Cutouts(render_cutouts(self.rendered, self.rendered_seed, folder, self.quiet))

@@ -1,4 +1,4 @@
-"""The recipe of the pose network: HRNet on crops of labelled and rendered people.
+"""The recipe of the pose network: HRNet on crops of labelled people and, if wanted, rendered ones.
 
 From few pictures and without weights from elsewhere, plain mean squared error on heat maps leads to maps that are
 zero everywhere. Here the foreground counts more, and the maps are compared as distributions over places as well,
@@ -8,23 +8,78 @@ whose gradient does not vanish where the answer is far off.
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.training.colours import Picture, recoloured
 from tensorsim.training.loop import Batch, Recipe
-from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople, crop_person, lean_deg
+from tensorsim.training.pose_data import (
+    Augmentation,
+    Person,
+    RenderedPeople,
+    crop_person,
+    cut_by_the_picture,
+    large,
+    lean_deg,
+    people,
+    upright,
+)
 from tensorsim.training.pose_metrics import evaluate_pose
+from tensorsim.training.shards import Shards, find_shards, read_coco_shards, split
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.topdown import MIRRORED
 
 STRIDE = 4  # crop pixels per heat-map pixel
-#: Share of the pictures of each source that are never trained on, see :func:`tensorsim.training.pose_data.split`.
-HELD_OUT_PERCENT = {"coco_small": 15, "lspet": 3}
+#: Of the pictures of LSPE, never trained on, see :func:`tensorsim.training.shards.split`.
+LSPET_HELD_OUT_PERCENT = 3
+
+
+class PosePeople(NamedTuple):
+    """People to train on.
+
+    Attributes:
+        sided: people whose left and right labels hold.
+        films: people in frames of films, labelled by another network.
+        unsided: people whose left and right are sometimes confused.
+    """
+
+    sided: Sequence[Person]
+    films: Sequence[Person]
+    unsided: Sequence[Person]
+
+
+def read_people(data: Path) -> PosePeople:
+    """The people to train on of a folder of shards.
+
+    Raises:
+        TensorsimError: shards are missing.
+    """
+    sided = people(read_coco_shards(data)[0])
+    films = people(Shards(find_shards(data, "films_teacher")))
+    for person in films:
+        # The teacher leaves out only what is beyond the edge of the picture.
+        body = person.keypoints[:17]
+        body[body[:, 2] == 0, 2] = -1
+    lspet = split(Shards(find_shards(data, "lspet")), LSPET_HELD_OUT_PERCENT)[0]
+    return PosePeople(sided, films, people(lspet))
+
+
+def held_out_people(data: Path) -> dict[str, list[Person]]:
+    """The people of a folder of shards who are never trained on, by the name of their group.
+
+    Raises:
+        TensorsimError: shards are missing.
+    """
+    coco = people(read_coco_shards(data)[1])
+    lspet = people(split(Shards(find_shards(data, "lspet")), LSPET_HELD_OUT_PERCENT)[1])
+    return {"COCO": coco, "COCO, large": large(coco), "LSPE": lspet, "LSPE, upright": upright(lspet)}
 
 
 def gaussian_maps(points: Tensor, size: tuple[int, int], sigma: float) -> Tensor:
@@ -40,15 +95,22 @@ def gaussian_maps(points: Tensor, size: tuple[int, int], sigma: float) -> Tensor
 
 
 def heatmap_loss(
-    maps: Tensor, targets: Tensor, foreground: float = 20.0, sharpness: float = 10.0, places: float = 0.1
+    maps: Tensor,
+    targets: Tensor,
+    emphasis: Tensor | None = None,
+    foreground: float = 20.0,
+    sharpness: float = 10.0,
+    places: float = 0.1,
 ) -> Tensor:
     """What heat maps (..., h, w) cost, per map (...); zero where they equal the targets.
 
-    ``sum_x (1 + foreground t) (m - t)^2 / sum_x t^2`` and, weighted with ``places``, the Kullback-Leibler divergence
-    of ``softmax(sharpness m)`` from ``softmax(sharpness t)`` over places x. Both have their minimum at m = t.
+    ``sum_x (1 + foreground e) (m - t)^2 / sum_x t^2`` and, weighted with ``places``, the Kullback-Leibler divergence
+    of ``softmax(sharpness m)`` from ``softmax(sharpness t)`` over places x. Both have their minimum at m = t. The
+    emphasis e, in [0, 1], is t itself unless given.
     """
+    emphasis = targets if emphasis is None else emphasis
     energy = (targets**2).sum((-2, -1)).clamp_min(1.0)
-    squares = ((1 + foreground * targets) * (maps - targets) ** 2).sum((-2, -1)) / energy
+    squares = ((1 + foreground * emphasis) * (maps - targets) ** 2).sum((-2, -1)) / energy
     told = F.log_softmax(sharpness * maps.flatten(-2), -1)
     wanted = F.log_softmax(sharpness * targets.flatten(-2), -1)
     divergence = (wanted.exp() * (wanted - told)).sum(-1)
@@ -56,45 +118,52 @@ def heatmap_loss(
 
 
 def person_loss(
-    maps: Tensor, points: Tensor, known: Tensor, gone: Tensor, sided: Tensor, sigma: float
+    maps: Tensor, points: Tensor, known: Tensor, gone: Tensor, rivals: Tensor, sided: Tensor, sigma: float
 ) -> Tensor:
     """Mean loss over the keypoints of each person that are known or gone (N,), zero where none is.
 
     The map of a keypoint that is gone should be zero: where the picture ends within a person, low peaks then tell
-    which part of the body is out of sight.
+    which part of the body is out of sight. Where the same keypoint of somebody else is, zeros count as much as the
+    peak does.
 
     Where ``sided`` is false, left and right may have been confused by who labelled: then the loss against labels
     with sides exchanged is taken instead if it is less than half as large, which a network reaches only once it
-    tells the sides by itself.
+    can distinguish the sides by itself.
 
     Args:
         maps: (N, 17, h, w).
         points: (N, 17, 2) crop pixels.
         known: (N, 17) bool.
         gone: (N, 17) bool, none of them known.
+        rivals: (N, M, 17, 2) crop pixels, keypoints of M others; far outside where there are none.
         sided: (N,) bool.
         sigma: of the targets, map pixels.
     """
     size = (maps.shape[-2], maps.shape[-1])
+    others = (
+        gaussian_maps(rivals / STRIDE, size, sigma).amax(1) if rivals.shape[1] else torch.zeros_like(maps)
+    )
 
     def mean_loss(points: Tensor, known: Tensor, gone: Tensor) -> Tensor:
         targets = gaussian_maps(points / STRIDE, size, sigma) * known[..., None, None]
         told = known | gone
-        return (heatmap_loss(maps, targets) * told).sum(-1) / told.sum(-1).clamp_min(1)
+        losses = heatmap_loss(maps, targets, torch.maximum(targets, others))
+        return (losses * told).sum(-1) / told.sum(-1).clamp_min(1)
 
-    mirrored = list(MIRRORED)
     straight = mean_loss(points, known, gone)
+    if bool(sided.all()):
+        return straight
+    mirrored = list(MIRRORED)
     exchanged = mean_loss(points[:, mirrored], known[:, mirrored], gone[:, mirrored])
     return torch.where(~sided & (exchanged < 0.5 * straight), exchanged, straight)
 
 
 class PoseRecipe(Recipe):
-    """Train :class:`~tensorsim.vision.HRNet` on people from three sources.
+    """Train :class:`~tensorsim.vision.HRNet` on people from four sources.
 
     Args:
         net: the network, for crops of its ``input_size``.
-        sided: people whose left and right labels hold.
-        unsided: people whose left and right are sometimes confused.
+        persons: whom to train on.
         validation: held-out people by name; the mean of their OKS is the score.
         rendered: people with exact labels, face included; None leaves them out.
         seed: of the stream of samples.
@@ -102,7 +171,7 @@ class PoseRecipe(Recipe):
         sigma: of the targets, in heat-map pixels.
         first_size: (H, W) of the crops of the first ``first_samples`` samples: smaller ones teach faster.
         first_samples: how many; 0 trains at the network's size from the start.
-        shares: of ``sided``, ``unsided`` and ``rendered`` in the stream.
+        shares: of ``sided``, ``films``, ``unsided`` and ``rendered`` in the stream, in relation to each other.
         augmentation: of the crops.
 
     Raises:
@@ -112,8 +181,7 @@ class PoseRecipe(Recipe):
     def __init__(
         self,
         net: HRNet,
-        sided: Sequence[Person],
-        unsided: Sequence[Person],
+        persons: PosePeople,
         validation: dict[str, list[Person]],
         rendered: RenderedPeople | None = None,
         seed: int = 0,
@@ -121,13 +189,15 @@ class PoseRecipe(Recipe):
         sigma: float = 1.5,
         first_size: tuple[int, int] = (96, 64),
         first_samples: int = 0,
-        shares: tuple[float, float, float] = (0.2, 0.55, 0.25),
+        shares: tuple[float, float, float, float] = (0.55, 0.2, 0.25, 0.1),
         augmentation: Augmentation | None = None,
     ) -> None:
         self.augmentation = Augmentation() if augmentation is None else augmentation
         height, width = net.input_size
+        self.groups: list[Sequence[Person]] = [persons.sided, persons.films, persons.unsided]
+        sizes = [*(len(group) for group in self.groups), 0 if rendered is None else len(rendered)]
         settings = {
-            "people": [len(sided), len(unsided), 0 if rendered is None else len(rendered)],
+            "people": [*sizes],
             "input_size": [height, width],
             "seed": seed,
             "learning_rate": learning_rate,
@@ -139,55 +209,51 @@ class PoseRecipe(Recipe):
         }
         super().__init__(net, settings, {"input_size": f"{height}x{width}"})
         self.input_size, self.first_size, self.first_samples = net.input_size, first_size, first_samples
-        self.sided, self.unsided, self.rendered, self.validation = sided, unsided, rendered, validation
+        self.rendered, self.validation = rendered, validation
         self.seed, self.learning_rate, self.sigma = seed, learning_rate, sigma
-        sizes = np.array(settings["people"])
-        self.shares = np.where(sizes > 0, shares, 0.0)
+        self.shares = np.where(np.array(sizes) > 0, shares, 0.0)
         if not self.shares.sum() > 0:
             raise TensorsimError("PoseRecipe: got nobody to train on, expected people from some source")
         self.shares /= self.shares.sum()
-        # People who stand count more: they are what is filmed.
-        upright = np.array([1.0 + 2.0 * (abs(lean_deg(person.keypoints)) < 30) for person in unsided])
-        self.upright = upright / upright.sum() if len(upright) else upright
-        self.colours: nn.Module | None = None
+        self.weights = [_weights(group) for group in self.groups]
 
     def sample(self, index: int) -> dict[str, Any]:
-        """A crop (3, h, w) uint8, its points (17, 2), which are known and which gone (17,), whether sides hold."""
+        """A crop (3, h, w) uint8, its points and rivals, which are known and which gone, whether sides hold."""
+        import cv2
+
+        cv2.setNumThreads(0)  # the processes of the loader are the parallel ones
         generator = np.random.default_rng((self.seed, index))
         size = self.first_size if index < self.first_samples else self.input_size
-        source = int(generator.choice(3, p=self.shares))
-        if source == 2 and self.rendered is not None:
+        source = int(generator.choice(len(self.shares), p=self.shares))
+        if source == 3 and self.rendered is not None:
             number = int(generator.integers(len(self.rendered)))
             crop = self.rendered.crop(number, size, self.augmentation, generator)
         else:
+            group = self.groups[source]
+            person = group[int(generator.choice(len(group), p=self.weights[source]))]
+            image = person.sample.image()
+            keypoints = person.keypoints
             if source == 0:
-                person = self.sided[int(generator.integers(len(self.sided)))]
-            else:
-                person = self.unsided[int(generator.choice(len(self.unsided), p=self.upright))]
+                keypoints = cut_by_the_picture(image, person.box, keypoints)
             crop = crop_person(
-                person.sample.image(),
-                person.box,
-                person.keypoints,
-                size,
-                self.augmentation,
-                generator,
+                image, person.box, keypoints, size, self.augmentation, generator, person.others
             )
+        image = covered(recoloured(crop.image, generator), generator)
         return {
-            "crops": np.ascontiguousarray(crop.image.transpose(2, 0, 1)),
+            "crops": np.ascontiguousarray(image.transpose(2, 0, 1)),
             "points": crop.points,
             "known": crop.known,
             "gone": crop.gone,
-            "sided": source != 1,
+            "rivals": crop.rivals,
+            "sided": source != 2,
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Mean over the batch of :func:`person_loss`, on crops whose colours are changed and patches hidden."""
-        if self.colours is None:
-            self.colours = colour_changes()
-        with torch.no_grad(), torch.autocast(batch["crops"].device.type, enabled=False):
-            crops = self.colours(batch["crops"].float() / 255)
+        """Mean over the batch of :func:`person_loss`."""
+        crops = batch["crops"].float() / 255
         maps = net(crops.contiguous(memory_format=torch.channels_last)).float()
-        losses = person_loss(maps, batch["points"], batch["known"], batch["gone"], batch["sided"], self.sigma)
+        points, known, gone = batch["points"], batch["known"], batch["gone"]
+        losses = person_loss(maps, points, known, gone, batch["rivals"], batch["sided"], self.sigma)
         return {"loss": losses.mean()}
 
     def optimiser(self) -> torch.optim.Optimizer:
@@ -215,14 +281,19 @@ class PoseRecipe(Recipe):
         }
 
 
-def colour_changes() -> nn.Module:
-    """Random light, colour, focus and hidden patches of a batch of crops (N, 3, h, w) in [0, 1]."""
-    import kornia.augmentation as augmentation
+def _weights(persons: Sequence[Person]) -> npt.NDArray[np.float64]:
+    """How often each person is taken: those who stand more often, as in films, and those with others beside them."""
+    standing = np.array([abs(lean_deg(person.keypoints)) < 30 for person in persons], float)
+    beside = np.array([(person.others[..., 2] > 0).any() for person in persons], float)
+    weights = 1 + standing + beside
+    return weights / max(weights.sum(), 1)
 
-    return nn.Sequential(
-        augmentation.ColorJitter(0.4, 0.4, 0.4, 0.0, p=0.9),
-        augmentation.RandomPlanckianJitter("blackbody", p=0.4),
-        augmentation.RandomGrayscale(p=0.1),
-        augmentation.RandomGaussianBlur((5, 5), (0.3, 1.5), p=0.2),
-        augmentation.RandomErasing((0.02, 0.12), (0.4, 2.5), value=0.4, p=0.4),
-    )
+
+def covered(image: Picture, generator: np.random.Generator) -> Picture:
+    """A crop (h, w, 3), at times with a rectangle of one colour over a part of it, in place."""
+    if generator.random() < 0.35:
+        size = np.array(image.shape[:2])
+        extent = (size * np.exp(generator.uniform(np.log(0.12), np.log(0.45), 2))).astype(int) + 1
+        top, left = (generator.random(2) * (size - extent)).astype(int)
+        image[top : top + extent[0], left : left + extent[1]] = generator.integers(0, 256, 3)
+    return image

@@ -4,7 +4,6 @@ Crops follow :mod:`tensorsim.vision.pose2d.crops`: pixel centres at integers, an
 that :class:`~tensorsim.vision.pose2d.crops.BoxCrop` gives for the person's box.
 """
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +23,10 @@ Doubles = npt.NDArray[np.float64]
 
 PADDING = 1.25  # of the boxes, as TopDownPose has it
 _SHOULDERS, _HIPS = (5, 6), (11, 12)
-_UPPER, _LOWER = tuple(range(13)), tuple(range(11, 17))
+_UPPER, _LOWER, _LEGS = tuple(range(13)), tuple(range(11, 17)), tuple(range(13, 17))
+#: People beside somebody whose keypoints the network is to keep apart.
+NEIGHBOURS = 2
+_FAR = -1e4
 
 
 class Person(NamedTuple):
@@ -36,12 +38,14 @@ class Person(NamedTuple):
         keypoints: (17 or 19, 3): x, y and v; a neck and the top of the head, where given, help to find the box of
             a person who is turned.
         area: pixels that show the person.
+        others: (NEIGHBOURS, 17, 3): keypoints of the people who overlap most; zero where there are none.
     """
 
     sample: Sample
     box: Floats
     keypoints: Floats
     area: float
+    others: Floats = np.zeros((0, 17, 3), np.float32)
 
 
 class Crop(NamedTuple):
@@ -52,12 +56,14 @@ class Crop(NamedTuple):
         points: (17, 2) float32, crop pixels.
         known: (17,) bool, labelled and inside of the crop.
         gone: (17,) bool, labelled but cut away: nothing of them is to be found in the crop.
+        rivals: (NEIGHBOURS, 17, 2) float32, crop pixels: the keypoints of others, far outside where not labelled.
     """
 
     image: Picture
     points: Floats
     known: npt.NDArray[np.bool_]
     gone: npt.NDArray[np.bool_]
+    rivals: Floats
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,9 @@ class Augmentation:
         scale: standard deviation of the log of the box's factor; held within a factor of 1.5.
         turn_deg: standard deviation of the rotation; held within twice as much.
         shift: of the centre, standard deviation in sizes of the box.
+        edge: of each edge of the box by itself, standard deviation in sizes of the box.
         upright: probability that a person who lies or leans is stood upright before that turn.
+        lay: probability that a person is laid on a side after it.
         half: probability that only the upper or the lower body is cropped.
         cut: probability that the picture ends within the person, mostly below.
     """
@@ -76,32 +84,61 @@ class Augmentation:
     scale: float = 0.15
     turn_deg: float = 18.0
     shift: float = 0.04
-    upright: float = 0.6
-    half: float = 0.3
+    edge: float = 0.04
+    upright: float = 0.4
+    lay: float = 0.06
+    half: float = 0.25
     cut: float = 0.25
 
 
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
     """The people of pictures with at least so many labelled COCO keypoints and such a longest side."""
-    return [
-        Person(sample, box, keypoints, float(area))
-        for sample in samples
-        for box, keypoints, area in zip(sample.boxes, sample.keypoints, sample.areas, strict=True)
-        if (keypoints[:17, 2] > 0).sum() >= least and (box[2:] - box[:2]).max() >= least_px
-    ]
-
-
-def split(samples: Sequence[Sample], percent: int) -> tuple[list[Sample], list[Sample]]:
-    """Samples to train on, and the percent that are held out, told by a hash of their keys."""
-    parts: tuple[list[Sample], list[Sample]] = ([], [])
+    found = []
     for sample in samples:
-        parts[int(hashlib.sha256(sample.key.encode()).hexdigest(), 16) % 100 < percent].append(sample)
-    return parts
+        for index, keypoints in enumerate(sample.keypoints):
+            box = sample.boxes[index]
+            if (keypoints[:17, 2] > 0).sum() >= least and (box[2:] - box[:2]).max() >= least_px:
+                area = float(sample.areas[index])
+                found.append(Person(sample, box, keypoints, area, _neighbours(sample, index)))
+    return found
+
+
+def _neighbours(sample: Sample, index: int) -> Floats:
+    """Keypoints (NEIGHBOURS, 17, 3) of the people whose boxes share most of that of one."""
+    low = np.maximum(sample.boxes[:, :2], sample.boxes[index, :2])
+    high = np.minimum(sample.boxes[:, 2:], sample.boxes[index, 2:])
+    shared = np.maximum(high - low, 0).prod(1)
+    shared[index] = 0
+    nearest = [i for i in np.argsort(-shared)[:NEIGHBOURS] if shared[i] > 0]
+    others = np.zeros((NEIGHBOURS, 17, 3), np.float32)
+    others[: len(nearest)] = sample.keypoints[nearest, :17]
+    return others
+
+
+def cut_by_the_picture(image: Picture, box: Floats, keypoints: Floats) -> Floats:
+    """Keypoints with v = -1 for the unlabelled joints of legs where a box ends at the lower edge of its picture."""
+    if box[3] < image.shape[0] * 0.985:
+        return keypoints
+    keypoints = keypoints.copy()
+    legs = keypoints[_LEGS, :]
+    legs[legs[:, 2] == 0, 2] = -1
+    keypoints[_LEGS, :] = legs
+    return keypoints
 
 
 def upright(persons: Sequence[Person], most_deg: float = 30.0) -> list[Person]:
     """Those of the people whose trunk leans no further than that."""
     return [person for person in persons if abs(lean_deg(person.keypoints)) < most_deg]
+
+
+def large(persons: Sequence[Person], least: int = 8, share: float = 0.25) -> list[Person]:
+    """Those of the people with so many labelled COCO keypoints and at least that share of their picture's height."""
+    return [
+        person
+        for person in persons
+        if (person.keypoints[:17, 2] > 0).sum() >= least
+        and person.box[3] - person.box[1] >= share * person.sample.image().shape[0]
+    ]
 
 
 def lean_deg(keypoints: Floats) -> float:
@@ -155,6 +192,7 @@ def crop_person(
     size: tuple[int, int],
     augmentation: Augmentation | None = None,
     generator: np.random.Generator | None = None,
+    others: Floats | None = None,
 ) -> Crop:
     """Crop a person from a picture.
 
@@ -165,6 +203,7 @@ def crop_person(
         size: (h, w) of the crop.
         augmentation: how it may be changed; None crops the box as it is.
         generator: decides; needed with an augmentation.
+        others: (NEIGHBOURS, 17, 3) keypoints of other people in the picture; None knows of none.
 
     Returns:
         The crop, with the C channels of the image.
@@ -177,7 +216,8 @@ def crop_person(
     if not (keypoints[:, 2] > 0).any():
         raise TensorsimError("crop_person: got a person without labelled keypoints")
     mirrored, border = False, cv2.BORDER_CONSTANT
-    turn = np.eye(2)
+    turn: Doubles = np.eye(2)
+    moved: npt.NDArray[np.floating] = np.zeros(2)
     frame = box.astype(np.float64)
     if augmentation is not None:
         if generator is None:
@@ -186,7 +226,8 @@ def crop_person(
         if generator.random() < 0.5:
             border = cv2.BORDER_REPLICATE
         if generator.random() < augmentation.cut:
-            image, box, keypoints = cut_picture(image, box, keypoints, generator)
+            image, box, rest = cut_picture(image, box, keypoints, generator)
+            moved, keypoints = (rest - keypoints)[0, :2], rest
             frame = box.astype(np.float64)
         turn, frame = _vary(box, keypoints, augmentation, generator)
     matrix = box_matrix(frame, size, mirrored)
@@ -200,7 +241,13 @@ def crop_person(
     inside = ((points >= -0.5) & (points <= np.array([size[1], size[0]]) - 0.5)).all(1)
     known = inside & (body[:, 2] > 0)
     gone = ~known & (body[:, 2] != 0)
-    return Crop(warped.astype(np.uint8, copy=False), points.astype(np.float32), known, gone)
+    rivals = np.full((NEIGHBOURS, len(COCO_KEYPOINTS), 2), _FAR, np.float32)
+    if others is not None and len(others):
+        if mirrored:
+            others = others[:, list(MIRRORED)]
+        places = (others[..., :2] + moved) @ matrix[:, :2].T + matrix[:, 2]
+        rivals = np.where(others[..., 2:] > 0, places, _FAR).astype(np.float32)
+    return Crop(warped.astype(np.uint8, copy=False), points.astype(np.float32), known, gone, rivals)
 
 
 def cut_picture(
@@ -242,6 +289,8 @@ def _vary(
     lean = lean_deg(keypoints)
     if generator.random() < augmentation.upright and abs(lean) > 30:
         angle -= lean
+    if generator.random() < augmentation.lay:
+        angle += 90 * generator.choice([-1, 1])
     turn = rotation(angle)
     frame = turned_box(box, keypoints, turn)
     part = np.array(_UPPER if generator.random() < 0.6 else _LOWER)
@@ -255,7 +304,9 @@ def _vary(
     half = (
         (frame[2:] - frame[:2]) / 2 * math.exp(float(np.clip(bounded_normal(augmentation.scale), -0.4, 0.4)))
     )
-    return turn, np.concatenate([middle - half, middle + half])
+    edges = size * np.array([bounded_normal(augmentation.edge) for _ in "uvuv"])
+    frame = np.concatenate([middle - half, middle + half]) + edges
+    return turn, frame if (frame[2:] - frame[:2] >= 1).all() else frame - edges
 
 
 class RenderedPeople:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tensorsim.commands.evaluate_detector import EvaluateDetector
 from tensorsim.commands.train_detector import TrainDetector
 from tensorsim.errors import TensorsimError
-from tensorsim.training.detector import USED_IOU, USED_SIDE, DetectorRecipe, TrainedRTMDet, read_sources
+from tensorsim.training.detector import HARD, USED_IOU, USED_SIDE, DetectorRecipe, TrainedRTMDet, read_sources
 from tensorsim.training.detector_data import Sources
 from tensorsim.training.detector_metrics import (
     average_precision,
@@ -37,7 +37,9 @@ def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DetectorRecipe:
     tiny = RTMDetSize(0.167, 0.125, 1, exp_on_reg=True, depthwise=False, share_conv=True, input_size=64)
     monkeypatch.setitem(RTMDET_SIZES, "test", tiny)
     complete, empty = shard(tmp_path / "p.tar", True), shard(tmp_path / "e.tar", False)
-    sources = Sources(complete, empty, [shard(tmp_path / "s.tar", True, False)], cutouts(tmp_path / "c.tar"))
+    partial = [shard(tmp_path / "s.tar", True, False)]
+    sources = Sources(complete, empty, partial, cutouts=cutouts(tmp_path / "c.tar"))
+    monkeypatch.setattr("tensorsim.training.detector.SIDES", (64,))
     torch.manual_seed(0)
     return DetectorRecipe(TrainedRTMDet("test"), sources, complete, warm_up=5)
 
@@ -78,7 +80,7 @@ def test_the_detector_sees_what_the_recipe_trains_on(recipe: DetectorRecipe) -> 
 
 
 def test_a_batch_of_another_size_keeps_boxes_on_people(recipe: DetectorRecipe, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr("tensorsim.training.detector.SIDES", (32,))
+    monkeypatch.setattr("tensorsim.training.detector.SIDES", (32, 64))
     sizes = set()
     for first in range(8):
         samples = [recipe.sample(2 * first), recipe.sample(2 * first + 1)]
@@ -125,8 +127,9 @@ def test_command_trains_and_goes_on_from_weights(
         files[f"{n}.jpg"] = encoded(image, ".jpg")
         files[f"{n}.json"] = json.dumps({"all_persons_labelled": True, "persons": persons}).encode()
     write_tar(tmp_path / "coco_small-00.tar", files)
-    write_tar(tmp_path / "backgrounds-00.tar", {"0.jpg": files["0.jpg"]})
-    for name in ("lspet", "pedestrian"):
+    for name in ("backgrounds", "coco_hardneg"):
+        write_tar(tmp_path / f"{name}-00.tar", {"0.jpg": files["0.jpg"]})
+    for name in ("lspet", "pedestrian", "coco_more", "coco_extra", "films_teacher"):
         write_tar(tmp_path / f"{name}-00.tar", {key: files[key] for key in ("1.jpg", "1.json")})
     cutouts(tmp_path / "cutouts-000.tar")
 
@@ -172,7 +175,8 @@ def test_bad_options_are_refused_before_people_are_rendered(tmp_path: Path) -> N
 
 
 def test_held_out_pictures_must_be_of_both_kinds(tmp_path: Path) -> None:
-    shard(tmp_path / "coco_small-00.tar", True)
+    for name in ("coco_small", "coco_more", "coco_extra"):
+        shard(tmp_path / f"{name}-00.tar", True)
     with pytest.raises(TensorsimError, match="held-out"):
         read_sources(tmp_path)
 
@@ -308,6 +312,11 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
     lying = {5: (20.0, 30.0), 6: (20.0, 40.0), 11: (60.0, 30.0), 12: (60.0, 40.0)}
     write("coco_small", [f"c{i}" for i in range(40)], [person({})], True)
     write_tar(tmp_path / "coco_small-01.tar", {f"n{i}.jpg": encoded(picture, ".jpg") for i in range(40)})
+    write("coco_more", [f"m{i}" for i in range(40)], [person({})], True)
+    write("coco_extra", [f"x{i}" for i in range(40)], [person({})], False)
+    write_tar(tmp_path / "coco_hardneg-00.tar", {"doll.jpg": encoded(picture, ".jpg")})
+    write("films_teacher", ["film"], [person(shoulders | hips)], True)
+    write("films_teacher-some", ["crowd"], [person({})], False)
     write("lspet", ["standing"], [person(shoulders | hips)], False)
     write("lspet-nobody", ["nobody"], [], False)
     write_tar(tmp_path / "lspet-01.tar", {
@@ -318,16 +327,21 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
     write_tar(tmp_path / "backgrounds-00.tar", {"room.jpg": encoded(picture, ".jpg")})
 
     sources, held_out = read_sources(tmp_path)
-    keys = {sample.key for sample in sources.complete}
-    assert keys | {sample.key for sample in held_out} >= {f"c{i}" for i in range(40)}
-    assert not keys & {sample.key for sample in held_out}
-    assert 0 < len(held_out) < 40
-    everybody, standing, street = sources.partial
+    keys, kept = {sample.key for sample in sources.complete}, {sample.key for sample in held_out}
+    everyone = {f"{kind}{i}" for kind in "cm" for i in range(40)}
+    assert keys == everyone - kept
+    assert kept < everyone | {f"n{i}" for i in range(40)}
+    assert all(any(key.startswith(kind) for key in kept) for kind in "cmn")
+    assert [sample.key for sample in sources.films] == ["film"]
+    crowds, everybody, street = sources.partial
+    assert 0 < len(crowds) < 40
+    assert all(sample.key.startswith("x") for sample in crowds)
     assert {s.key for s in everybody} == {"standing", "lying", "nobody"}
-    assert [s.key for s in standing] == ["standing"]
-    empty = {s.key for s in sources.empty}
-    assert "room" in empty
-    assert empty <= {"room", *(f"n{i}" for i in range(40))} - {sample.key for sample in held_out}
+    assert [s.key for s in sources.outlined] == ["standing"]
+    empty = [s.key for s in sources.empty]
+    assert empty.count("room") == 1
+    assert empty.count("doll") == HARD
+    assert set(empty) == {"room", "doll", *(f"n{i}" for i in range(40))} - kept
     np.testing.assert_allclose(street[0].boxes, [[20, 30 - 0.18 * 50, 60, 80]], rtol=1e-6)
 
 

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from tensorsim.errors import TensorsimError
+from tensorsim.training.canvas import KNOWN_CELLS, Canvas
 from tensorsim.training.cutouts import Cutouts
-from tensorsim.training.detector_data import KNOWN_CELLS, Canvas, Labelled, PictureMaker, Sources
+from tensorsim.training.detector_data import Labelled, PictureMaker, Sources
 from tensorsim.training.detector_people import outline
 from tensorsim.training.shards import POINTS, Sample, Shards
+from tensorsim.training.views import random_turn
 from tests.training.tars import write_tar
 
 RED, GREEN = (230, 20, 20), (20, 200, 20)
@@ -102,7 +104,7 @@ def cutouts(path: Path) -> Cutouts:
 def sources(tmp_path: Path) -> Sources:
     complete, empty = shard(tmp_path / "p.tar", True), shard(tmp_path / "e.tar", False)
     partial = shard(tmp_path / "s.tar", True, everyone=False)
-    return Sources(complete, empty, [partial], cutouts(tmp_path / "c.tar"))
+    return Sources(complete, empty, [partial], cutouts=cutouts(tmp_path / "c.tar"))
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -114,6 +116,31 @@ def test_placed_boxes_hold_the_person(sources: Sources, seed: int) -> None:
     # A pixel on either side is what interpolation and jpeg smear.
     np.testing.assert_allclose(boxes[0], red_box(canvas.image), atol=1.6)
     assert canvas.known.all()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_boxes_are_tight_around_people_in_turned_pictures(tmp_path: Path, seed: int) -> None:
+    """Around an ellipse, which the recomputed box should hold to the pixel at any turn."""
+    image = np.full((300, 400, 3), 90, np.uint8)
+    cv2.ellipse(image, (200, 150), (30, 75), 0, 0, 360, RED, -1)
+    persons = [{"bbox": [169.5, 74.5, 62, 152], "keypoints": None}]
+    label = {"all_persons_labelled": True, "persons": persons}
+    files = {"a.jpg": encoded(image, ".jpg"), "a.json": json.dumps(label).encode()}
+    sample = Shards([write_tar(tmp_path / "e.tar", files)])[0]
+    rng = np.random.default_rng(seed)
+    canvas = Canvas(256)
+    canvas.place(sample, (0, 0, 256, 256), rng, random_turn((300, 400), rng))
+    assert len(canvas.boxes) == 1
+    np.testing.assert_allclose(canvas.boxes[0], red_box(canvas.image), atol=2.5)
+
+
+def test_kinds_without_pictures_are_left_out(sources: Sources) -> None:
+    kinds, shares = sources.kinds()
+    assert "films" not in kinds
+    assert sum(shares) == pytest.approx(1)
+    assert shares[kinds.index("complete")] / shares[kinds.index("empty")] == pytest.approx(0.55 / 0.12)
+    kinds, _ = Sources(sources.complete, sources.empty, sources.partial, sources.complete).kinds()
+    assert kinds == ["complete", "films", "partial", "empty"]
 
 
 def test_placing_flips_and_scales(sources: Sources) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.loop import LoopConfig, fit
-from tensorsim.training.pose import PoseRecipe, gaussian_maps, heatmap_loss, person_loss
+from tensorsim.training.pose import PosePeople, PoseRecipe, covered, gaussian_maps, heatmap_loss, person_loss
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
 from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck
 from tensorsim.training.shards import Sample
@@ -48,6 +48,10 @@ def test_loss_is_the_formula_and_zero_at_the_target_alone() -> None:
     assert heatmap_loss(targets, targets).abs().max() < 1e-12
 
 
+#: Nobody else beside three people.
+NONE = torch.zeros(3, 0, 17, 2)
+
+
 def random_people(count: int = 3) -> tuple[Tensor, Tensor, Tensor]:
     """Points, and which of them are known and which gone."""
     points = 4 + torch.rand(count, 17, 2) * torch.tensor([40.0, 56.0])
@@ -58,13 +62,13 @@ def random_people(count: int = 3) -> tuple[Tensor, Tensor, Tensor]:
 def test_unknown_keypoints_cost_nothing() -> None:
     points, known, gone = random_people()
     maps = torch.rand(3, 17, 16, 12, requires_grad=True)
-    person_loss(maps, points, known, gone, torch.tensor([True, False, True]), 1.5).sum().backward()
+    person_loss(maps, points, known, gone, NONE, torch.tensor([True, False, True]), 1.5).sum().backward()
     assert maps.grad is not None
     told = maps.grad.abs().amax((-2, -1)) > 0
     # A person whose sides are not sure is compared with straight labels as long as the net knows no better.
     torch.testing.assert_close(told, known | gone)
     none = torch.zeros_like(known)
-    nobody = person_loss(maps, points, none, none, torch.ones(3, dtype=torch.bool), 1.5)
+    nobody = person_loss(maps, points, none, none, NONE, torch.ones(3, dtype=torch.bool), 1.5)
     assert (nobody == 0).all()
 
 
@@ -72,9 +76,37 @@ def test_what_is_gone_should_leave_no_peak() -> None:
     points, known, gone = random_people()
     sided = torch.ones(3, dtype=torch.bool)
     truth = gaussian_maps(points / 4, (16, 12), 1.5) * known[..., None, None]
-    assert person_loss(truth, points, known, gone, sided, 1.5).abs().max() < 1e-5
+    assert person_loss(truth, points, known, gone, NONE, sided, 1.5).abs().max() < 1e-5
     ghosts = gaussian_maps(points / 4, (16, 12), 1.5)
-    assert person_loss(ghosts, points, known, gone, sided, 1.5).min() > 0.01
+    assert person_loss(ghosts, points, known, gone, NONE, sided, 1.5).min() > 0.01
+
+
+def test_a_peak_at_somebody_else_costs_more_than_one_elsewhere() -> None:
+    """Also where the other's joint is not one that is known of the person."""
+    sided = torch.ones(1, dtype=torch.bool)
+    known = torch.ones(1, 17, dtype=torch.bool)
+    gone = torch.zeros(1, 17, dtype=torch.bool)
+    points = torch.full((1, 17, 2), 16.0)
+    rivals = torch.stack([torch.full((1, 17, 2), 44.0), torch.full((1, 17, 2), -1e4)], dim=1)
+    truth = gaussian_maps(points / 4, (16, 12), 1.5)
+    at_other = truth + 0.3 * gaussian_maps(rivals[:, 0] / 4, (16, 12), 1.5)
+    nobody_there = torch.full_like(rivals, -1e4)
+    cheap = person_loss(at_other, points, known, gone, nobody_there, sided, 1.5)
+    dear = person_loss(at_other, points, known, gone, rivals, sided, 1.5)
+    assert float(dear) > 3 * float(cheap) > 0
+    assert float(person_loss(truth, points, known, gone, rivals, sided, 1.5)) < 1e-5
+
+
+def test_parts_of_crops_are_covered_in_one_colour_at_times() -> None:
+    shares = []
+    for seed in range(60):
+        image = np.full((64, 48, 3), 90, np.uint8)
+        changed = (covered(image, np.random.default_rng(seed)) != 90).any(-1)
+        shares.append(changed.mean())
+        if changed.any():
+            assert len(np.unique(image[changed], axis=0)) == 1
+    assert 0.15 < np.mean([share > 0 for share in shares]) < 0.55
+    assert max(shares) < 0.3
 
 
 def test_exchanged_sides_are_forgiven_only_where_they_may_be() -> None:
@@ -82,8 +114,8 @@ def test_exchanged_sides_are_forgiven_only_where_they_may_be() -> None:
     mirrored = list(MIRRORED)
     truth = gaussian_maps(points / 4, (16, 12), 1.5) * known[..., None, None]
     wrong = points[:, mirrored], known[:, mirrored], gone[:, mirrored]
-    forgiven = person_loss(truth, *wrong, torch.zeros(3, dtype=torch.bool), 1.5)
-    blamed = person_loss(truth, *wrong, torch.ones(3, dtype=torch.bool), 1.5)
+    forgiven = person_loss(truth, *wrong, NONE, torch.zeros(3, dtype=torch.bool), 1.5)
+    blamed = person_loss(truth, *wrong, NONE, torch.ones(3, dtype=torch.bool), 1.5)
     assert forgiven.abs().max() < 1e-5
     assert blamed.min() > 0.1
 
@@ -178,7 +210,8 @@ def recipe(folder: Path, **options: object) -> PoseRecipe:
     )
     torch.manual_seed(0)
     net = HRNet(TINY, (64, 64))
-    return PoseRecipe(net, persons, persons, {"held_out": persons}, rendered, first_size=(32, 32), **options)  # type: ignore[arg-type]
+    everyone = PosePeople(persons, persons, persons)
+    return PoseRecipe(net, everyone, {"held_out": persons}, rendered, first_size=(32, 32), **options)  # type: ignore[arg-type]
 
 
 def test_samples_depend_on_seed_and_number_only(tmp_path: Path) -> None:
@@ -194,10 +227,10 @@ def test_samples_depend_on_seed_and_number_only(tmp_path: Path) -> None:
 
 def test_sources_left_out(tmp_path: Path) -> None:
     full = recipe(tmp_path)
-    only = PoseRecipe(full.net, full.sided, [], {}, None)  # type: ignore[arg-type]
+    only = PoseRecipe(full.net, PosePeople(full.groups[0], [], []), {})  # type: ignore[arg-type]
     assert all(only.sample(n)["sided"] for n in range(10))
     with pytest.raises(TensorsimError, match="nobody"):
-        PoseRecipe(full.net, [], [], {}, None)  # type: ignore[arg-type]
+        PoseRecipe(full.net, PosePeople([], [], []), {})  # type: ignore[arg-type]
 
 
 def test_loss_of_a_batch_reaches_the_network(tmp_path: Path) -> None:
@@ -217,7 +250,7 @@ def test_eight_crops_are_learnt(tmp_path: Path) -> None:
     losses = []
     for _ in range(80):
         loss = person_loss(
-            net(crops), batch["points"], batch["known"], batch["gone"], batch["sided"], 1.5
+            net(crops), batch["points"], batch["known"], batch["gone"], batch["rivals"], batch["sided"], 1.5
         ).mean()
         optimiser.zero_grad()
         loss.backward()

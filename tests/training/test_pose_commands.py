@@ -7,9 +7,7 @@ import pytest
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
-from tensorsim.training.pose import HELD_OUT_PERCENT
-from tensorsim.training.pose_data import split
-from tensorsim.training.shards import Shards
+from tensorsim.training.pose import held_out_people, read_people
 from tests.training.tars import write_tar
 from tests.training.test_pose_data import BOX, standing, write_cutouts
 from tests.training.test_shards import jpg, label
@@ -21,7 +19,7 @@ def data(tmp_path: Path) -> Path:
     person = {"bbox": [left, top, right - left, bottom - top], "keypoints": standing().tolist()}
     pictures = {f"im{n}.jpg": jpg(n, 280, 200) for n in range(40)}
     labels = {f"im{n}.json": label([person]) for n in range(40)}
-    for name in ("coco_small-00", "lspet-00"):
+    for name in ("coco_small-00", "coco_more-00", "coco_extra-00", "films_teacher-00", "lspet-00"):
         write_tar(tmp_path / f"{name}.tar", pictures | labels)
     write_tar(tmp_path / "backgrounds-00.tar", {"place.jpg": jpg(0, 80, 60)})
     write_cutouts(tmp_path / "cutouts-000.tar")
@@ -37,14 +35,11 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
 
     EvaluatePose(weights, data=data).run()
     rows = capsys.readouterr().out.splitlines()
-    held_out = {
-        name: len(split(Shards([data / f"{name}-00.tar"]), percent)[1])
-        for name, percent in HELD_OUT_PERCENT.items()
-    }
+    held_out = {name: len(persons) for name, persons in held_out_people(data).items()}
     assert min(held_out.values()) > 0
-    assert len(rows) == 5
-    for name, count in held_out.items():
-        (row,) = (row for row in rows if row.startswith(f"{name}, held out   "))
+    assert len(rows) == 1 + len(held_out)
+    for row, (name, count) in zip(rows[1:], held_out.items(), strict=True):
+        assert row.startswith(f"{name}, held out   ")
         assert int(row.split()[-6]) == count
         assert all(0 <= float(figure) <= 1 for figure in row.split()[-5:])
     # Training goes on from those weights.
@@ -61,6 +56,18 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
     )  # type: ignore[arg-type]
     more.run()
     assert (data / "more" / "best.safetensors").is_file()
+
+
+def test_nobody_held_out_is_trained_on(data: Path) -> None:
+    persons, held_out = read_people(data), held_out_people(data)
+    for trained, kept in (("sided", "COCO"), ("unsided", "LSPE")):
+        keys = {person.sample.key for person in getattr(persons, trained)}
+        apart = {person.sample.key for person in held_out[kept]}
+        assert keys
+        assert apart
+        assert not keys & apart
+        assert keys | apart == {f"im{n}" for n in range(40)}
+    assert len(persons.films) == 40
 
 
 @pytest.mark.parametrize(

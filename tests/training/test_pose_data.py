@@ -18,11 +18,10 @@ from tensorsim.training.pose_data import (
     lean_deg,
     people,
     rotation,
-    split,
     turned_box,
     upright,
 )
-from tensorsim.training.shards import Sample
+from tensorsim.training.shards import Sample, split
 from tensorsim.vision.pose2d.crops import BoxCrop, crop_to_image
 from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.training.tars import write_tar
@@ -126,7 +125,7 @@ def test_points_outside_or_not_labelled_are_not_known() -> None:
 def test_what_the_edge_cuts_away_is_gone_even_where_the_crop_reaches_beyond() -> None:
     keypoints = standing()
     keypoints[9, 2] = 0
-    options = Augmentation(scale=0, turn_deg=0, shift=0, half=0, cut=1)
+    options = Augmentation(scale=0, turn_deg=0, shift=0, edge=0, lay=0, half=0, cut=1)
     beyond = 0
     for seed in range(20):
         # The mirror image comes first, then the border, then the cut.
@@ -147,7 +146,7 @@ def test_half_bodies() -> None:
     keypoints = standing()
     shown = set()
     for seed in range(30):
-        options = Augmentation(scale=0, turn_deg=0, shift=0, half=1, cut=0)
+        options = Augmentation(scale=0, turn_deg=0, shift=0, edge=0, lay=0, half=1, cut=0)
         known = crop_person(
             drawn(keypoints), BOX, keypoints, SIZE, options, np.random.default_rng(seed)
         ).known
@@ -203,7 +202,7 @@ def test_who_lies_is_stood_upright() -> None:
     keypoints = standing((-100, -130))
     keypoints[:, :2] = keypoints[:, :2] @ rotation(100).T + [120, 100]
     box = np.concatenate([keypoints[:, :2][keypoints[:, 2] > 0].min(0), keypoints[:, :2].max(0)])
-    options = Augmentation(scale=0, turn_deg=0, shift=0, half=0, cut=0, upright=1)
+    options = Augmentation(scale=0, turn_deg=0, shift=0, edge=0, lay=0, half=0, cut=0, upright=1)
     for seed in range(5):
         crop = crop_person(
             np.zeros((200, 240, 3), np.uint8), box, keypoints, SIZE, options, np.random.default_rng(seed)
