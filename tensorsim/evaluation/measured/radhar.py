@@ -74,7 +74,7 @@ class RadHar:
         self.effects = Effects() if effects is None else effects
         profile = RangeProfile(RADAR, window="hamming", gate_m=(0.6, 5.4))
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
-        self.scatterers = LimbScatterers(RADAR.tx_m, RADAR.rx_m, per_segment=2)
+        self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)
         # Next to a body that fills many range bins the smaller reference cells are those of noise.
         self.cfar = CfarDetector(
             (4, 0), (10, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
@@ -112,7 +112,7 @@ class RadHar:
         draw = Draw(count, generator)
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.beam:
-            rcs = in_beam(positions, rcs, RADAR.tx_m[2], draw(16.0, 40.0))
+            rcs = in_beam(positions, rcs, RADAR.tx_positions_m[0][2], draw(16.0, 40.0))
         if self.effects.dim_limbs:
             gain_db = draw(-8.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
             gain_db[:, 1] = 0.0  # the torso
