@@ -16,7 +16,8 @@ from tensorsim.config import SimulationConfig
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import write_video
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
-from tensorsim.recognition import ActivityRecognizer
+from tensorsim.recognition import ActivityRecognizer, label_windows
+from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.streaming import maps_of_pose, progress_bar
 from tensorsim.types import Pose, RadarMaps
 
@@ -298,13 +299,41 @@ def summary_of(source: "Source", config: SimulationConfig, pose: Pose, maps: Rad
     }
 
 
-def label_of(recognizer: ActivityRecognizer | None, maps: RadarMaps) -> dict[str, Any]:
-    """The activity that the maps (without a batch dimension) show, and the probability of each; None unasked."""
+def label_of(
+    recognizer: ActivityRecognizer | None, maps: RadarMaps, duration_s: float, least_probability: float = 0.0
+) -> dict[str, Any]:
+    """What ``summary.json`` says of the activity.
+
+    ``label`` and ``probabilities`` (means over the windows) are of the whole scene, ``timeline`` has the label of each
+    window of four seconds. None where there is no recognizer, or one that cannot see the speeds of this radar.
+
+    Args:
+        recognizer: of the radar of the maps.
+        maps: without batch dimensions.
+        duration_s: of the scene.
+        least_probability: below it the label is "not sure".
+    """
     if recognizer is None:
-        return {"label": None, "probabilities": None}
-    probabilities = recognizer(maps).softmax(-1).tolist()
-    by_name = {name: round(p, 4) for name, p in zip(recognizer.class_names, probabilities, strict=True)}
-    return {"label": max(by_name, key=by_name.__getitem__), "probabilities": by_name}
+        return {"label": None, "probabilities": None, "timeline": None}
+    windows = label_windows(recognizer, maps, duration_s, least_probability=least_probability)
+    means = scene_probabilities(windows)
+    best = int(means.argmax())
+    sure = float(means[best]) >= least_probability
+    return {
+        "label": recognizer.class_names[best] if sure else NOT_SURE,
+        "probabilities": {
+            name: round(p, 4) for name, p in zip(recognizer.class_names, means.tolist(), strict=True)
+        },
+        "timeline": [
+            {
+                "start_s": round(window.start_s, 3),
+                "end_s": round(window.end_s, 3),
+                "label": window.label,
+                "probability": round(max(window.probabilities), 4),
+            }
+            for window in windows
+        ],
+    }
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

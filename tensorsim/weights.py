@@ -253,7 +253,7 @@ def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
             raise TensorsimError(
                 f"{path}: {key} of shape {list(value.shape)} has more values than are stored"
             )
-        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+        if value.is_floating_point() and not bool(torch.isfinite(value.float()).all()):
             raise TensorsimError(f"{path}: {key} has NaN or infinite values, expected finite weights")
         if key.endswith("running_var") and bool((value < 0).any()):
             raise TensorsimError(f"{path}: {key} has negative values, expected variances")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer
+from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer, warn_of_label
 from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
@@ -52,7 +52,6 @@ class Demo(NetworkOptions, RadarOptions):
             raise TensorsimError(f"--duration: got {self.duration}, expected seconds from 0.5 to 60")
         detector, pose_network = default_networks(self.detector, self.pose)
         config = self._film_configuration(detector, pose_network)
-        recognizer = load_recognizer(config)
 
         import numpy as np
         import torch
@@ -72,6 +71,7 @@ class Demo(NetworkOptions, RadarOptions):
 
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
+            recognizer = load_recognizer(config)
             networks = load_networks(detector, pose_network, config.pose.flip_test)
             maps_stage = PoseToDoppler.from_config(config).to(device)
             # The true motion is known at many moments: it needs no smoothing.
@@ -107,7 +107,8 @@ class Demo(NetworkOptions, RadarOptions):
                     device,
                     self.quiet,
                 )
-                label = results.label_of(recognizer, maps)
+                label = results.label_of(recognizer, maps, frames / FILM_FPS, self.least_probability)
+                warn_of_label(recognizer, config, int(pose.valid.any(-1).sum()))
                 somebody = bool(truth.valid.any() | pose.valid.any())
                 pictures = self.pictures(
                     maps_stage, label["label"], f"demo: {ACTIVITIES[activity]}", somebody

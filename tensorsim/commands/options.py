@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
     from tensorsim.config import SimulationConfig
@@ -77,6 +78,8 @@ class RadarOptions(PanelOptions):
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
+    least_probability: float = 0.0
+    """A label whose probability is lower is "not sure"."""
     seed: int | None = None
     """Seed of everything that is random. Default: 0."""
     colormap: Literal["turbo", "viridis", "jet", "parula", "gray"] = "turbo"
@@ -103,6 +106,10 @@ class RadarOptions(PanelOptions):
         if not (math.isfinite(self.dynamic_range) and self.dynamic_range > 0):
             raise TensorsimError(
                 f"--dynamic-range: got {self.dynamic_range}, expected a positive number of dB"
+            )
+        if not 0 <= self.least_probability <= 1:
+            raise TensorsimError(
+                f"--least-probability: got {self.least_probability}, expected a number from 0 to 1"
             )
         if out.exists() and not out.is_dir():
             raise TensorsimError(f"--out: {out} is a file, expected a folder")
@@ -206,6 +213,34 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
     if config.classifier == "none":
         return None
     try:
-        return ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier)
+        recognizer = ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier)
     except TensorsimError as error:
         raise TensorsimError(f"--classifier: {error}") from None
+    # Faster motion would fold into the picture that the network sees.
+    if config.scene.radar.unambiguous_speed_m_s < 0.9 * recognizer.speed_m_s:
+        warnings.warn(
+            f"no label: the radar sees speeds up to {config.scene.radar.unambiguous_speed_m_s:.2g} m/s, the classifier "
+            f"was trained on speeds up to {recognizer.speed_m_s:.2g} m/s",
+            TensorsimWarning,
+            stacklevel=2,
+        )
+        return None
+    return recognizer
+
+
+def warn_of_label(recognizer: "ActivityRecognizer | None", config: "SimulationConfig", people: int) -> None:
+    """Say where a label means little: several people in one scene, or a map that the network was not trained on."""
+    if recognizer is None:
+        return
+    if people > 1:
+        warnings.warn(
+            "several people are in the scene: the label is of all of them, the classifier was trained on one person",
+            TensorsimWarning,
+            stacklevel=2,
+        )
+    if config.processing.integration == "paper":
+        warnings.warn(
+            "integration 'paper' folds approaching and receding motion: the classifier was trained on signed Doppler",
+            TensorsimWarning,
+            stacklevel=2,
+        )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer
+from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer, warn_of_label
 from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
@@ -103,16 +103,18 @@ class Simulate(NetworkOptions, RadarOptions):
                 name = field.name.replace("_", "-")
                 raise TensorsimError(f"--{name}: got it for {KINDS[kind]}, expected it for {meant} only")
         config = self.configuration()
-        recognizer = load_recognizer(config)
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
+            recognizer = load_recognizer(config)
             source, config = self._source(kind, config, device)
             length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
             config = at_display_rate(config, length_s)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
                 pose, maps = results.simulate(source, stage, folder, config.seed, device, self.quiet)
-                label = results.label_of(recognizer, maps)
+                duration_s = pose.valid.shape[2] / source.fps
+                label = results.label_of(recognizer, maps, duration_s, self.least_probability)
+                warn_of_label(recognizer, config, int(pose.valid.any(-1).sum()))
                 somebody = bool(pose.valid.any())
                 pictures = self.pictures(stage, label["label"], self.source.name, somebody)
                 results.write_maps(folder, maps, results.axes_of(stage, maps), pictures=pictures)

@@ -178,9 +178,9 @@ def judged(
         maps = maps_of_pose(how.stage, pose, fps, device, quiet)
     except TensorsimError as error:
         return Verdict(scene, None, None, False, str(error)), None
-    told = label_of(how.recognizer, maps)
-    label = told["label"]
-    return Verdict(scene, label, told["probabilities"][label], label in film.accept), maps
+    found = label_of(how.recognizer, maps, pose.valid.shape[2] / fps)
+    label = found["label"]
+    return Verdict(scene, label, found["probabilities"][label], label in film.accept), maps
 
 
 def followed(pose: Pose, fps: float) -> list[dict[str, Any]]:

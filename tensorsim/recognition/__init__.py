@@ -5,5 +5,15 @@ from tensorsim.recognition.map_image import MapToImage, ridge_map
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
+from tensorsim.recognition.timeline import Window, label_windows
 
-__all__ = ["ActivityRecognizer", "LabelSet", "MapToImage", "SPGNet", "SPNet", "ridge_map"]
+__all__ = [
+    "ActivityRecognizer",
+    "LabelSet",
+    "MapToImage",
+    "SPGNet",
+    "SPNet",
+    "Window",
+    "label_windows",
+    "ridge_map",
+]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.recognition.map_image import MapToImage, ridge_map
 from tensorsim.recognition.spgnet import SPGNet
@@ -32,6 +32,8 @@ class ActivityRecognizer(nn.Module):
             after moving target indication and the Doppler-time map as two channels.
         size, speed_m_s, range_db: of the picture, see :class:`MapToImage`.
         class_names: of the network's outputs in their order; by default ``tensorsim.ACTIVITIES``.
+        temperature: logits are divided by it for :meth:`probabilities` (Guo et al., "On calibration of modern neural
+            networks", ICML 2017).
 
     Shapes: RadarMaps -> (..., classes). Differentiable by the maps.
 
@@ -53,8 +55,11 @@ class ActivityRecognizer(nn.Module):
         speed_m_s: float = 3.8,
         range_db: float = 40.0,
         class_names: Sequence[str] | None = None,
+        temperature: float = 1.0,
     ) -> None:
         super().__init__()
+        check_positive(temperature, "ActivityRecognizer.temperature")
+        self.temperature = float(temperature)
         if inputs not in INPUTS:
             raise TensorsimError(
                 f"ActivityRecognizer.inputs: got {inputs!r}, expected one of {', '.join(INPUTS)}"
@@ -82,6 +87,11 @@ class ActivityRecognizer(nn.Module):
     def forward(self, maps: RadarMaps) -> Tensor:
         """Logits (..., classes)."""
         return self.network(self.picture(maps))
+
+    @torch.jit.export
+    def probabilities(self, maps: RadarMaps) -> Tensor:
+        """Calibrated probabilities (..., classes): the softmax of the logits over the temperature."""
+        return (self.forward(maps) / self.temperature).softmax(-1)
 
     @torch.jit.export
     def picture(self, maps: RadarMaps) -> Tensor:
@@ -126,6 +136,7 @@ class ActivityRecognizer(nn.Module):
                 "speed_m_s": repr(self.speed_m_s),
                 "range_db": repr(self.range_db),
                 "class_names": labels.to_text(),
+                "temperature": repr(self.temperature),
             },
         )
 
@@ -160,4 +171,5 @@ class ActivityRecognizer(nn.Module):
             float(stated.get("speed_m_s", 3.8)),
             float(stated.get("range_db", 40.0)),
             None if names is None else LabelSet.from_text(names).names,
+            float(stated.get("temperature", 1.0)),
         ).eval()

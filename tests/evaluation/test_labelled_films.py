@@ -115,6 +115,11 @@ class Always(nn.Module):
         super().__init__()
         self.index = index
 
+    class_names = ACTIVITIES
+
+    def probabilities(self, maps: RadarMaps) -> Tensor:
+        return self.forward(maps).softmax(-1)
+
     def forward(self, maps: RadarMaps) -> Tensor:
         return torch.nn.functional.one_hot(torch.tensor(self.index), len(ACTIVITIES)).double().mul(4)
 

@@ -1,0 +1,106 @@
+"""Activities over time: a recognizer that is asked about windows of the maps."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.recognition.recognizer import ActivityRecognizer
+from tensorsim.types import RadarMaps
+
+#: Length of the clips that the shipped networks were trained on.
+WINDOW_S = 4.0
+STEP_S = 1.0
+#: The label of a window whose most probable class has less than the probability that is asked for.
+NOT_SURE = "not sure"
+
+
+class Window(NamedTuple):
+    """The activity within a window of a scene.
+
+    Attributes:
+        start_s, end_s: from the beginning of the maps.
+        label: the most probable class, or :data:`NOT_SURE`.
+        probabilities: of the classes of the recognizer, in their order.
+    """
+
+    start_s: float
+    end_s: float
+    label: str
+    probabilities: tuple[float, ...]
+
+
+def window_starts(duration_s: float, window_s: float = WINDOW_S, step_s: float = STEP_S) -> list[float]:
+    """Starts of windows that cover a duration: every ``step_s``, the last one at the end.
+
+    A duration of less than a window and a step is one window, so that nobody is asked twice about nearly the same.
+    """
+    check_positive(window_s, "window_s")
+    check_positive(step_s, "step_s")
+    if duration_s < window_s + step_s:
+        return [0.0]
+    last = duration_s - window_s
+    starts = [step_s * k for k in range(math.floor(last / step_s + 1e-9) + 1)]
+    # The last window ends with the scene; one that begins just before it would repeat it.
+    starts[-1] = last
+    return starts
+
+
+def label_windows(
+    recognizer: ActivityRecognizer,
+    maps: RadarMaps,
+    duration_s: float,
+    window_s: float = WINDOW_S,
+    step_s: float = STEP_S,
+    least_probability: float = 0.0,
+) -> list[Window]:
+    """Label the windows of the maps of one scene.
+
+    Args:
+        recognizer: of the radar of the maps.
+        maps: without batch dimensions.
+        duration_s: of the scene; the columns of each map are spread over it evenly.
+        window_s: length of a window.
+        step_s: from one window to the next.
+        least_probability: a window whose best class has less is :data:`NOT_SURE`.
+
+    Raises:
+        TensorsimError: maps with batch dimensions, or a length that is not positive.
+    """
+    if maps.doppler_time.dim() != 2:
+        raise TensorsimError(
+            f"label_windows: got maps of shape {list(maps.doppler_time.shape)}, expected those of one scene (F, K)"
+        )
+    check_positive(duration_s, "duration_s")
+    windows = []
+    for start_s in window_starts(duration_s, window_s, step_s):
+        end_s = min(start_s + window_s, duration_s) if duration_s >= window_s + step_s else duration_s
+        part = _part(maps, start_s / duration_s, end_s / duration_s)
+        probabilities = recognizer.probabilities(part)
+        best = int(probabilities.argmax())
+        sure = float(probabilities[best]) >= least_probability
+        label = recognizer.class_names[best] if sure else NOT_SURE
+        windows.append(Window(start_s, end_s, label, tuple(probabilities.tolist())))
+    return windows
+
+
+def _part(maps: RadarMaps, start: float, end: float) -> RadarMaps:
+    """The columns of maps between two shares of their length."""
+
+    def cut(x: Tensor) -> Tensor:
+        columns = x.shape[-1]
+        first = min(round(start * columns), columns - 1)
+        return x[..., first : max(round(end * columns), first + 1)]
+
+    columns = {
+        name: cut(getattr(maps, name))
+        for name in ("range_time", "range_time_mti", "doppler_time", "ridges", "ridge_magnitudes")
+    }
+    return maps._replace(**columns)
+
+
+def scene_probabilities(windows: list[Window]) -> Tensor:
+    """Mean probabilities (classes,) over the windows of a scene."""
+    return torch.tensor([window.probabilities for window in windows]).mean(0)
