@@ -5,12 +5,11 @@ Letters used in every docstring:
 =====  ==========================================================================================
 ``B``  clips in a batch
 ``T``  video frames
-``P``  people, padded to one count per batch (``valid`` says which are real)
+``P``  people, padded to one count per batch (``valid`` says which are real); in echo synthesis, paths
 ``K``  detections of a frame, padded likewise; in Doppler-time maps, frames of the STFT
 ``J``  joints: 17 of COCO in the image, 14 of the radar body in metres
 ``S``  scatterers
 ``V``  channels of an array: every transmitter with every receiver
-``W``  ways of a wave over a scatterer
 ``M``  pulses (slow time)
 ``N``  samples of a pulse (fast time)
 ``R``  range bins

@@ -1,4 +1,4 @@
-"""Map -> cleaner map."""
+"""Denoising of radar maps."""
 
 from tensorsim.enhance.dncnn import DnCNN, MapDenoiser
 

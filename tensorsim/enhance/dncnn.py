@@ -1,4 +1,4 @@
-"""DnCNN: a chain of convolutions that predicts the noise of an image; what is left is the clean image.
+"""DnCNN: a convolutional network that predicts the noise of an image; the clean image is the difference.
 
 Source: K. Zhang, W. Zuo, Y. Chen, D. Meng, L. Zhang, "Beyond a Gaussian denoiser: residual learning of deep
 CNN for image denoising", IEEE Transactions on Image Processing 26 (2017).
@@ -14,21 +14,21 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 from tensorsim.enhance.perona_malik import PeronaMalik
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_not_empty
 
-#: What a network's pixels are to a map, see :class:`MapDenoiser`.
+#: How a map is scaled to an image for the network, see :class:`MapDenoiser`.
 SCALES = ("peak", "floor")
 
 
 class DnCNN(nn.Module):
-    """Noisy images in [0, 1] -> clean images ``x - Q(x)``, Q the noise that the network sees.
+    """Noisy images in [0, 1] -> clean images ``x - Q(x)``; the network Q predicts the noise (residual learning).
 
-    ``depth`` convolutions of 3x3: the first and the last alone, those between with batch normalisation. The
-    state dict has the names of the authors' PyTorch code: ``model.{3i-1}`` and ``model.{3i}`` for convolution
-    i and its normalisation, ``model.{2i}`` for convolution i when normalisation is folded into it.
+    ``depth`` convolutions of 3x3, all but the first and the last with batch normalisation. The state dict has the
+    names of the authors' PyTorch code: ``model.{3i-1}`` and ``model.{3i}`` for convolution i and its normalisation,
+    ``model.{2i}`` for convolution i if normalisation is folded into it.
 
     Args:
-        depth: number of convolutions, also the reach of an output pixel in pixels.
+        depth: number of convolutions, also the radius of the receptive field in pixels.
         channels: width of the network.
-        batch_norm: False builds the network without normalisation, as released weights are.
+        batch_norm: False builds the network without normalisation, as in the released weights.
 
     Example:
         >>> DnCNN(depth=17)(torch.rand(2, 40, 60)).shape
@@ -79,7 +79,7 @@ class DnCNN(nn.Module):
         return noise.reshape(images.shape)
 
     def folded(self) -> "DnCNN":
-        """The network with normalisation folded into the convolutions: in evaluation the same, and faster."""
+        """The network with normalisation folded into the convolutions: the same output in evaluation mode, faster."""
         if not self.batch_norm:
             return self
         convolutions = [layer for layer in self.model if isinstance(layer, nn.Conv2d)]
@@ -97,15 +97,15 @@ class DnCNN(nn.Module):
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "DnCNN":
-        """Build the network that a weight file holds, in evaluation mode.
+        """Build the network of a weight file, in evaluation mode.
 
         Args:
-            source: a path of a ``.pth`` or ``.safetensors`` with the names ``conv{i}`` (folded), those of the
-                authors' PyTorch code, folded or not, or of this class, which are the same; or a name that
-                ``tensorsim models list`` prints; None: the shipped weights.
+            source: path of a ``.pth`` or ``.safetensors`` file with the names ``conv{i}`` (folded) or those of the
+                authors' PyTorch code, folded or not, which this class has too; or a name from
+                ``tensorsim models list``; None for the shipped weights.
 
         Raises:
-            TensorsimError: no such file, a file that is not safe or not whole, or weights of another network.
+            TensorsimError: no such file, an unsafe or incomplete file, or weights of another network.
         """
         from tensorsim.registry import locate
         from tensorsim.weights import load_state_dict, load_strict
@@ -137,31 +137,32 @@ def _convolution(in_channels: int, out_channels: int) -> nn.Conv2d:
 
 
 def map_floor(maps: Tensor) -> Tensor:
-    """Median (..., 1, 1) of each map (..., H, W): the level of its noise, if echoes fill less than half of it."""
+    """Median (..., 1, 1) of each map (..., H, W): its noise level, if echoes cover less than half of it."""
     return maps.flatten(-2).median(-1).values.unsqueeze(-1).unsqueeze(-1)
 
 
 class MapDenoiser(nn.Module):
     """Denoise magnitude maps with a network for images.
 
-    The network sees a map as an image x, and what it takes away from it, ``x - network(x)``, is taken from the map:
+    The map is scaled to an image x, and the noise that the network predicts, ``x - network(x)``, is subtracted from
+    the map in its own scale:
 
-    - ``scale="peak"``: ``x = (map - min) / (max - min)``, for networks made for pictures;
-    - ``scale="floor"``: ``x = log(1 + map / floor)`` with the map's median as floor, and what is taken away counts in
-      floors. Noise fills more than half of a map, so that at every signal-to-noise ratio and behind every gain the
-      network meets the same noise. For networks that were trained so.
+    - ``scale="peak"``: ``x = (map - min) / (max - min)``, for networks trained on photographs;
+    - ``scale="floor"``: ``x = log(1 + map / floor)`` with the median of the map as floor; the predicted noise is in
+      units of the floor. Noise covers more than half of a map, so its level in x does not depend on the
+      signal-to-noise ratio or the gain. For networks trained on this scale.
 
-    Maps are cleaned in tiles of columns that overlap by the reach of the network, so the result is that of
-    the whole map and memory does not grow with its length.
+    Maps are processed in tiles of columns that overlap by the receptive field of the network: the result is that of
+    the whole map, and memory does not grow with its length.
 
     Args:
         network: noisy images (..., H, W) -> clean ones, :class:`DnCNN` or
             :class:`~tensorsim.enhance.perona_malik.PeronaMalik`.
-        tile: columns (time) cleaned at once.
+        tile: columns (time) per tile.
         scale: ``"peak"`` or ``"floor"``.
 
     Example:
-        >>> denoiser = MapDenoiser.from_pretrained()  # the shipped weights, which say their scale
+        >>> denoiser = MapDenoiser.from_pretrained()  # the shipped weights, with their scale
         >>> denoiser(torch.rand(2, 64, 40)).shape
         torch.Size([2, 64, 40])
 
@@ -181,13 +182,13 @@ class MapDenoiser(nn.Module):
         self.reach: int = network.reach
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Clean magnitude maps (..., H, W), each on its own scale.
+        """Denoise magnitude maps (..., H, W), each on its own scale.
 
-        Differentiable, except where the clean map is held at its lower bound.
+        Differentiable, except where the result is clipped at its lower bound.
 
         Returns:
-            Tensor of the shape of ``maps``. Magnitudes stay magnitudes: nothing is below the smallest value of the
-            map (``"peak"``) or below 0 (``"floor"``). A map whose floor is 0 has no noise and is returned as it is.
+            Tensor of the shape of ``maps``, clipped at the minimum of the map (``"peak"``) or at 0 (``"floor"``). A map
+            whose floor is 0 has no noise and is returned unchanged.
 
         Raises:
             TensorsimError: not real, fewer than two dimensions, empty, or NaN.
@@ -206,12 +207,12 @@ class MapDenoiser(nn.Module):
         return self.clean(images).clamp(min=0.0) * span + low
 
     def clean(self, images: Tensor) -> Tensor:
-        """Clean images (..., H, W), one after another."""
+        """Denoise images (..., H, W), one after another."""
         flat = images.reshape(-1, images.shape[-2], images.shape[-1])
         return torch.stack([self.clean_in_tiles(image) for image in flat.unbind(0)]).reshape(images.shape)
 
     def clean_in_tiles(self, image: Tensor) -> Tensor:
-        """Clean one image (H, W), tile after tile."""
+        """Denoise one image (H, W), tile after tile."""
         width = image.shape[-1]
         tiles: list[Tensor] = []
         for start in range(0, width, self.tile):
@@ -223,14 +224,14 @@ class MapDenoiser(nn.Module):
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None, tile: int = 1024) -> "MapDenoiser":
-        """A :class:`DnCNN` on the scale that its weight file states; one that states none is for pictures.
+        """A :class:`DnCNN` on the scale in the metadata of its weight file, ``"peak"`` if there is none.
 
         Args:
             source: see :meth:`DnCNN.from_pretrained`.
-            tile: columns cleaned at once.
+            tile: columns per tile.
 
         Raises:
-            TensorsimError: see :meth:`DnCNN.from_pretrained`; a file that states an unknown scale.
+            TensorsimError: see :meth:`DnCNN.from_pretrained`; a file with an unknown scale.
         """
         from tensorsim.registry import locate
         from tensorsim.weights import read_metadata

@@ -1,8 +1,8 @@
-"""Denoising by sparse combinations of patches that are learned from the noisy image itself.
+"""Denoising by sparse representation of patches over a dictionary learned from the noisy image itself.
 
 Source: M. Elad, M. Aharon, "Image denoising via sparse and redundant representations over learned dictionaries", IEEE
 Transactions on Image Processing 15 (2006). The dictionary is learned by scikit-learn's online method (Mairal et al.,
-2009) in place of K-SVD: the same objective, one patch after another.
+2009) instead of K-SVD: the same objective, minimised one patch after another.
 """
 
 import math
@@ -25,7 +25,7 @@ def noise_deviation(image: Tensor) -> float:
 
 
 def cosine_dictionary(side: int, atoms: int) -> Tensor:
-    """Overcomplete cosine patches (atoms, side^2) of norm 1, ``atoms`` a square number: where learning starts."""
+    """Overcomplete cosine dictionary (atoms, side^2) of norm 1, ``atoms`` a square number: the initial dictionary."""
     count = math.isqrt(atoms)
     place = torch.arange(side, dtype=torch.float64)
     rows = torch.cos(torch.arange(count, dtype=torch.float64)[:, None] * (place + 0.5) * (math.pi / count))
@@ -43,20 +43,21 @@ def ksvd_denoise(
     training_patches: int = 10_000,
     seed: int = 0,
 ) -> Tensor:
-    """Clean an image (H, W) in [0, 1].
+    """Denoise an image (H, W) in [0, 1].
 
-    Every patch without its mean is approximated by as few atoms as leave a squared error of ``side^2 (1.15 sigma)^2``
-    (orthogonal matching pursuit); patches are averaged where they overlap, together with the noisy image of weight
-    ``0.118 / sigma`` (the paper's 30 over sigma in grey levels). Runs on the CPU in float64 and is not differentiable.
+    Every patch, less its mean, is approximated by the fewest atoms that give a squared error of at most
+    ``side^2 (1.15 sigma)^2`` (orthogonal matching pursuit). Overlapping patches are averaged, together with the noisy
+    image with weight ``0.118 / sigma`` (30 over sigma in grey levels in the source). Runs on the CPU in float64 and is
+    not differentiable.
 
     Args:
         image: (H, W), at least ``side`` in both.
-        sigma: deviation of the noise; None estimates it, see :func:`noise_deviation`.
-        side: of a patch.
-        atoms: of the dictionary, a square number.
+        sigma: standard deviation of the noise; None estimates it, see :func:`noise_deviation`.
+        side: size of a patch in pixels.
+        atoms: size of the dictionary, a square number.
         iterations: passes over the training patches.
-        training_patches: at most so many, drawn at random.
-        seed: of that draw and of learning.
+        training_patches: maximum number of patches for learning, drawn at random.
+        seed: of the draw and of learning.
 
     Raises:
         TensorsimError: another rank, an image smaller than a patch, NaN, a negative deviation, counts below one, atoms
@@ -103,7 +104,7 @@ def ksvd_denoise(
     )
     dictionary = learner.fit(centred[drawn.numpy()]).components_
     dictionary /= (dictionary**2).sum(1, keepdims=True) ** 0.5
-    # Patches below the tolerance are their mean: the pursuit would find no atom for them.
+    # Patches below the tolerance are replaced by their mean: the pursuit would find no atom for them.
     busy = (centred**2).sum(1) > tolerance
     found = torch.zeros_like(patches)
     if busy.any():

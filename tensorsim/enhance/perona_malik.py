@@ -1,7 +1,7 @@
-"""Anisotropic diffusion: smooths inside regions and not across edges.
+"""Anisotropic diffusion: smooths regions but not edges.
 
 Source: P. Perona, J. Malik, "Scale-space and edge detection using anisotropic diffusion", IEEE Transactions on Pattern
-Analysis and Machine Intelligence 12 (1990), equations 7 to 10, here with the four diagonal neighbours as well.
+Analysis and Machine Intelligence 12 (1990), equations 7 to 10, here also with the four diagonal neighbours.
 """
 
 import torch
@@ -14,10 +14,11 @@ CONDUCTANCES = ("exponential", "quadratic")
 
 
 def diffuse(images: Tensor, threshold: float, exponential: bool) -> Tensor:
-    """One step of diffusion of images (B, 1, H, W); nothing flows over the border.
+    """One step of diffusion of images (B, 1, H, W), without flow over the border.
 
-    ``I + 1/8 sum over neighbours of w c(dI) dI``, dI the difference to the neighbour, w 1 beside and 1/2 across, c
-    ``exp(-(dI / K)^2)`` or ``1 / (1 + (dI / K)^2)`` with K = ``threshold``. Steps up to 1/6 are stable.
+    ``I + 1/8 sum over neighbours of w c(dI) dI``: dI is the difference to the neighbour, w is 1 for the four direct and
+    1/2 for the four diagonal neighbours, c is ``exp(-(dI / K)^2)`` or ``1 / (1 + (dI / K)^2)`` with K = ``threshold``.
+    Step sizes up to 1/6 are stable.
     """
     height, width = images.shape[-2], images.shape[-1]
     padded = F.pad(images, [1, 1, 1, 1], mode="replicate")
@@ -36,9 +37,9 @@ class PeronaMalik(nn.Module):
     """Anisotropic diffusion of images in [0, 1].
 
     Args:
-        iterations: steps; also the reach of an output pixel in pixels.
-        threshold: K, differences much above it are edges and stay.
-        conductance: ``"exponential"`` favours strong edges, ``"quadratic"`` wide regions.
+        iterations: number of steps; also the radius of the receptive field in pixels.
+        threshold: K; differences well above it are edges and are preserved.
+        conductance: ``"exponential"`` favours strong edges, ``"quadratic"`` large regions.
 
     Shapes: (..., H, W) -> (..., H, W). Differentiable.
 

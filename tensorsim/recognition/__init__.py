@@ -1,4 +1,4 @@
-"""Maps -> label: SPNet, its light sibling, and the picture of a map that they see."""
+"""Activity recognition: SPNet and SPGNet, and the conversion of radar maps to their input images."""
 
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.recognition.map_image import MapToImage, ridge_map

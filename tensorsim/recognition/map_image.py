@@ -1,4 +1,4 @@
-"""From a radar map to the picture that a classifier sees: resampled in power, cut to a span, on a scale of [0, 1]."""
+"""Radar maps to input images of a classifier: resampled in power, cropped to a span of the axis, scaled to [0, 1]."""
 
 import math
 
@@ -23,45 +23,45 @@ SCALES = ("db", "linear")
 def area_weights(start: Tensor, width: float, low: float, high: float, size: int) -> Tensor:
     """Matrix (size, N) that averages N cells over ``size`` equal pixels between ``low`` and ``high``.
 
-    Cell n covers ``start[n]`` to ``start[n] + width``. Row i holds the shares of pixel i that the cells cover, divided
-    by their sum; a pixel beyond all cells has a row of zeros.
+    Cell n covers ``start[n]`` to ``start[n] + width``. Row i contains the overlap of pixel i with each cell, divided by
+    the sum of the row; a pixel outside of all cells has a row of zeros.
     """
     pixel = (high - low) / size
     left = low + pixel * torch.arange(size, dtype=start.dtype, device=start.device).unsqueeze(-1)
     overlap = torch.minimum(left + pixel, start + width) - torch.maximum(left, start)
-    # Rounding leaves overlaps of 1e-16 pixels, which a division by their own sum would make a whole one.
+    # Overlaps of 1e-16 pixels due to rounding are 0: divided by their own sum they would become 1.
     share = torch.where(overlap > 1e-9 * pixel, overlap, torch.zeros_like(overlap))
     total = share.sum(-1, keepdim=True)
     return share / torch.where(total > 0, total, torch.ones_like(total))
 
 
 def scaled(power: Tensor, scale: str, range_db: float) -> Tensor:
-    """Power (..., H, W) as pixels in [0, 1], each picture against its own peak; one of zeros stays 0.
+    """Power (..., H, W) to pixels in [0, 1], each image normalised by its own peak; an image of zeros stays 0.
 
     ``"linear"``: magnitude over peak. ``"db"``: decibels below the peak, ``range_db`` and more below it is 0.
     """
     peak = power.amax((-2, -1), keepdim=True)
     level = power / torch.where(peak > 0, peak, torch.ones_like(peak))
     if scale == "linear":
-        # The root of 0 has no gradient; 1e-20 is 200 dB down.
+        # The square root of 0 has no gradient; 1e-20 is -200 dB.
         return torch.where(level > 1e-20, level.clamp_min(1e-20).sqrt(), torch.zeros_like(level))
     return 1 + 10 * level.clamp_min(10 ** (-range_db / 10)).log10() / range_db
 
 
 class MapToImage(nn.Module):
-    """Magnitude maps to pictures for a classifier.
+    """Magnitude maps to images for a classifier.
 
-    Every pixel is the mean power of the part of the map that it covers, so a picture does not depend on how finely
-    the map was sampled. Row 0 is the lowest value of the axis (positive speed = approaching), column 0 the first
-    instant; all columns of the map are spread over the width of the picture.
+    Every pixel is the mean power of the part of the map that it covers, so the image does not depend on the sampling
+    of the map. Row 0 is the lowest value of the axis (positive speed = approaching), column 0 the first frame; the
+    columns of the map fill the width of the image.
 
     Args:
         axis: (F,) value of each bin, ascending in equal steps; each bin covers a step around its value.
-        span: (low, high) of the axis that the picture shows. What lies beyond the axis is 0.
+        span: (low, high) limits of the image on the axis. Outside of the axis the image is 0.
         size: height and width in pixels.
         scale, range_db: see :func:`scaled`.
 
-    Shapes: map (..., F, K) magnitude -> picture (..., 1, size, size) in [0, 1]. Differentiable.
+    Shapes: map (..., F, K) magnitude -> image (..., 1, size, size) in [0, 1]. Differentiable.
 
     Example:
         >>> doppler_picture = MapToImage.doppler(RadarConfig.through_wall())
@@ -119,10 +119,10 @@ class MapToImage(nn.Module):
         scale: str = "db",
         range_db: float = 40.0,
     ) -> "MapToImage":
-        """For Doppler-time maps of ``bins`` rows, showing radial speeds up to ``speed_m_s`` either way.
+        """For Doppler-time maps of ``bins`` rows, with radial speeds from ``-speed_m_s`` to ``speed_m_s``.
 
-        The span is in speed so that radars of different carriers show alike; 3.8 m/s is what the through-wall preset
-        can tell apart. ``bins`` None is what ``DopplerTimeMap`` makes of its default window.
+        The span is a speed, so that images of radars with different carriers are alike; 3.8 m/s is the unambiguous
+        speed of the through-wall preset. None for ``bins`` is the number of ``DopplerTimeMap`` with its default window.
         """
         if bins is None:
             bins = 1 << (max(round(0.1 * radar.prf_hz), 256) - 1).bit_length()
@@ -139,20 +139,20 @@ class MapToImage(nn.Module):
         scale: str = "db",
         range_db: float = 40.0,
     ) -> "MapToImage":
-        """For range-time maps of all range bins of a radar, showing ranges up to ``farthest_m``."""
+        """For range-time maps of all range bins of a radar, with ranges up to ``farthest_m``."""
         axis = torch.arange(radar.samples_per_chirp // 2, dtype=torch.float64) * radar.range_resolution_m
         return cls(axis, (0.0, farthest_m), size, scale, range_db)
 
     @torch.jit.export
     def average(self, power: Tensor) -> Tensor:
-        """Mean of each pixel's part of (..., F, K): (..., size, size)."""
+        """Mean of power (..., F, K) over each pixel: (..., size, size)."""
         frames = power.shape[-1]
         start = torch.arange(frames, dtype=torch.float64, device=power.device)
         columns = area_weights(start, 1.0, 0.0, float(frames), self.size).to(power.dtype)
         return torch.matmul(torch.matmul(self.rows.to(power.dtype), power), columns.transpose(0, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Magnitudes (..., F, K) to pictures (..., 1, size, size)."""
+        """Magnitudes (..., F, K) to images (..., 1, size, size)."""
         layout = f"(..., {self.rows.shape[1]} bins, frames)"
         check_floating(maps, "MapToImage")
         check_min_rank(maps, 2, "MapToImage", layout)
@@ -165,9 +165,9 @@ class MapToImage(nn.Module):
 
 
 def ridge_map(indices: Tensor, magnitudes: Tensor, bins: int) -> Tensor:
-    """A Doppler-time map with nothing but ridges: bins and magnitudes (..., C, K) -> (..., ``bins``, K).
+    """Doppler-time map of ridges alone: bins and magnitudes (..., C, K) -> (..., ``bins``, K), 0 elsewhere.
 
-    Where two ridges meet the larger counts. Differentiable by the magnitudes.
+    Where two ridges meet, the larger magnitude is used. Differentiable by the magnitudes.
 
     Raises:
         TensorsimError: shapes that differ, or bins outside of the map.

@@ -1,4 +1,4 @@
-"""Maps of a radar to activities: the picture that a network was trained on, then the network."""
+"""Radar maps to activities: conversion to the image that a network was trained on, then the network."""
 
 import os
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from tensorsim.recognition.spnet import SPNet
 from tensorsim.types import RadarMaps
 from tensorsim.weights import read_metadata, save_weights
 
-#: What a network can look at, and how many channels that has.
+#: Kinds of input of a network, and their number of channels.
 INPUTS = {"doppler": 1, "ridges": 1, "merged": 2}
 #: Networks that a weight file can name.
 NETWORKS: dict[str, type[SPNet] | type[SPGNet]] = {"SPNet": SPNet, "SPGNet": SPGNet}
@@ -26,11 +26,11 @@ class ActivityRecognizer(nn.Module):
     """Maps of one radar to the logits of activities, or of classes of your own.
 
     Args:
-        radar: the radar of the maps, which tells what a Doppler bin is in m/s.
-        network: pictures (..., C, size, size) in [0, 1] -> logits (..., classes).
+        radar: the radar of the maps, for the speed of a Doppler bin in m/s.
+        network: images (..., C, size, size) in [0, 1] -> logits (..., classes).
         inputs: ``"doppler"``, the Doppler-time map; ``"ridges"``, its ridges alone; ``"merged"``, the range-time map
             after moving target indication and the Doppler-time map as two channels.
-        size, speed_m_s, range_db: of the picture, see :class:`MapToImage`.
+        size, speed_m_s, range_db: of the image, see :class:`MapToImage`.
         class_names: of the network's outputs in their order; by default ``tensorsim.ACTIVITIES``.
         temperature: logits are divided by it for :meth:`probabilities` (Guo et al., "On calibration of modern neural
             networks", ICML 2017).
@@ -67,8 +67,8 @@ class ActivityRecognizer(nn.Module):
         channels = getattr(network, "in_channels", INPUTS[inputs])
         if channels != INPUTS[inputs]:
             raise TensorsimError(
-                f"ActivityRecognizer: got a network of {channels} input channels, expected {INPUTS[inputs]}, as "
-                f"{inputs} has"
+                f"ActivityRecognizer: got a network of {channels} input channels, expected {INPUTS[inputs]} for "
+                f"inputs {inputs!r}"
             )
         self.labels = LabelSet() if class_names is None else LabelSet(tuple(class_names))
         classes = getattr(network, "num_classes", len(self.labels))
@@ -95,7 +95,7 @@ class ActivityRecognizer(nn.Module):
 
     @torch.jit.export
     def picture(self, maps: RadarMaps) -> Tensor:
-        """What the network sees: (..., C, size, size) in [0, 1]."""
+        """Input image of the network: (..., C, size, size) in [0, 1]."""
         if self.inputs == "ridges":
             bins = maps.doppler_time.shape[-2]
             return self.doppler_picture(ridge_map(maps.ridges, maps.ridge_magnitudes, bins))
@@ -144,14 +144,15 @@ class ActivityRecognizer(nn.Module):
     def from_pretrained(
         cls, radar: RadarConfig, source: str | os.PathLike[str] | None = None
     ) -> "ActivityRecognizer":
-        """Build the recognizer of a weight file of SPNet or SPGNet, which says what its pictures and classes are.
+        """Build the recognizer of a weight file of SPNet or SPGNet, with the image settings and classes in its metadata.
 
         Args:
-            radar: of the maps to come.
-            source: a path of a ``.safetensors``, a name of ``tensorsim models list``, or None for the shipped SPGNet.
+            radar: the radar of the maps.
+            source: path of a ``.safetensors`` file, a name from ``tensorsim models list``, or None for the shipped
+                SPGNet.
 
         Raises:
-            TensorsimError: no such file or name, or a file that does not say what it was trained on.
+            TensorsimError: no such file or name, or a file without these metadata.
         """
         from tensorsim.registry import locate
 
@@ -159,7 +160,7 @@ class ActivityRecognizer(nn.Module):
         stated = read_metadata(path)
         if stated.get("network") not in NETWORKS or "size" not in stated:
             raise TensorsimError(
-                f"{path}: its header says {stated or 'nothing'}, expected network (one of {', '.join(NETWORKS)}), "
+                f"{path}: got the metadata {stated or 'none'}, expected network (one of {', '.join(NETWORKS)}), "
                 "size, speed_m_s and range_db"
             )
         names = stated.get("class_names")

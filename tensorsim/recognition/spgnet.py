@@ -1,7 +1,7 @@
-"""SPGNet: grouped 3x3 convolutions in two levels, the small sibling of SPNet.
+"""SPGNet: grouped 3x3 convolutions in two levels, a smaller network than SPNet.
 
 Source: X. Wang, S. Lai, Z. Chai, X. Zhang, X. Qian, "SPGNet: Serial and Parallel Group Network", IEEE Transactions on
-Multimedia 24 (2022), as the Python variant of RadHARSimulator V2 (arXiv 2511.09022) has it for 32x32 pictures.
+Multimedia 24 (2022), in the form of the Python code of RadHARSimulator V2 (arXiv 2511.09022) for 32x32 images.
 """
 
 import os
@@ -12,16 +12,16 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.recognition.spnet import as_pictures, centred
 
-#: Groups of each version; widths are 16 and more times these.
+#: Groups of each version; the widths of the stages are 16, 32 and 64 times this number.
 VERSIONS = {"s2p6": 6, "s2p7": 7, "s2p8": 8, "s2p9": 9}
-#: Layers of each stage.
+#: Number of layers of each stage.
 _BLOCKS = (4, 8, 3)
 
 
 def conv_norm(
     in_channels: int, out_channels: int, kernel: int, stride: int = 1, groups: int = 1, relu: bool = True
 ) -> nn.Sequential:
-    """Convolution without bias, normalisation, and ReLU if wanted."""
+    """Convolution without bias, normalisation, and optionally ReLU."""
     layers: list[nn.Module] = [
         nn.Conv2d(in_channels, out_channels, kernel, stride, kernel // 2, groups=groups, bias=False),
         nn.BatchNorm2d(out_channels),
@@ -32,10 +32,13 @@ def conv_norm(
 
 
 class TwoLevelLayer(nn.Module):
-    """``relu(skip(x) + fuse(concat(o1, o2)))``, o1 a grouped 3x3 convolution and o2 another one of o1.
+    """``relu(skip(x) + fuse(concat(o1, o2)))``: o1 is a grouped 3x3 convolution, o2 a second one applied to o1.
 
     Args:
-        in_channels, out_channels, stride, groups: ``stride`` is that of o1.
+        in_channels: channels of x.
+        out_channels: channels of the result.
+        stride: of the first convolution.
+        groups: of both convolutions.
     """
 
     def __init__(self, in_channels: int, out_channels: int, stride: int, groups: int) -> None:
@@ -62,21 +65,22 @@ class TwoLevelLayer(nn.Module):
 
 
 class SPGNet(nn.Module):
-    """Pictures of radar maps to activities, with a third of SPNet's parameters.
+    """SPGNet: images of radar maps to activities, with a third of SPNet's parameters.
 
     Args:
-        num_classes: classes.
-        in_channels: 1 for a map, 2 for a range-time and a Doppler-time map merged, 3 for a colour picture.
-        version: ``"s2p6"`` to ``"s2p9"``, by width.
+        num_classes: number of classes.
+        in_channels: 1 for one map, 2 for a range-time and a Doppler-time map, 3 for a colour image.
+        version: ``"s2p6"`` to ``"s2p9"``, in order of width.
 
     Attributes:
-        mean: (C,) the training pictures' mean of each channel, which is subtracted; part of the weights.
+        mean: (C,) mean of each channel over the training images, which is subtracted; part of the weights.
 
-    Shapes: pictures (..., C, H, W) in [0, 1], made for 32x32 -> logits (..., num_classes). Differentiable.
+    Shapes: images (..., C, H, W) in [0, 1], 32x32 in the source -> logits (..., num_classes). Differentiable.
     3 268 052 parameters for s2p6, 12 classes and 3 channels.
 
     Raises:
-        TensorsimError: fewer than one class or channel, an unknown version; pictures of other channels, or NaN.
+        TensorsimError: fewer than one class or channel, an unknown version; images with another number of
+            channels, or NaN.
     """
 
     mean: Tensor
@@ -114,17 +118,17 @@ class SPGNet(nn.Module):
                 nn.init.normal_(module.weight, 0.0, 0.01)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Pictures (..., C, H, W) to logits (..., num_classes)."""
+        """Images (..., C, H, W) to logits (..., num_classes)."""
         x = self.body(centred(pictures, self.mean, "SPGNet")).mean((-2, -1))
         x = self.fc2(self.dropout(torch.relu(self.norm(self.fc1(x)))))
         return as_pictures(x, pictures)
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "SPGNet":
-        """Build the network that a weight file holds, in evaluation mode.
+        """Build the network of a weight file, in evaluation mode.
 
         Args:
-            source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
+            source: a path, a name from ``tensorsim models list``, or None for the shipped weights.
 
         Raises:
             TensorsimError: no such file or name, or weights of another network.

@@ -1,8 +1,8 @@
-"""SPNet: six parallel branches of convolutions, three times over, from a picture of a radar map to an activity.
+"""SPNet: the hybrid parallel-serial network, three blocks of six parallel branches, from a map's image to an activity.
 
-Source: RadHARSimulator V2 (arXiv 2511.09022) and the layer list that its author published. That list has no
-activation at all, so that in evaluation it is an affine map of the pixels; ``activation="none"`` builds it to the
-letter, the default has ReLU where the field puts it.
+Source: RadHARSimulator V2 (arXiv 2511.09022) and the layer list published with it. That list has no activations, so
+that in evaluation mode the network is an affine function of the pixels; ``activation="none"`` builds exactly that, the
+default has ReLU at the usual places.
 """
 
 import os
@@ -15,10 +15,10 @@ from tensorsim.errors import TensorsimError, check_finite, check_floating, check
 
 
 def centred(pictures: Tensor, mean: Tensor, name: str) -> Tensor:
-    """Pictures (..., C, H, W) as a batch (B, C, H, W) without the mean (C,) of each channel.
+    """Images (..., C, H, W) as a batch (B, C, H, W), less the mean (C,) of each channel.
 
     Raises:
-        TensorsimError: other channels, no pictures, NaN.
+        TensorsimError: another number of channels, no images, NaN.
     """
     check_floating(pictures, name)
     channels = mean.shape[0]
@@ -32,14 +32,14 @@ def centred(pictures: Tensor, mean: Tensor, name: str) -> Tensor:
 
 
 def as_pictures(logits: Tensor, pictures: Tensor) -> Tensor:
-    """Logits (B, classes) with the leading dimensions of the pictures (..., C, H, W)."""
+    """Logits (B, classes) with the leading dimensions of the images (..., C, H, W)."""
     shape = list(pictures.shape[:-3])
     shape.append(logits.shape[-1])
     return logits.reshape(shape)
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Pixels before and after, so that ``ceil(size / stride)`` come out: MATLAB's "same"; an odd one goes after."""
+    """Padding (before, after) for an output of ``ceil(size / stride)``, as MATLAB's "same": an odd pixel goes after."""
     total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
     return total // 2, total - total // 2
 
@@ -57,7 +57,7 @@ class SameConv(nn.Module):
         self, in_channels: int, out_channels: int, stride: int = 1, groups: int = 1, padding: str = "matlab"
     ) -> None:
         super().__init__()
-        self.matlab = padding == "matlab" and stride > 1  # alike at stride 1
+        self.matlab = padding == "matlab" and stride > 1  # both are equal at stride 1
         self.stride = stride
         self.conv = nn.Conv2d(
             in_channels, out_channels, 3, stride, padding=0 if self.matlab else 1, groups=groups
@@ -73,10 +73,10 @@ class SameConv(nn.Module):
 
 
 class ParallelBlock(nn.Module):
-    """Normalisation, six parallel branches of three 3x3 convolutions, their fusion, and a shortcut; halves the size.
+    """Normalisation, six parallel branches of three serial 3x3 convolutions, their fusion, and a shortcut.
 
     Branch i gives ``p_i = conv(conv(y))`` and ``q_i = conv(p_i)``; the twelve are concatenated and fused by a 1x1
-    convolution. Six branches side by side are one convolution in six groups.
+    convolution. The six branches are computed as one convolution in six groups. Halves the size.
     """
 
     branches = 6
@@ -102,18 +102,18 @@ class ParallelBlock(nn.Module):
 
 
 class SPNet(nn.Module):
-    """Pictures of radar maps to activities.
+    """SPNet: images of radar maps to activities.
 
     Args:
-        num_classes: classes.
-        in_channels: 1 for a map, 2 for a range-time and a Doppler-time map merged, 3 for a colour picture.
-        activation: ``"relu"``, or ``"none"`` for the published layer list, which in evaluation is affine.
+        num_classes: number of classes.
+        in_channels: 1 for one map, 2 for a range-time and a Doppler-time map, 3 for a colour image.
+        activation: ``"relu"``, or ``"none"`` for the published layer list, which is affine in evaluation mode.
         padding: ``"matlab"``, or ``"torch"`` for symmetric padding; see :class:`SameConv`.
 
     Attributes:
-        mean: (C,) the training pictures' mean of each channel, which is subtracted; part of the weights.
+        mean: (C,) mean of each channel over the training images, which is subtracted; part of the weights.
 
-    Shapes: pictures (..., C, H, W) in [0, 1], 224x224 in the paper -> logits (..., num_classes). Differentiable.
+    Shapes: images (..., C, H, W) in [0, 1], 224x224 in the paper -> logits (..., num_classes). Differentiable.
     11 055 660 parameters for 12 classes and 3 channels.
 
     Example:
@@ -121,8 +121,8 @@ class SPNet(nn.Module):
         torch.Size([2, 12])
 
     Raises:
-        TensorsimError: fewer than one class or channel, an unknown activation or padding; pictures of other channels
-            or NaN.
+        TensorsimError: fewer than one class or channel, an unknown activation or padding; images with another number
+            of channels, or NaN.
     """
 
     mean: Tensor
@@ -155,7 +155,7 @@ class SPNet(nn.Module):
                 _glorot(module)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Pictures (..., C, H, W) to logits (..., num_classes)."""
+        """Images (..., C, H, W) to logits (..., num_classes)."""
         x = centred(pictures, self.mean, "SPNet")
         x = self.conv2(self.act(self.conv1(x)))
         x = self.act(self.block3(self.block2(self.block1(x))))
@@ -164,10 +164,10 @@ class SPNet(nn.Module):
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "SPNet":
-        """Build the network that a weight file holds, in evaluation mode.
+        """Build the network of a weight file, in evaluation mode.
 
         Args:
-            source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
+            source: a path, a name from ``tensorsim models list``, or None for the shipped weights.
 
         Raises:
             TensorsimError: no such file or name, or weights of another network.
@@ -188,7 +188,7 @@ class SPNet(nn.Module):
 
 
 def _glorot(layer: nn.Conv2d | nn.Linear) -> None:
-    """Glorot's uniform weights branch by branch, bias 0: where MATLAB starts."""
+    """Initial weights as in MATLAB: Glorot's uniform distribution for each branch, bias 0."""
     weight = layer.weight
     receptive = weight[0, 0].numel()
     groups = layer.groups if isinstance(layer, nn.Conv2d) else 1

@@ -336,7 +336,7 @@ def test_bad_display_rate(rate):
 
 def test_warns_of_what_the_range_axis_cannot_show():
     far = torch.tensor([0.0, 9.0, 1.5]).expand(64, 2, 3).clone()
-    with pytest.warns(TensorsimWarning, match=r"9\.00 m away, beyond the 7\.49 m"):
+    with pytest.warns(TensorsimWarning, match=r"9\.00 m away, more than the 7\.49 m"):
         check_unambiguous(far, torch.ones(64, 2), RadarConfig.free_space())
     check_unambiguous(far, torch.zeros(64, 2), RadarConfig.free_space())  # nobody is there
     check_unambiguous(far, torch.ones(64, 2), THROUGH)  # 30 m

@@ -1,4 +1,4 @@
-"""What a Doppler-time map tells of a gait: motion relative to the torso, and its rhythm."""
+"""Tools for gait analysis: bulk Doppler compensation, and the cadence-velocity diagram."""
 
 import math
 
@@ -18,9 +18,9 @@ from tensorsim.errors import (
 
 
 def path_of_speed(speed_m_s: Tensor, prf_hz: float) -> Tensor:
-    """Change of range (..., M) m since the first pulse of radial speeds (..., M), positive = approaching.
+    """Change of range (..., M) m since the first pulse, from radial speeds (..., M) m/s, positive = approaching.
 
-    The trapezoidal rule, in float64.
+    Integrates by the trapezoidal rule in float64.
     """
     speed = speed_m_s.double()
     steps = (speed[..., 1:] + speed[..., :-1]) / (2 * prf_hz)
@@ -28,22 +28,22 @@ def path_of_speed(speed_m_s: Tensor, prf_hz: float) -> Tensor:
 
 
 class BulkDopplerCompensation(nn.Module):
-    """Takes the motion of one point of the body, usually the torso, out of range profiles.
+    """Removes the motion of one point of the body, usually the torso, from range profiles.
 
-    The phase of a target at range r is ``2 pi (fc + B/2) 2 r / c`` at mid-chirp (the centre of the sweep, as in the
-    labels of the Doppler axis). Its conjugate, along the given path, brings that point to 0 Hz; limbs show their
-    speed relative to it. With ``migration`` the range bins move along too, so that the point stays in the bin in
-    which it was at the first pulse.
+    The phase of a target at range r is ``2 pi (fc + B/2) 2 r / c`` at mid-chirp (the centre of the sweep, as on the
+    Doppler axis). Multiplication with its conjugate along the given path shifts that point to 0 Hz; limbs appear at
+    their speed relative to it. With ``migration`` the range bins are shifted too, so that the point stays in the bin
+    of the first pulse.
 
     Args:
         radar: the radar.
         migration: also shift the range bins: an inverse transform to N fast-time samples, a linear phase about
-            mid-chirp, and back. The bins of negative range, which profiles do not have, count as 0, which costs
-            about the sidelobe level of the range window for targets near range 0.
+            mid-chirp, and a transform. Profiles do not contain negative ranges; these are taken as 0, which causes
+            an error of about the sidelobe level of the range window for targets near range 0.
 
     Shapes: profiles (..., M, R) complex, range of the point (..., M) m, half the bistatic path; see
     :func:`path_of_speed` for a track of speeds -> (..., M, R) complex. Only changes of range matter. Differentiable
-    in both.
+    by both.
 
     Raises:
         TensorsimError: real profiles, a path of another length than the pulses, NaN.
@@ -80,22 +80,21 @@ class BulkDopplerCompensation(nn.Module):
         return profiles * self._unwind(2 * moved / self.doppler_wavelength_m, profiles).unsqueeze(-1)
 
     def _unwind(self, cycles: Tensor, like: Tensor) -> Tensor:
-        """``exp(-j 2 pi cycles)``; float64 until the whole turns are gone."""
+        """``exp(-j 2 pi cycles)``, wrapped to one cycle in float64."""
         angle = -2 * math.pi * (cycles - cycles.detach().round())
         return torch.polar(torch.ones_like(angle), angle).to(like.dtype)
 
 
 class CadenceVelocityDiagram(nn.Module):
-    """How strongly each Doppler comes and goes at each cadence: ``|FFT over time of the map|``.
+    """Cadence-velocity diagram ``|FFT over time of the map|``: modulation of each Doppler bin at each cadence.
 
-    Of every Doppler bin the mean over time is removed, so that what is steady does not cover the rhythm, and
-    a periodic Hann window is laid over the clip (the diagram of Bjorklund, Johansson and Petersson, IEEE RadarCon
-    2012).
+    The mean over time of every Doppler bin is removed, so that constant components do not mask the modulation, and
+    a periodic Hann window is applied to the clip (Bjorklund, Johansson and Petersson, IEEE RadarCon 2012).
 
     Args:
         frame_rate_hz: frames per second of the map, ``DopplerTimeMap.frame_rate_hz``.
 
-    Shapes: map (..., F, K) -> (..., F, K // 2 + 1) magnitude; a bin that goes as ``a cos`` peaks at ``a K / 4``.
+    Shapes: map (..., F, K) -> (..., F, K // 2 + 1) magnitude; a bin modulated by ``a cos`` peaks at ``a K / 4``.
     Differentiable where it is not 0.
 
     Raises:

@@ -1,9 +1,12 @@
-"""Torso speed, limb speed and step rate of a person on foot, read from a Doppler-time map.
+"""Torso speed, limb speed and step rate of a walking or running person, estimated from a Doppler-time map.
 
 Percentiles of the amplitude over speed follow van Dorp and Groen, *Feature-based human motion parameter
 estimation with radar*, IET Radar, Sonar & Navigation 2 (2008): half of the amplitude of a frame lies below the
-speed of the torso, 95 % of it below the speed of the fastest limb. The sign of the speed is ignored, so that
-maps of a real signal, which show every motion on both sides, are read like those of a complex one.
+speed of the torso, 95 % of it below the speed of the fastest limb. The sign of the speed is ignored, so that the
+symmetric maps of a real signal give the same result as those of a complex one.
+
+Noise would add amplitude at high speeds. Power is therefore averaged over a few cells, the noise floor of each frame
+is subtracted, and cells below a threshold above the floor are set to 0.
 """
 
 import math
@@ -23,37 +26,42 @@ from tensorsim.errors import (
     check_size,
 )
 
-#: Cells this far below the strongest of their frame do not count.
+#: Cells this far below the strongest of their frame are set to 0.
 DYNAMIC_RANGE_DB = 25.0
 
-#: Nor do those that stand out of the noise, the median of the fastest quarter of the axis, by less than this.
-ABOVE_NOISE_DB = 10.0
+#: Power is averaged over this range of speed and time.
+AVERAGE_M_S = 0.2
+AVERAGE_S = 0.08
 
-#: Slower cells are floor, furniture and mains hum.
+#: The noise floor is the median of the fastest quarter of the axis. The threshold is the floor plus this multiple of
+#: the distance from the median to the upper quartile: a false alarm rate of about 1e-4 for white noise in one range
+#: bin without averaging, and less with averaging.
+THRESHOLD = 10.0
+
+#: Slower cells are static echoes, furniture and mains hum.
 SLOWEST_M_S = 0.4
 
-#: Power above these multiples of the torso's speed is that of a swinging leg. Which multiple separates them best
-#: depends on the gait, so the rhythms above all of them vote.
+#: Power above these multiples of the torso speed is that of the swinging leg. The best multiple depends on the gait,
+#: so the modulation spectra for all of them are added.
 SWING = (1.25, 1.5, 1.75)
 
-#: A frame belongs to steady gait when the torso is faster than this part of its 90th percentile.
+#: A frame belongs to steady gait if the torso speed is above this fraction of its 90th percentile.
 STEADY = 0.6
 
-#: Slower modulation of the swing than this is a change of speed, not a step.
+#: Range of step rates. Slower modulation is a change of speed.
 SLOWEST_STEP_HZ = 1.2
 FASTEST_STEP_HZ = 4.5
 
 
 class GaitParameters(NamedTuple):
-    """What a Doppler-time map says of a gait.
+    """Gait parameters of a Doppler-time map; 0 for a map without motion.
 
     Attributes:
-        torso_m_s: (...) median over steady frames of the torso's radial speed; 0 without any.
-        limb_m_s: (...) 90th percentile over steady frames of the limbs' radial speed: the peaks of the swings;
-            likewise.
-        step_hz: (...) steps per second, two to a stride; likewise.
-        torso_track_m_s: (..., K) per frame; 0 where nothing stands out of the noise.
-        limb_track_m_s: (..., K) likewise.
+        torso_m_s: (...) median over steady frames of the radial speed of the torso.
+        limb_m_s: (...) 90th percentile over steady frames of the radial speed of the limbs, the peaks of the swings.
+        step_hz: (...) steps per second, two per stride.
+        torso_track_m_s: (..., K) radial speed of the torso per frame; 0 in frames without motion above the noise.
+        limb_track_m_s: (..., K) the same for the limbs.
     """
 
     torso_m_s: Tensor
@@ -64,11 +72,10 @@ class GaitParameters(NamedTuple):
 
 
 class GaitEstimator(nn.Module):
-    """Reads :class:`GaitParameters` from the map of one person who walks or runs.
+    """Estimates :class:`GaitParameters` from the map of one walking or running person.
 
-    The step rate is the strongest modulation, with its first harmonic, between 1.2 and 4.5 Hz of the shares of
-    power faster than 1.25, 1.5 and 1.75 times the torso: a swinging leg puts it there once a step. Not
-    differentiable.
+    The step rate is the strongest modulation between 1.2 and 4.5 Hz, together with its first harmonic, of the
+    fractions of power above 1.25, 1.5 and 1.75 times the torso speed: a leg swings once per step. Not differentiable.
 
     Args:
         speed_m_s: (F,) radial speed of each Doppler bin of the maps, one- or two-sided, in any order.
@@ -77,11 +84,12 @@ class GaitEstimator(nn.Module):
     Shapes: magnitude (..., F, K) -> :class:`GaitParameters`.
 
     Raises:
-        TensorsimError: a map that does not fit the axis, lasts less than a second, is empty or has NaN; rates that
-            are not positive or too low to see steps.
+        TensorsimError: a map that does not fit the axis, lasts less than a second, is empty or has NaN; a frame rate
+            that is not positive or too low for steps.
     """
 
     speed_m_s: Tensor
+    ascending: Tensor
     order: Tensor
 
     def __init__(self, speed_m_s: Tensor, frame_rate_hz: float) -> None:
@@ -89,27 +97,31 @@ class GaitEstimator(nn.Module):
         check_positive(frame_rate_hz, "GaitEstimator.frame_rate_hz")
         if frame_rate_hz < 5 * FASTEST_STEP_HZ:
             raise TensorsimError(
-                f"frame_rate_hz: got {frame_rate_hz}, expected at least {5 * FASTEST_STEP_HZ} to see steps and "
+                f"frame_rate_hz: got {frame_rate_hz}, expected at least {5 * FASTEST_STEP_HZ} for steps and "
                 "their first harmonic"
             )
         if speed_m_s.dim() != 1 or not bool((speed_m_s.abs() > SLOWEST_M_S).any()):
             raise TensorsimError(
                 f"speed_m_s: got shape {list(speed_m_s.shape)}, expected (F,) with speeds above {SLOWEST_M_S} m/s"
             )
-        speed, order = speed_m_s.detach().double().abs().sort()
+        signed, ascending = speed_m_s.detach().double().sort()
+        speed, order = signed.abs().sort()
         first = int((speed <= SLOWEST_M_S).sum())
+        bins = round(AVERAGE_M_S / max(float(signed.diff().median()), 1e-9)) if len(signed) > 1 else 1
+        self.average = (2 * min(bins // 2, len(signed)) + 1, 2 * round(AVERAGE_S * frame_rate_hz / 2) + 1)
         self.bins = speed_m_s.shape[0]
         self.frame_rate_hz = float(frame_rate_hz)
         self.second = math.ceil(frame_rate_hz)
         self.quietest = 10 ** (-DYNAMIC_RANGE_DB / 10)
-        self.above_noise = 10 ** (ABOVE_NOISE_DB / 10)
+        self.threshold = THRESHOLD
         self.swing, self.steady = SWING, STEADY
         self.band = (SLOWEST_STEP_HZ, FASTEST_STEP_HZ)
         self.register_buffer("speed_m_s", speed[first:], persistent=False)
+        self.register_buffer("ascending", ascending, persistent=False)
         self.register_buffer("order", order[first:], persistent=False)
 
     def forward(self, doppler_time: Tensor) -> GaitParameters:
-        """Magnitude (..., F, K) to torso, limbs and steps."""
+        """Magnitude (..., F, K) to torso speed, limb speed and step rate."""
         layout = f"(..., {self.bins} Doppler bins, at least {self.second} frames)"
         check_floating(doppler_time, "doppler_time")
         check_min_rank(doppler_time, 2, "doppler_time", layout)
@@ -118,16 +130,13 @@ class GaitEstimator(nn.Module):
             raise TensorsimError(f"doppler_time: got shape {list(doppler_time.shape)}, expected {layout}")
         check_not_empty(doppler_time, "doppler_time")
         check_finite(doppler_time, "doppler_time")
-        power = doppler_time.double().index_select(-2, self.order).square()
-        noise = power[..., -(power.shape[-2] // 4) :, :].flatten(-2).median(-1)[0]
-        least = torch.maximum(self.quietest * power.amax(-2), self.above_noise * noise.unsqueeze(-1))
-        power = torch.where(power < least.unsqueeze(-2), 0.0, power)
+        power = self._power_above_noise(doppler_time.double())
         share = power.sqrt().cumsum(-2)
-        something = share[..., -1, :] > 0
+        moving = share[..., -1, :] > 0
         share = share / share[..., -1:, :].clamp_min(1e-300)
         fastest = self.speed_m_s.shape[0] - 1
-        torso = torch.where(something, self.speed_m_s[(share < 0.5).sum(-2).clamp(max=fastest)], 0.0)
-        limb = torch.where(something, self.speed_m_s[(share < 0.95).sum(-2).clamp(max=fastest)], 0.0)
+        torso = torch.where(moving, self.speed_m_s[(share < 0.5).sum(-2).clamp(max=fastest)], 0.0)
+        limb = torch.where(moving, self.speed_m_s[(share < 0.95).sum(-2).clamp(max=fastest)], 0.0)
         steady = torso > self.steady * torso.quantile(0.9, -1, keepdim=True)
         walks = steady.any(-1)
 
@@ -145,11 +154,31 @@ class GaitEstimator(nn.Module):
             limb.to(dtype),
         )
 
-    def _step_rate(self, swing: Tensor, steady: Tensor) -> Tensor:
-        """Strongest frequency in the band of steps of ``swing`` (W, ..., K), whose trend over 1.2 s is removed.
+    def _power_above_noise(self, doppler_time: Tensor) -> Tensor:
+        """Power by ascending speed less the noise floor, 0 where there is no echo: (..., F, K) -> (..., F', K).
 
-        Periodograms of ``log(swing)`` over 4 s, half overlapping, are averaged (Welch): the phase of the steps
-        does not outlast a turn. Those of all W are scaled to the same power and added. ``steady`` (..., K).
+        The threshold applies to the average over neighbouring cells. The power itself keeps its resolution.
+        """
+        power = doppler_time.index_select(-2, self.ascending).square()
+        maps = power.reshape(-1, 1, power.shape[-2], power.shape[-1])
+        margin = (self.average[0] // 2, self.average[1] // 2)
+        average = F.avg_pool2d(maps, self.average, 1, margin, count_include_pad=False).view_as(power)
+        power, average = power.index_select(-2, self.order), average.index_select(-2, self.order)
+        fastest = average[..., -(average.shape[-2] // 4) :, :]
+        floor, quartile = fastest.median(-2)[0], fastest.quantile(0.75, -2)
+        # How much noise varies around its floor is the same in all frames of a clip.
+        spread = (
+            torch.where(floor > 0, quartile / floor - 1, math.nan).nanmedian(-1, keepdim=True)[0].nan_to_num()
+        )
+        least = (floor * (1 + self.threshold * spread)).unsqueeze(-2)
+        echo = (average >= least) & (power >= self.quietest * power.amax(-2, keepdim=True))
+        return torch.where(echo, (power - floor.unsqueeze(-2)).clamp_min(0.0), 0.0)
+
+    def _step_rate(self, swing: Tensor, steady: Tensor) -> Tensor:
+        """Strongest frequency in the band of steps of ``swing`` (W, ..., K), after removal of its trend over 1.2 s.
+
+        Periodograms of ``log(swing)`` over 4 s, half overlapping, are averaged (Welch), since the phase of the steps
+        changes when the person turns. Those of all W are scaled to the same power and added. ``steady`` (..., K).
         """
         shares, frames = swing.shape[0], swing.shape[-1]
         signal = (swing + self.quietest).log().reshape(-1, 1, frames)
@@ -159,7 +188,7 @@ class GaitEstimator(nn.Module):
         signal = signal * F.avg_pool1d(weight, 9, 1, 4)
         span = min(frames, 4 * self.second)
         window = torch.hann_window(span, periodic=False, dtype=signal.dtype, device=signal.device)
-        # Zeros to 0.01 Hz between the samples of the spectrum: the clip may hold a few steps only.
+        # Zero padding for a spectrum in steps of 0.01 Hz: the clip may have a few steps only.
         length = 100 * self.second
         pieces = signal.squeeze(1).unfold(-1, span, max(1, span // 2)) * window
         spectrum = torch.fft.rfft(pieces, length).abs().square().mean(1)
@@ -167,7 +196,7 @@ class GaitEstimator(nn.Module):
         spectrum = spectrum.unflatten(0, (shares, spectrum.shape[0] // shares)).sum(0)
         step = self.frame_rate_hz / length
         low, high = math.ceil(self.band[0] / step), math.floor(self.band[1] / step) + 1
-        # A harmonic supports its fundamental, so that two bumps a step do not pass for two steps.
+        # The harmonic counts for its fundamental, so that two maxima per step are not taken for two steps.
         harmonic = spectrum[:, 2 * low : 2 * high : 2]
         peak = (spectrum[:, low:high] + 0.5 * harmonic).argmax(-1) + low
         return (peak * step).reshape(swing.shape[1:-1])

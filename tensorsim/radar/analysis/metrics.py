@@ -1,10 +1,10 @@
-"""How far apart two radar maps are: entropy, PSNR, SSIM, NMSE, and the error of the Doppler envelope.
+"""Metrics of radar maps and their differences: entropy, PSNR, SSIM, NMSE, and the error of the Doppler envelope.
 
-A figure of a map means something only with its normalisation, so every function here states it. ``scale`` says
-what is compared, each map against its own peak:
+A metric of a map depends on its normalisation, so every function states it. ``scale`` selects how maps are
+normalised, each by its own peak:
 
 - ``"linear"``: magnitude over peak, in [0, 1];
-- ``"db"``: decibels below the peak, cut off at ``range_db`` (40) and mapped to [0, 1], as maps are looked at.
+- ``"db"``: decibels below the peak, clipped at ``range_db`` (40) and mapped to [0, 1], as in pictures of maps.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from tensorsim.errors import TensorsimError, check_finite, check_floating, check
 
 
 class Envelope(NamedTuple):
-    """Outline of a Doppler-time map; NaN in frames that have nothing to outline.
+    """Envelope of a Doppler-time map; NaN in frames without any cell above the level.
 
     Attributes:
         upper: (..., K) its highest Doppler, in the units of the given axis.
@@ -47,7 +47,7 @@ def _check_pair(maps: Tensor, reference: Tensor) -> None:
 
 
 def normalise(maps: Tensor, scale: str = "db", range_db: float = 40.0) -> Tensor:
-    """Magnitudes (..., F, K) to [0, 1] on a scale of this module; a map of zeros stays 0.
+    """Normalise magnitudes (..., F, K) to [0, 1] on a scale of this module; a map of zeros stays 0.
 
     Raises:
         TensorsimError: unknown scale, a range that is not positive, negative or NaN magnitudes.
@@ -64,10 +64,13 @@ def normalise(maps: Tensor, scale: str = "db", range_db: float = 40.0) -> Tensor
 
 
 def entropy(maps: Tensor) -> Tensor:
-    """Shannon entropy (...) in nats of how power is spread over a map (..., F, K).
+    """Shannon entropy (...) in nats of the distribution of power over a map (..., F, K).
 
-    ``-sum p ln p`` with ``p = |map|^2 / sum |map|^2``: the map's power is normalised to 1, scale and gain do not
-    matter. 0 for a single point (and for a map of zeros), ``ln(F K)`` for a flat one; the lower, the sharper.
+    ``-sum p ln p`` with ``p = |map|^2 / sum |map|^2``; a gain has no influence. 0 for a single point (and for a map of
+    zeros), ``ln(F K)`` for a constant map; sharper maps have lower entropy.
+
+    >>> float(entropy(torch.eye(4)))  # four equal cells: ln 4
+    1.3862943649291992
     """
     _check_map(maps, "map")
     power = maps.square()
@@ -79,6 +82,9 @@ def psnr(maps: Tensor, reference: Tensor, scale: str = "db", range_db: float = 4
     """Peak signal-to-noise ratio (...) in dB, ``-10 log10 mean (a - b)^2`` of the normalised maps; their peak is 1.
 
     Infinite for equal maps.
+
+    >>> float(psnr(torch.ones(3, 3), torch.ones(3, 3)))
+    inf
     """
     _check_pair(maps, reference)
     difference = normalise(maps, scale, range_db) - normalise(reference, scale, range_db)
@@ -99,7 +105,7 @@ def nmse(maps: Tensor, reference: Tensor, scale: str = "linear", range_db: float
 def ssim(maps: Tensor, reference: Tensor, scale: str = "db", range_db: float = 40.0) -> Tensor:
     """Mean structural similarity (...) of the normalised maps, in [-1, 1] (Wang et al., 2004).
 
-    Their Gaussian window of 11 x 11, sigma 1.5, wherever it lies wholly inside the map (kornia's ``ssim``).
+    With their Gaussian window of 11 x 11, sigma 1.5, at positions wholly inside the map (kornia's ``ssim``).
 
     Raises:
         TensorsimError: also for maps smaller than 11 x 11.
@@ -117,7 +123,7 @@ def ssim(maps: Tensor, reference: Tensor, scale: str = "db", range_db: float = 4
 def level_envelope(maps: Tensor, axis: Tensor, level_db: float = 20.0) -> Envelope:
     """Highest and lowest Doppler at which a map (..., F, K) is within ``level_db`` of its peak.
 
-    ``axis`` (F,), ascending, gives Doppler in Hz or speed in m/s. To one bin; without gradient.
+    ``axis`` (F,), ascending, gives Doppler in Hz or speed in m/s. Resolution one bin; no gradient.
     """
     _check_axis(maps, axis)
     check_positive(level_db, "level_db")
@@ -133,10 +139,10 @@ def level_envelope(maps: Tensor, axis: Tensor, level_db: float = 20.0) -> Envelo
 def percentile_envelope(
     maps: Tensor, axis: Tensor, percentile: float = 95.0, floor_db: float = 40.0
 ) -> Envelope:
-    """Dopplers below and above which lies ``percentile`` of each frame's energy.
+    """Doppler below which, and above which, ``percentile`` percent of the energy of each frame lies.
 
-    Magnitudes lower than ``floor_db`` below the peak of the map (..., F, K) are noise and count as 0. The energy of
-    a bin is spread evenly over its width, so the envelope is not bound to bins. ``axis`` (F,): equal steps,
+    Magnitudes more than ``floor_db`` below the peak of the map (..., F, K) are noise and set to 0. The energy of a bin
+    is distributed evenly over its width, so the envelope is not quantised to bins. ``axis`` (F,): equal steps,
     ascending, Hz or m/s.
     """
     _check_axis(maps, axis)
@@ -159,7 +165,7 @@ def percentile_envelope(
 
 
 def envelope_rmse(envelope: Envelope, reference: Envelope) -> Tensor:
-    """Root mean square difference (...) of two envelopes, over both outlines and the frames that both have.
+    """Root mean square difference (...) of two envelopes, over upper and lower and the frames that both have.
 
     In the units of the envelopes: m/s for an axis of ``doppler_hz * wavelength / 2``. NaN without such frames.
     """

@@ -1,4 +1,4 @@
-"""Whether a radar can follow the motion of a scene, and reaches as far."""
+"""Checks that the speeds and ranges of a scene are unambiguous for a radar."""
 
 import warnings
 
@@ -11,9 +11,9 @@ from tensorsim.radar.synthesis.legs import leg_length
 
 
 def mean_range(positions: Tensor, radar: RadarConfig) -> Tensor:
-    """Half of ``|P - Ptx| + |P - Prx|``, which the range axis shows: (..., 3) metres -> (...) float64 metres.
+    """Range ``(|P - Ptx| + |P - Prx|) / 2`` as on the range axis: (..., 3) metres -> (...) float64 metres.
 
-    Of several antennas the first of each.
+    For several antennas, that of the first transmitter and receiver.
     """
     positions = positions.double()
     tx, rx = positions.new_tensor([radar.tx_positions_m[0], radar.rx_positions_m[0]])
@@ -26,13 +26,13 @@ def radial_speed(positions: Tensor, radar: RadarConfig) -> Tensor:
 
 
 class SpeedCheck:
-    """Gathers the radial speeds and ranges of a scene, piece by piece, and judges them against the radar.
+    """Collects the radial speeds and ranges of a scene, piece by piece, and compares them with the radar's limits.
 
-    The Doppler shift of a pulse radar is known up to its PRF, so a speed above ``lambda PRF / 4`` shows up at
-    a wrong place. When the RCS-weighted mean of the radial speed (absolute, over scatterers and pulses of a
-    clip) is above it, the map says nothing true of the scene: an error. When only some scatterer is, a foot
-    for instance: a warning. So is a scatterer beyond the last range bin: its beat frequency is above half the
-    sample rate, and the map does not show it. Scatterers without RCS, as people before they appear, do not count.
+    Doppler is ambiguous modulo the PRF, so a speed above ``lambda PRF / 4`` appears at a wrong frequency. If the
+    RCS-weighted mean of the absolute radial speed (over scatterers and pulses of a clip) is above this limit, the
+    whole map is wrong: an error. If only some scatterers are, a foot for instance: a warning. A scatterer at a range
+    larger than that of the last bin has a beat frequency above half the sample rate and is not in the map: a warning.
+    Scatterers with RCS 0, such as people before they appear, are ignored.
     """
 
     def __init__(self, radar: RadarConfig) -> None:
@@ -41,7 +41,7 @@ class SpeedCheck:
         self.fastest, self.farthest = 0.0, 0.0
 
     def add(self, positions: Tensor, rcs: Tensor) -> None:
-        """Take in positions (..., M, S, 3) and the RCS per pulse (..., M, S); sums over M and S."""
+        """Add positions (..., M, S, 3) m and the RCS per pulse (..., M, S) m^2."""
         if positions.shape[-3] < 2 or positions.numel() == 0:
             return
         rcs = rcs.detach().double()
@@ -54,12 +54,12 @@ class SpeedCheck:
         self.fastest = max(self.fastest, float(speed.max()))
 
     def judge(self) -> None:
-        """Raise TensorsimError or warn, see the class."""
+        """Raise TensorsimError or warn; see the class."""
         reach_m = self.radar.range_resolution_m * (self.radar.samples_per_chirp // 2)
         if self.farthest > reach_m:
             warnings.warn(
-                f"positions: some scatterer is {self.farthest:.2f} m away, beyond the {reach_m:.2f} m that the range "
-                "axis of this radar shows",
+                f"positions: some scatterer is {self.farthest:.2f} m away, more than the {reach_m:.2f} m of this "
+                "radar's range axis",
                 TensorsimWarning,
                 stacklevel=3,
             )
@@ -71,7 +71,7 @@ class SpeedCheck:
         enough = 4 * speed / self.radar.doppler_wavelength_m
         message = (
             f"radial speed of {speed:.2f} m/s, above the unambiguous {limit:.2f} m/s of a PRF of "
-            f"{self.radar.prf_hz:g} Hz; a PRF of {enough:.0f} Hz would do"
+            f"{self.radar.prf_hz:g} Hz; expected a PRF of at least {enough:.0f} Hz"
         )
         if mean > limit:
             raise TensorsimError(f"positions: got a scene moving at a mean {message}")

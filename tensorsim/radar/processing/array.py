@@ -1,8 +1,8 @@
 """Angle of arrival: range-angle and azimuth-time maps of the channels of an array.
 
-A plane wave from the unit direction u reaches channel v, transmitter at p and receiver at q, ahead of the
-origin by ``u . (p + q) / c``, so that its beat signal has the phase ``-2 pi u . (p + q) / lambda``: the virtual
-element stands at ``p + q``. Maps are those of the conventional (Bartlett) beamformer ``w^H C w`` with the
+A plane wave from the unit direction u reaches channel v, with transmitter at p and receiver at q, earlier than the
+origin by ``u . (p + q) / c``. Its beat signal has the phase ``-2 pi u . (p + q) / lambda``: the virtual element is
+at ``p + q``. Maps are those of the conventional (Bartlett) beamformer ``w^H C w`` with the
 steering vector w and the covariance C of the channels (Van Trees, *Optimum Array Processing*, ch. 6).
 """
 
@@ -18,7 +18,7 @@ from tensorsim.ops import safe_sqrt
 
 
 class AngleMaps(NamedTuple):
-    """Where echoes come from; magnitudes, those of one channel for a single plane wave.
+    """Magnitude over azimuth; for a single plane wave, that of one channel.
 
     Attributes:
         range_angle: (..., R, D) for D azimuths, root mean square over pulses.
@@ -50,12 +50,13 @@ def beam_power(profiles: Tensor, cycles: Tensor) -> Tensor:
 
 
 def align_transmitters(profiles: Tensor, transmitters: int) -> Tensor:
-    """Profiles (..., V, M, R) of K transmitters in turn as if all had fired at the start of the pulse interval.
+    """Time alignment of profiles (..., V, M, R) of K transmitters that fire in turn (TDM).
 
-    Transmitter k samples the motion k / K of an interval later than the first, which an angle estimator takes for
-    a direction. A linear phase over Doppler, ``exp(-j 2 pi f k / K)`` for f in [-1/2, 1/2) cycles per interval,
-    brings its pulses back: every Doppler at once, up to PRF / 2. Half a dozen pulses at either end, where the
-    transform takes the clip for periodic, stay wrong; so does the range walk within an interval. Differentiable.
+    Transmitter k samples the motion k / K of a pulse interval later than the first; an angle estimator would take the
+    phase of this motion for a direction. A linear phase over Doppler, ``exp(-j 2 pi f k / K)`` for f in [-1/2, 1/2)
+    cycles per interval, shifts its pulses to the start of the interval, for Doppler up to PRF / 2. About six pulses at
+    either end stay wrong, because the transform is periodic; range migration within an interval is not corrected.
+    Differentiable.
 
     Raises:
         TensorsimError: real profiles, or a number of channels that is no multiple of the transmitters.
@@ -85,9 +86,9 @@ class AngleMapper(nn.Module):
 
     Shapes: profiles (..., V, M, R) complex -> :class:`AngleMaps`. Differentiable.
 
-    The wavelength is that of the centre of the sweep, whose phase a range profile keeps. Plane waves: ranges
-    large beside ``aperture^2 / lambda``. Transmitters in turn: a target at v m/s shifts the phase between
-    neighbours by ``4 pi v / (lambda K PRF)``, which is not taken out here: see :func:`align_transmitters`.
+    The wavelength is that of the centre of the sweep, to which the phase of a range profile belongs. Waves are plane:
+    ranges much larger than ``aperture^2 / lambda``. For transmitters in turn (TDM), motion at v m/s changes the phase
+    between neighbours by ``4 pi v / (lambda K PRF)``, which is not corrected here: see :func:`align_transmitters`.
 
     Attributes:
         azimuth_rad: (D,).

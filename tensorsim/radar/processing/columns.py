@@ -1,11 +1,11 @@
-"""Maps whose columns, one per pulse or frame, arrive in pieces."""
+"""Maps that are computed piece by piece, with one column per pulse or frame."""
 
 import torch
 from torch import Tensor
 
 
 def block_rms(magnitude: Tensor, block: int) -> Tensor:
-    """Root of the mean power of ``block`` columns at a time: (..., R, M) -> (..., R, ceil(M / block)).
+    """Root mean square of every ``block`` columns: (..., R, M) -> (..., R, ceil(M / block)).
 
     The last block may be shorter.
     """
@@ -21,14 +21,14 @@ def block_rms(magnitude: Tensor, block: int) -> Tensor:
 
 
 def join_pulses(earlier: Tensor, later: Tensor) -> Tensor:
-    """(B, p, R) and (B, m, R) to (B, p + m, R), stored with time running fastest as both are."""
+    """Concatenate (B, p, R) and (B, m, R) to (B, p + m, R); in memory time varies fastest, as in both."""
     return torch.cat((earlier.transpose(1, 2), later.transpose(1, 2)), -1).transpose(1, 2)
 
 
 class Columns:
-    """A map (R, columns) that is written piece by piece: joining pieces at the end would take twice its memory.
+    """A map (R, columns) written piece by piece: concatenation at the end would need twice the memory.
 
-    Every ``block`` columns that arrive become one, their :func:`block_rms`.
+    Every ``block`` columns are reduced to one by :func:`block_rms`.
     """
 
     def __init__(self, columns: int, block: int = 1) -> None:
@@ -51,7 +51,7 @@ class Columns:
         self.done += columns.shape[1]
 
     def result(self) -> Tensor:
-        """The whole map, after the last columns."""
+        """The whole map; call it after the last columns."""
         if self.rest is not None and self.rest.shape[1] > 0:
             self._write(block_rms(self.rest, self.block))
         assert self.map is not None

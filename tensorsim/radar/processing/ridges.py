@@ -23,13 +23,12 @@ class Ridges(NamedTuple):
 
 
 def strongest_peaks(doppler_time: Tensor, count: int) -> Ridges:
-    """The ``count`` largest local maxima along Doppler of each frame, largest first.
+    """Maximum local energy: the ``count`` largest local maxima along Doppler of each frame, largest first.
 
     (..., F, K) -> (..., C, K) with C = ``count``.
 
-    The Doppler axis is a circle of PRF, so its ends are neighbours. Of a plateau the first bin counts. Where
-    a frame has fewer maxima its largest is repeated, and a frame without any has them all at zero Doppler,
-    bin F // 2.
+    The Doppler axis is periodic with the PRF, so its ends are neighbours. Of a plateau the first bin counts. In a
+    frame with fewer maxima the largest is repeated; in a frame without any, all are at zero Doppler, bin F // 2.
     """
     bins = doppler_time.shape[-2]
     below, above = doppler_time.roll(1, -2), doppler_time.roll(-1, -2)
@@ -43,11 +42,11 @@ def strongest_peaks(doppler_time: Tensor, count: int) -> Ridges:
 
 
 def connect(peaks: Ridges, orders: Tensor, bins: int) -> Ridges:
-    """Reorder the peaks of each frame so that each row goes on where it was in the frame before.
+    """Reorder the peaks of each frame so that each row continues the same row of the frame before.
 
-    Between neighbouring frames that permutation of the peaks is taken whose bin jumps, around the circle of
-    ``bins``, have the smallest sum. ``orders`` (C!, C) holds all permutations. The rows start in the order of
-    magnitude.
+    Between neighbouring frames the permutation of the peaks with the smallest sum of bin jumps is used; jumps are
+    taken modulo ``bins``. ``orders`` (C!, C) contains all permutations. The rows of the first frame are in the order
+    of magnitude.
     """
     index = peaks.indices.transpose(-1, -2)  # (..., K, C)
     frames, count = index.shape[-2], index.shape[-1]
@@ -59,7 +58,7 @@ def connect(peaks: Ridges, orders: Tensor, bins: int) -> Ridges:
     start = rows.expand(index[..., :1, :].shape)
     order = torch.cat((start, orders[cost.argmin(-1)]), -2)  # (..., K, C): row -> peak, frame to frame
     reach = 1
-    while reach < frames:  # running composition of permutations, doubling its reach
+    while reach < frames:  # cumulative composition of permutations, over 1, 2, 4, ... frames
         head, tail = order[..., :reach, :], order[..., reach:, :]
         order = torch.cat((head, tail.gather(-1, order[..., :-reach, :])), -2)
         reach *= 2
@@ -104,12 +103,12 @@ class RidgeExtractor(nn.Module):
 
     @torch.jit.export
     def peaks(self, doppler_time: Tensor) -> Ridges:
-        """The maxima of each frame, not yet connected."""
+        """Maxima of each frame, not connected."""
         return strongest_peaks(doppler_time, self.count)
 
     @torch.jit.export
     def connect(self, peaks: Ridges, bins: int) -> Ridges:
-        """Connect the maxima of all frames of a clip whose map has ``bins`` Doppler bins."""
+        """Connect the maxima of all frames of a clip; its map has ``bins`` Doppler bins."""
         return connect(peaks, self.orders, bins)
 
     def forward(self, doppler_time: Tensor) -> Ridges:
@@ -119,14 +118,16 @@ class RidgeExtractor(nn.Module):
 
 
 def best_path(gain: Tensor, jumps: Tensor, cost: Tensor) -> Tensor:
-    """The bins (B, K) int64 of the path with the largest sum of gains less jump costs (Viterbi, 1967).
+    """Bins (B, K) int64 of the path with the largest sum of gains minus jump costs (Viterbi, 1967).
 
-    ``gain`` (B, F, K); from frame to frame a path may jump by any of ``jumps`` (D,) bins around the circle of F, at
-    ``cost`` (D,) each. Of equal ways the first in ``jumps`` is taken.
+    Args:
+        gain: (B, F, K) gain of each bin.
+        jumps: (D,) int64 allowed changes of bin from frame to frame, modulo F; of equal paths the first is taken.
+        cost: (D,) cost of each jump.
     """
     bins, frames = gain.shape[1], gain.shape[2]
     here = torch.arange(bins, device=gain.device).unsqueeze(-1)
-    origins = torch.remainder(here - jumps, bins)  # (F, D): where a path at this bin may come from
+    origins = torch.remainder(here - jumps, bins)  # (F, D): possible bins in the frame before
     score = gain[:, :, 0]
     choices: list[Tensor] = []
     for frame in range(1, frames):
@@ -143,22 +144,22 @@ def best_path(gain: Tensor, jumps: Tensor, cost: Tensor) -> Tensor:
 
 
 class PathRidgeExtractor(nn.Module):
-    """The ``count`` best smooth paths through a map, one after another, each strongest over the whole clip.
+    """The ``count`` best smooth paths through a map, one after another, each optimal over the whole clip.
 
-    A path earns in each frame the level of its bin in dB above ``floor_db`` below the map's peak, and pays
-    ``penalty_db * jump^2`` for each change of bin. Where a component fades the path has nothing to earn and goes
-    straight on; where two cross it stays with the one that pays. A found path takes a band of bins with it, which
-    earn nothing for the paths after it. Slower than :class:`RidgeExtractor`, and it needs the whole clip.
+    The gain of a path in a frame is the level of its bin in dB, counted from ``floor_db`` below the map's peak; the
+    cost of a change of bin is ``penalty_db * jump^2``. Where a component fades, the path continues straight; where
+    two components cross, it stays on the stronger one. A band of bins around each path has no gain for the paths
+    after it. Slower than :class:`RidgeExtractor`, and needs the whole clip.
 
     Args:
         count: number of ridges, at least 1.
-        penalty_db: price of a jump by one bin; four times as much for two.
+        penalty_db: cost of a jump by one bin; four times as much for two bins.
         max_jump: largest jump from frame to frame, bins.
-        band: bins on either side of a found path that go with it.
-        floor_db: levels this far below the map's peak and farther earn nothing.
+        band: bins on either side of a found path that belong to it.
+        floor_db: bins at least this far below the map's peak have no gain.
 
-    Shapes: (..., F, K) magnitude -> :class:`Ridges` with (..., count, K). The Doppler axis is a circle of PRF. A map
-    without anything has its ridges at the first bin. Bins have no gradient, magnitudes do.
+    Shapes: (..., F, K) magnitude -> :class:`Ridges` with (..., count, K). The Doppler axis is periodic with the PRF.
+    The ridges of an empty map are at the first bin. Bins have no gradient, magnitudes do.
 
     Raises:
         TensorsimError: settings out of range, fewer Doppler bins than a jump either way, no frame, NaN.
@@ -183,7 +184,7 @@ class PathRidgeExtractor(nn.Module):
         check_positive(floor_db, "floor_db")
         self.count, self.band = count, band
         self.penalty_db, self.floor_db = penalty_db, floor_db
-        # Short jumps first: they win where ways are equal.
+        # Short jumps first: of equal paths the first is taken.
         jumps = torch.tensor(sorted(range(-max_jump, max_jump + 1), key=abs))
         self.register_buffer("jumps", jumps, persistent=False)
 

@@ -1,4 +1,4 @@
-"""The Fourier synchrosqueezed transform: a short-time spectrum sharpened along frequency, and still invertible."""
+"""Fourier synchrosqueezed transform (FSST): a short-time spectrum sharpened along frequency that can be inverted."""
 
 import math
 
@@ -12,18 +12,22 @@ from tensorsim.radar.processing.doppler import DopplerFrames
 
 
 def reassigned_bins(spectrum: Tensor, derivative: Tensor, threshold: Tensor) -> Tensor:
-    """Bins (..., F) int64 at which the energy of each bin of an STFT belongs.
+    """Bins (..., F) int64 to which the values of an STFT are reassigned.
 
-    ``derivative`` is the STFT with the window's derivative per sample. For a tone at w0 the two are ``G(w - w0)``
-    and ``j (w - w0) G(w - w0)``, so ``w0 = w - Im(derivative / spectrum)``. Bins with a magnitude of ``threshold``
-    or less stay where they are.
+    For a tone at w0, the STFT is ``G(w - w0)`` and the STFT with the derivative of the window is
+    ``j (w - w0) G(w - w0)``, so ``w0 = w - Im(derivative / spectrum)``.
+
+    Args:
+        spectrum: (..., F) complex, the STFT.
+        derivative: (..., F) complex, the STFT with the derivative of the window per sample.
+        threshold: (..., 1) values of at most this magnitude are not moved.
     """
     bins = spectrum.shape[-1]
     spectrum, derivative = spectrum.detach(), derivative.detach()
     power = torch.view_as_real(spectrum).square().sum(-1)
-    loud = power > threshold.square()
-    offset = (derivative * spectrum.conj()).imag / torch.where(loud, power, 1.0) * (bins / (2 * math.pi))
-    offset = torch.where(loud, offset.round(), 0.0).long()
+    above = power > threshold.square()
+    offset = (derivative * spectrum.conj()).imag / torch.where(above, power, 1.0) * (bins / (2 * math.pi))
+    offset = torch.where(above, offset.round(), 0.0).long()
     return torch.remainder(torch.arange(bins, device=spectrum.device) - offset, bins)
 
 
@@ -31,21 +35,21 @@ class SynchrosqueezedMap(DopplerFrames):
     """Doppler-time map by the Fourier synchrosqueezed transform; the interface of
     :class:`~tensorsim.radar.DopplerTimeMap`.
 
-    Every STFT value moves along frequency to its local frequency, the derivative of its phase in time (Oberlin,
-    Meignen and Perrier, ICASSP 2014; Thakur and Wu, SIAM J. Math. Anal. 2011), and values that meet are added as
-    complex numbers. Values only move within their frame, so their sum, the signal at the frame's centre, stays:
-    :meth:`inverse`. Frames, window, FFT length and axes are those of the Doppler-time map, but that phase counts
-    from the frame's centre, pulse ``L // 2`` of it.
+    Every STFT value is moved along frequency to its local frequency, the time derivative of its phase (Oberlin,
+    Meignen and Perrier, ICASSP 2014; Thakur and Wu, SIAM J. Math. Anal. 2011); values in the same bin are added as
+    complex numbers. Values stay in their frame, so the sum of a frame, the signal at its centre, does not change:
+    :meth:`inverse`. Frames, window, FFT length and axes are those of the Doppler-time map, except that phase is
+    referred to the centre of the frame, its pulse ``L // 2``.
 
     Args:
         radar, window_s, overlap: see :class:`~tensorsim.radar.processing.doppler.DopplerFrames`.
         hop: pulses from frame to frame instead of ``overlap``; 1 for a transform that can be inverted at
             every pulse.
-        threshold_db: values this far below the strongest of their frame and range bin are left in place.
+        threshold_db: values this far below the strongest of their frame and range bin are not moved.
 
     Shapes: (..., M, R) complex -> (..., F, K) magnitude, ``sqrt(sum over range bins of |T|^2)``; for one
     coherent series pass it as R = 1 (see :func:`~tensorsim.radar.processing.doppler.coherent_sum`). Differentiable
-    in the values that move, not in where they move.
+    by the values, not by their bins.
 
     Raises:
         TensorsimError: as :class:`~tensorsim.radar.processing.doppler.DopplerFrames`; a hop below 1, real
@@ -82,7 +86,7 @@ class SynchrosqueezedMap(DopplerFrames):
         derivative = torch.fft.fft(frames * self.slope.to(real), self.bins)
         threshold = self.threshold * spectrum.detach().abs().amax(-1, keepdim=True)
         index = reassigned_bins(spectrum, derivative, threshold)
-        # Phase counted from the centre: exp(+j 2 pi f centre / F), in whole turns exact.
+        # Phase referred to the centre: exp(+j 2 pi f centre / F), computed modulo F for accuracy.
         turns = torch.remainder(torch.arange(self.bins, device=frames.device) * centre, self.bins)
         angle = turns.to(torch.float64) * (2 * math.pi / self.bins)
         centred = spectrum * torch.polar(torch.ones_like(angle), angle).to(spectrum.dtype)
@@ -102,8 +106,8 @@ class SynchrosqueezedMap(DopplerFrames):
     def inverse(self, transform: Tensor) -> Tensor:
         """Transform (..., R, F, K) to the profiles (..., K, R) at pulses ``L // 2 + hop * k`` of the clip.
 
-        ``x = sum over f of T / (F g(0))``, the conjugate of which is the raw profile; g is 1 at its centre. Set all
-        but a band of the transform to 0 to take one component out of a signal.
+        ``x = sum over f of T / (F g(0))``, the conjugate of which is the raw profile; g is 1 at its centre. To
+        extract one component of a signal, set the transform outside of its band to 0.
         """
         check_min_rank(transform, 3, "transform", "(..., range bins, Doppler bins, frames)")
         centre = self.window[self.length // 2].to(torch.view_as_real(transform).dtype)

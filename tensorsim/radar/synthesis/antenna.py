@@ -1,4 +1,4 @@
-"""Antenna patterns: how much of the peak amplitude an antenna has towards a direction.
+"""Antenna patterns: amplitude of an antenna towards a direction, relative to its peak.
 
 Boresight is +y. Angles of a direction (x, y, z): azimuth ``atan2(x, y)``, positive to the right (+x), and
 elevation ``atan2(z, hypot(x, y))``, positive upwards. Patterns give **amplitude relative to the peak**, the
@@ -35,7 +35,7 @@ def angles(direction: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class CosineAntenna(nn.Module):
-    """Cosine-power pattern: relative gain ``cos(a)^q`` at an angle a from +y, and nothing behind.
+    """Cosine-power pattern: relative gain ``cos(a)^q`` at an angle a from +y, 0 for angles above 90 degrees.
 
     Args:
         exponent: q > 0 of the gain. Or:
@@ -44,7 +44,7 @@ class CosineAntenna(nn.Module):
     Shapes: directions (..., 3) of any length -> amplitude (...). Differentiable.
 
     Raises:
-        TensorsimError: not exactly one of the two, or a number out of its range; directions of another shape.
+        TensorsimError: not exactly one of the two given, or a number out of range; directions of another shape.
     """
 
     def __init__(self, exponent: float | None = None, beamwidth_rad: float | None = None) -> None:
@@ -55,7 +55,7 @@ class CosineAntenna(nn.Module):
         elif beamwidth_rad is not None and exponent is None:
             if not 0 < beamwidth_rad < math.pi:
                 raise TensorsimError(f"beamwidth_rad: got {beamwidth_rad}, expected between 0 and pi")
-            # log(cos(a)), exact for narrow beams too.
+            # log(cos(a)), accurate also for narrow beams.
             self.exponent = math.log(0.5) / math.log1p(-2 * math.sin(beamwidth_rad / 4) ** 2)
         else:
             raise TensorsimError(
@@ -78,7 +78,7 @@ class TabulatedAntenna(nn.Module):
     Args:
         azimuth_rad: (A,) ascending angles, A >= 2.
         elevation_rad: (E,) ascending angles, E >= 2.
-        gain_db: (E, A) gain relative to the peak. Directions outside of the table take its edge.
+        gain_db: (E, A) gain relative to the peak. Directions outside of the table get the value at its edge.
 
     Shapes: directions (..., 3) of any length -> amplitude (...). Differentiable between the nodes.
 
@@ -109,7 +109,7 @@ class TabulatedAntenna(nn.Module):
         self.register_buffer("gain_db", table, persistent=False)
 
     def _cell(self, axis: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-        """Lower node and the part of the cell above it, for angles (...) held to the table."""
+        """Lower node and position within the cell (0 to 1) of angles (...), clamped to the table."""
         angle = torch.maximum(torch.minimum(angle, axis[-1]), axis[0])
         index = (torch.searchsorted(axis, angle.detach(), right=True) - 1).clamp(0, axis.numel() - 2)
         return index, (angle - axis[index]) / (axis[index + 1] - axis[index])

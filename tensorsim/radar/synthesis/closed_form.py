@@ -1,16 +1,16 @@
-"""Range profiles in closed form: the bins of each path without making the IF and transforming it.
+"""Range profiles in closed form: the range bins of each path without the IF and its Fourier transform.
 
-The IF of a path is a tone at bin ``b = mu tau N / fs``. With its phase s and the phase of the bins counted from
-mid-chirp, its windowed transform is real but for s:
+The IF of a path is a tone at bin ``b = mu tau N / fs``. With its complex amplitude s and the phase of the bins
+referred to mid-chirp, its windowed transform is real except for s::
 
     X[k] = exp(-j pi k (N - 1) / N) sum over paths of s W(k - b),
     W(x) = sum over n of w[n] cos(2 pi x (n - (N - 1) / 2) / N)
 
-for a symmetric window. W is one Dirichlet kernel ``sin(pi x) / sin(pi x / N)`` for the rectangle, three for Hamming
-and Hann, five for Blackman (Harris, *On the use of windows for harmonic analysis with the DFT*, 1978). Evaluated as
-printed it is 0 / 0 at the peak of every target. But with ``b = n + f``, n whole and ``|f| <= 1/2``, W is so smooth
-in f that a Chebyshev series of few terms is exact to the last digit (its coefficients fall like the Bessel functions
-``J_j(pi / 2)``): a small table, for any window.
+for a symmetric window. W is one Dirichlet kernel ``sin(pi x) / sin(pi x / N)`` without window, three for Hamming and
+Hann, five for Blackman (Harris, *On the use of windows for harmonic analysis with the DFT*, 1978). The Dirichlet
+kernel is 0 / 0 at the peak. With ``b = n + f``, n an integer and ``|f| <= 1/2``, W is smooth in f, and a Chebyshev
+series of few terms has the accuracy of the number format (its coefficients decrease like the Bessel functions
+``J_j(pi / 2)``): a small table for any window.
 """
 
 import math
@@ -33,7 +33,7 @@ def kernel_table(window: Tensor, offsets: Tensor, terms: int) -> Tensor:
 
     Args:
         window: (N,) float64, symmetric.
-        offsets: (D,) whole bins m.
+        offsets: (D,) integer bins m.
         terms: length of the series.
     """
     samples = window.shape[0]
@@ -81,13 +81,13 @@ def mid_chirp_tones(
 
 
 def bin_sum(beat: Tensor, strength: Tensor, samples: int, table: Tensor) -> Tensor:
-    """All N bins (L, N) of the spectrum of windowed tones, their phase counted from mid-chirp.
+    """All N bins (L, N) of the spectrum of windowed tones, with phases referred to mid-chirp.
 
     Args:
         beat: (L, P) float64, in [0, N).
         strength: (L, P) complex, at mid-chirp.
         samples: N.
-        table: (J, D) from :func:`kernel_table` for the D bins around a tone, the middle one (D // 2) at it; real,
+        table: (J, D) from :func:`kernel_table` for the D bins around a tone, of which D // 2 is the nearest; real,
             in the precision of the result.
     """
     whole = beat.detach().round()
@@ -97,8 +97,8 @@ def bin_sum(beat: Tensor, strength: Tensor, samples: int, table: Tensor) -> Tens
     place = (whole.long().unsqueeze(-1) + torch.arange(width, device=beat.device)).flatten(1)
     ring = torch.zeros([spread.shape[0], samples + width], dtype=spread.dtype, device=beat.device)
     ring = ring.scatter_add(1, place, spread)
-    # Place p of the ring is bin p - width // 2: bring its two ends, if used, round to the other side. Half a sample
-    # off a whole one, mid-chirp of an even N sees the other sign there.
+    # Place p of the ring is bin p - width // 2. Bins at both ends are wrapped around modulo N. For even N, mid-chirp is
+    # half a sample off, and the wrapped bins change sign.
     before, sign = width // 2, 1 - 2 * ((samples - 1) % 2)
     bins = ring[:, before : before + samples]
     bins[:, samples - before :].add_(ring[:, :before], alpha=sign)
@@ -109,8 +109,8 @@ def bin_sum(beat: Tensor, strength: Tensor, samples: int, table: Tensor) -> Tens
 def tone_energy(beat: Tensor, strength: Tensor, samples: int) -> Tensor:
     """Sum over N samples of ``|sum of tones|^2``: (..., P) float64 beat bins, (..., P) complex at mid-chirp -> (...).
 
-    Every pair of tones adds ``2 Re(s_i conj(s_j)) sin(pi d) / sin(pi d / N)``, d the difference of their bins; there
-    are P (P - 1) / 2 pairs.
+    Every pair of tones contributes ``2 Re(s_i conj(s_j)) sin(pi d) / sin(pi d / N)``, d the difference of their bins.
+    There are P (P - 1) / 2 pairs.
     """
     parts = torch.view_as_real(strength)
     own = samples * parts.square().sum((-2, -1))
@@ -126,24 +126,24 @@ def tone_energy(beat: Tensor, strength: Tensor, samples: int) -> Tensor:
 
 
 class RangeBinSynthesizer(nn.Module):
-    """Range profiles of a scene directly from its propagation paths; no IF is made.
+    """Range profiles of a scene directly from its propagation paths, without the IF.
 
-    Equals :class:`~tensorsim.radar.RangeProfile` of
-    :class:`~tensorsim.radar.EchoSynthesizer` to 1e-6 of the norm in float32 and 1e-12 in float64 with all
-    bins, and to ``truncation`` of it when only bins near a path are kept.
+    With all bins, the relative difference to :class:`~tensorsim.radar.RangeProfile` of
+    :class:`~tensorsim.radar.EchoSynthesizer` is 1e-6 of the norm in float32 and 1e-12 in float64; with only the bins
+    near each path it is ``truncation``.
 
     Args:
         echo: the scene's paths and its static echo.
         profile: the window, and the gate if it has one.
-        near_bins: keep the bins within this many of the nearest to each path; None keeps all. All bins cost
-            more than the time-domain way; a few cost several times less.
+        near_bins: compute only the bins at most this far from the one nearest to each path; None computes all.
+            All bins take longer than the time-domain engine, a few bins several times less.
 
     Shapes: positions (..., M, S, 3) m, rcs (..., S), (..., M, S) or (S,) m^2 -> (..., M, R) complex, free of
     noise; complex64, and complex128 after ``.double()``. Differentiable by both.
 
     Attributes:
-        truncation: expected error of the norm that ``near_bins`` causes for one path, relative: the square root
-            of the part of the window's energy in bins further out, its mean over fractions of a bin. 0 with all.
+        truncation: expected relative error of the norm for one path due to ``near_bins``: the square root of the
+            fraction of the window's energy in the other bins, averaged over fractions of a bin. 0 for all bins.
 
     Raises:
         TensorsimError: ``near_bins`` below 1, an echo with several antennas or a closed Airy slab; see
@@ -160,7 +160,7 @@ class RangeBinSynthesizer(nn.Module):
         if echo.paths.airy or echo.paths.has_array:
             raise TensorsimError(
                 "echo: got a wall with incidence 'airy' or several antennas, expected one antenna of each kind and "
-                "paths that are pure tones: the time-domain way has the others"
+                "paths that are pure tones; engine 'time' supports the others"
             )
         self.echo, self.profile = echo, profile
         self.terms_float32, self.terms_float64 = TERMS_FLOAT32, TERMS_FLOAT64
@@ -186,13 +186,13 @@ class RangeBinSynthesizer(nn.Module):
     @staticmethod
     @torch.jit.unused
     def _energy(table: Tensor) -> float:
-        """Energy of all columns, the mean over fractions f."""
+        """Energy of all columns, averaged over fractions f of a bin."""
         fraction = (torch.arange(64, dtype=torch.float64) + 0.5) / 64 - 0.5
         return float(torch.matmul(chebyshev(2 * fraction, table.shape[0]), table).square().sum(-1).mean())
 
     @torch.jit.export
     def tones(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
-        """Beat bins and amplitudes of the P paths, unchecked: (..., S, 3) m, (..., S) m^2 -> (..., P)."""
+        """Beat bins and amplitudes of the P paths, without input checks: (..., S, 3) m, (..., S) m^2 -> (..., P)."""
         paths = self.echo.paths(positions.double(), rcs.double(), None)
         return self._tones(paths.delay_s.flatten(-2), paths.gain.flatten(-2))
 
@@ -231,7 +231,7 @@ class RangeBinSynthesizer(nn.Module):
         samples = self.profile.samples
         if beat.shape[-1] ** 2 <= 16 * samples:
             return tone_energy(beat, strength, samples)
-        # So many pairs cost more than all samples.
+        # For many tones the sum over samples is faster than the sum over pairs.
         start = beat * (-(samples - 1) / (2 * samples))
         first = strength * phasor((start - start.round()).to(self.echo.fine.dtype))
         sums = tone_sum(first, beat / samples, self.echo.coarse, self.echo.fine)[..., :samples]
@@ -239,7 +239,7 @@ class RangeBinSynthesizer(nn.Module):
 
     @torch.jit.export
     def static_bins(self) -> Tensor:
-        """Profile (R,) of what does not move and is switched on: leakage and wall echo."""
+        """Profile (R,) of the static paths, leakage and wall echo."""
         return self.profile(self.echo.static_echo().unsqueeze(0))[0]
 
     def forward(self, positions: Tensor, rcs: Tensor) -> Tensor:

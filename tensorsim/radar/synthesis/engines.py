@@ -1,9 +1,9 @@
-"""The two ways from scatterers to range profiles free of noise, with one interface.
+"""Two engines that compute noise-free range profiles of scatterers, with one interface.
 
     engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2) -> profiles (B, m, R), energy (B,)
 
-``energy`` is that of the signal that the receiver noise refers to, over m pulses and the N samples of their IF.
-Arguments are not checked: the simulator has done that.
+``energy`` is that of the reference signal of the receiver noise, over m pulses and the N samples of their IF.
+Arguments are not checked; the simulator has checked them.
 """
 
 from torch import Tensor, nn
@@ -15,9 +15,12 @@ from tensorsim.radar.synthesis.noise import energy
 
 
 class TimeEngine(nn.Module):
-    """By way of the IF: echo and Fourier transform over fast time.
+    """Computes the IF and its Fourier transform over fast time.
 
-    ``total``: the energy is that of echo and static paths together, and not of the echo alone.
+    Args:
+        echo: scatterers -> IF.
+        profile: IF -> range profiles.
+        total: the energy includes the static paths.
     """
 
     def __init__(self, echo: EchoSynthesizer, profile: RangeProfile, total: bool) -> None:
@@ -34,7 +37,7 @@ class TimeEngine(nn.Module):
 
 
 class RangeBinEngine(nn.Module):
-    """In closed form; ``total`` as above."""
+    """Computes range bins in closed form; ``total``: the energy includes the static paths."""
 
     def __init__(self, bins: RangeBinSynthesizer, total: bool) -> None:
         super().__init__()

@@ -29,18 +29,18 @@ def decibels(signal_power: Tensor, noise_power: Tensor) -> Tensor:
 
 
 class ProfileNoise(nn.Module):
-    """What white noise in the IF becomes in range profiles, drawn there: no IF and no Fourier transform.
+    """Receiver noise in range profiles, drawn in the range bins: without IF and Fourier transform.
 
-    White noise of variance v in the N samples of a pulse is white of variance N v in the N bins. A window w turns
-    that into its circular convolution with ``W(m) / N``, W the transform of the window, of which a handful of values
-    are not next to nothing: three for Hamming and Hann, five for Blackman, one for the rectangle. The others, less
-    than 1e-4 of its energy, are left out; phases count from sample N / 2.
+    White noise of variance v in the N samples of a pulse is white noise of variance N v in the N bins. A window w
+    convolves it circularly with ``W(m) / N``, where W is the transform of the window. Few values of W matter: three
+    for Hamming and Hann, five for Blackman, one without window. The others, less than 1e-4 of the energy, are left
+    out. Phases are referred to sample N / 2.
 
     Args:
         window: (N,) over fast time, symmetric.
 
     Shapes: like (B, R, M) complex, noise power per IF sample (B,) -> noise (B, R, M) in R neighbouring bins, and the
-        energy (B,) that N samples would have of what was drawn. Differentiable by the power.
+        energy (B,) that this realisation would have in N samples. Differentiable by the power.
     """
 
     taps: list[float]
@@ -73,23 +73,24 @@ class ProfileNoise(nn.Module):
 
 
 class ReceiverNoise(nn.Module):
-    """Adds complex white Gaussian noise to IF samples. PyTorch's global generator draws it:
-    ``torch.manual_seed``.
+    """Adds complex white Gaussian noise to IF samples.
+
+    The noise is drawn from PyTorch's global generator; ``torch.manual_seed`` makes it reproducible.
 
     Args:
-        snr_db: ratio of signal to noise per IF sample, both as mean over the clip; None adds no noise.
-        reference: what the signal is: ``"echo"``, the echo of the targets; ``"total"``, everything in the IF,
-            leakage and wall echo included; ``"absolute"`` sets the noise to ``k T0 B F / Pt`` instead (IF
-            samples are for transmit power 1) and leaves ``snr_db`` out.
-        empty_power: the signal power to assume in a clip whose signal is exactly zero, so that an empty scene
-            has a noise floor too.
+        snr_db: signal-to-noise ratio per IF sample, both powers averaged over the clip; None adds no noise.
+        reference: the signal of the ratio: ``"echo"``, the echo of the targets; ``"total"``, the whole IF,
+            including leakage and wall echo. ``"absolute"`` sets the noise power to ``k T0 B F / Pt`` (IF
+            samples are for transmit power 1) and ignores ``snr_db``.
+        empty_power: signal power assumed for a clip whose signal is exactly zero, so that an empty scene has a
+            noise floor.
         bandwidth_hz: B for ``"absolute"``: the sample rate of the complex IF.
         noise_figure_db: F for ``"absolute"``.
         transmit_power_w: Pt for ``"absolute"``.
 
-    Shapes: IF (..., M, N) complex, optionally the target echo in it, likewise -> IF with noise. Without the
-        target echo the whole IF counts as echo. One noise power per clip. Differentiable: noise scales with its
-        reference.
+    Shapes: IF (..., M, N) complex, optionally the target echo in it, of the same shape -> IF with noise.
+        Without the target echo the whole IF is the reference. One noise power per clip. Differentiable: the noise
+        scales with its reference.
 
     Raises:
         TensorsimError: unknown reference, numbers that are not finite or positive, a real IF, shapes that
@@ -139,7 +140,7 @@ class ReceiverNoise(nn.Module):
 
     @torch.jit.export
     def realised_snr_db(self, clean: Tensor, noisy: Tensor, target_echo: Tensor | None = None) -> Tensor:
-        """Ratio (...) in dB of the reference signal to the noise that was really drawn; +inf without noise."""
+        """Ratio (...) in dB of the reference signal to this realisation of the noise; +inf without noise."""
         signal = clean if target_echo is None or self.reference == "total" else target_echo
         return decibels(mean_power(signal), mean_power(noisy - clean))
 

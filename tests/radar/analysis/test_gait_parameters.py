@@ -15,6 +15,7 @@ from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.range_profile import RangeProfile
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
+from tensorsim.radar.synthesis.noise import ReceiverNoise
 from tests.stage import StageTester
 
 SPEED = torch.linspace(-9, 9, 181).double()
@@ -100,6 +101,30 @@ def test_steps_of_generated_walks(speed_m_s, limbs):
     step_hz = 2 * np.fft.rfftfreq(1 << 17, 1 / radar.prf_hz)[strides.argmax()]
     assert float(found.step_hz) == pytest.approx(step_hz, rel=0.05)
     assert float(found.torso_m_s) == pytest.approx(speed_m_s, rel=0.25 if limbs else 0.45)  # bright points
+
+
+@pytest.mark.parametrize(("limbs", "lost"), [(False, 0.1), (True, 0.25)])
+def test_noise_adds_no_speed(limbs, lost):
+    """A simulated walk at 0 to 40 dB per IF sample: torso, steps, and limbs over torso stay those without noise.
+
+    Thin limbs are up to 25 dB below the torso, so that at 0 dB their tips are lost in the noise.
+    """
+    radar = PRESETS["infineon-bgt24mtr12"].radar
+    walk = ActivityGenerator().generate(
+        "walking", people=nominal_people(1, speed_m_s=1.1), rate_hz=radar.prf_hz
+    )
+    scatterers = LimbScatterers(radar.tx_m, radar.rx_m) if limbs else JointScatterers()
+    beat = EchoSynthesizer(radar)(*scatterers(walk.joints, torch.ones(walk.joints.shape[:2]).double()))
+    doppler, profile = DopplerTimeMap(radar, window_s=0.15), RangeProfile(radar, gate_m=(1.0, 6.0))
+    estimator = GaitEstimator(doppler.doppler_hz * radar.doppler_wavelength_m / 2, doppler.frame_rate_hz)
+    clean = estimator(doppler(profile(beat)))
+    ratio = float(clean.limb_m_s / clean.torso_m_s)
+    for snr_db in (0.0, 10.0, 40.0):
+        torch.manual_seed(0)
+        noisy = estimator(doppler(profile(ReceiverNoise(snr_db)(beat))))
+        assert float(noisy.torso_m_s) == pytest.approx(float(clean.torso_m_s), rel=0.1)
+        assert float(noisy.step_hz) == pytest.approx(float(clean.step_hz), rel=0.06)
+        assert (1 - lost) * ratio < float(noisy.limb_m_s / noisy.torso_m_s) < 1.08 * ratio
 
 
 def test_two_sides_are_one():
