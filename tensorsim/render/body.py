@@ -11,15 +11,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tensorsim.body import proportions
+from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.render.cast import Volumes
 
 REFERENCE_HEIGHT_M = 1.75
-#: Shank, thigh and trunk of the body, in heights (the proportions of ``tensorsim.motion``).
-SEGMENTS_PER_HEIGHT = 0.779
 #: The nose before the middle of the head, and the place of the head over the middle of the shoulders.
 NOSE_FORWARD, NOSE_UP = 0.102, -0.005
-#: Direction from the middle of the shoulders to the nose of a body that looks ahead: this far before upright.
-NOSE_TILT = math.atan2(0.06, 0.11)
+#: Angle from upright to the direction of the nose from the middle of the shoulders, of a body that looks ahead.
+NOSE_TILT = math.atan2(proportions.NOSE_FORWARD, proportions.NOSE_UP)
 
 #: Eyes and ears from the middle of the head, (right, front, up), right side.
 EYE = (0.032, 0.086, 0.028)
@@ -36,7 +36,7 @@ class Body(NamedTuple):
         volumes: :class:`Volumes` with leading (T, S).
         part: (S,) int64 index into PARTS.
         keypoints: (T, 17, 3) COCO keypoints in the world.
-        height_m: standing height, from the median lengths of bones.
+        height_m: standing height, the median over time of that from the lengths of bones.
     """
 
     volumes: Volumes
@@ -50,17 +50,6 @@ def frame(up: Tensor, right: Tensor) -> Tensor:
     up = F.normalize(up, dim=-1)
     right = F.normalize(right - (right * up).sum(-1, keepdim=True) * up, dim=-1)
     return torch.stack([right, torch.linalg.cross(up, right), up], dim=-2)
-
-
-def body_height(joints: Tensor) -> float:
-    """Standing height in metres of a skeleton (T, 14, 3), from its median trunk, thighs and shanks."""
-
-    def length(a: Tensor, b: Tensor) -> float:
-        return float((a - b).norm(dim=-1).median())
-
-    hips = (joints[:, 8] + joints[:, 11]) / 2
-    legs = sum(length(joints[:, a], joints[:, b]) for a, b in ((8, 9), (9, 10), (11, 12), (12, 13)))
-    return (length(joints[:, 1], hips) + legs / 2) / SEGMENTS_PER_HEIGHT
 
 
 class _Builder:
@@ -108,9 +97,9 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
         girth: thickness of everything, 1 for the median adult.
         long_hair: hair down to the shoulders.
     """
-    height = body_height(joints)
+    height = float(body_height(joints).median())
     s = height / REFERENCE_HEIGHT_M
-    neck, hips = joints[:, 1], (joints[:, 8] + joints[:, 11]) / 2
+    neck, hips = joints[:, 1], mid_hips(joints)
     shoulder_line, hip_line = joints[:, 2] - joints[:, 5], joints[:, 8] - joints[:, 11]
     chest = frame(neck - hips, shoulder_line)
     pelvis = frame(neck - hips, hip_line)
