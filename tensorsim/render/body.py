@@ -89,8 +89,8 @@ class _Builder:
 def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> Body:
     """A body on the joints of one person.
 
-    The head looks where the nose is from the shoulders; the trunk twists with shoulders and hips; hands go on
-    from the forearms and feet stand square to the shanks, but not into the floor.
+    The head faces the direction of the nose from the shoulders; the trunk twists with shoulders and hips; hands
+    continue the forearms and feet are at right angles to the shanks, but not below the floor.
 
     Args:
         joints: (T, 14, 3) metres, order of ``tensorsim.JOINTS``.
@@ -158,8 +158,8 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
             "trunk", chest, hips, low, joints[:, joint] - 0.02 * s * chest[:, 2], (0.07, 0.055), s, 1.0, tall
         )
 
-    # Head and neck. One point tells of the head, so its nod is taken half as large as the nose has it. The head
-    # stays upright as long as the trunk is nearly so, and over the neck: some skeletons mark its middle.
+    # Head and neck. The nose alone gives the orientation of the head, so half of its pitch is used. The head
+    # stays upright as long as the trunk nearly is, and over the neck: in some skeletons the joint is its centre.
     nose = joints[:, 0] - neck
     yaw = torch.asin(((nose * chest[:, 0]).sum(-1) / (0.105 * s)).clamp(-0.9, 0.9))
     ahead = torch.cos(yaw)[:, None] * chest[:, 1] + torch.sin(yaw)[:, None] * chest[:, 0]
@@ -252,12 +252,12 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
 
 
 def _level_foot(shank: Tensor, ankle: Tensor, ground: Tensor, scale: float) -> Tensor:
-    """Frame of a foot square to the shank (T, 3, 3), its toes lifted out of the floor."""
+    """Frame of a foot at right angles to the shank (T, 3, 3), its toes not below the floor."""
     toe = ankle + scale * 0.165 * shank[:, 1]
     clearance = ankle[:, 2] - ground  # 0 on the floor
     lowest = (ground - 0.01 * scale + 0.4 * clearance.clamp(min=0)).minimum(ankle[:, 2])
     short = (lowest - toe[:, 2]).clamp(min=0)
-    # Only feet near the floor stand on it; a foot in the air or of a lying body hangs as it likes.
+    # Only feet near the floor stand on it; those in the air and of lying bodies keep their orientation.
     lift = short * (clearance < 0.25 * scale)
     forward = F.normalize(toe + F.pad(lift[:, None], (2, 0)) - ankle, dim=-1)
     up = torch.linalg.cross(shank[:, 0], forward)
