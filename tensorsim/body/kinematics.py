@@ -108,7 +108,7 @@ def forward_kinematics(
 
 
 def rest_on_floor(joints: Tensor, height_m: Tensor | float = 1.0) -> Tensor:
-    """Shift poses (..., 14, 3) vertically so that they rest on z = 0 by whatever is lowest.
+    """Shift poses (..., 14, 3) vertically so that their lowest joint rests on z = 0.
 
     Standing, that is an ankle at its anatomical height; lying or kneeling, a joint with flesh around it.
     """

@@ -19,7 +19,7 @@ FOREARM = 0.146
 #: The nose seen from the middle of the shoulders: forward and up.
 NOSE_FORWARD = 0.06
 NOSE_UP = 0.11
-#: Flesh between a joint and the floor that it rests on; ankles stand at their own height.
+#: Height over the floor of a joint that rests on it; ankles stand at their own height.
 FLESH = 0.045
 
 

@@ -30,7 +30,7 @@ def mid_hips(joints: Tensor) -> Tensor:
 
 
 def body_height(joints: Tensor) -> Tensor:
-    """Standing height of the body from its legs and trunk, whatever its pose.
+    """Standing height of the body from its legs and trunk, in any pose.
 
     Args:
         joints: (..., 14, 3) in any unit of length.
@@ -60,14 +60,14 @@ def mirror(joints: Tensor) -> Tensor:
 def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> tuple[Tensor, Tensor]:
     """The 14 joints of ``tensorsim.JOINTS`` from the 17 key points of COCO.
 
-    The head is the nose. From behind, the nose is hidden and its score low: the head then slides, as the
-    score falls below ``threshold``, to the score-weighted mean of eyes and ears, which from there lies where
+    The head is the nose. From behind, the nose is hidden and its score low: as the score falls below
+    ``threshold``, the head moves to the score-weighted mean of eyes and ears, which from behind lies where
     the nose would project. The neck is the middle of the shoulders, with the lower of their two scores.
 
     Args:
         keypoints: (..., 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
         scores: (..., 17).
-        threshold: score from which the nose counts as seen.
+        threshold: score from which the nose counts as visible.
 
     Returns:
         joints (..., 14, 2) in pixels and scores (..., 14). Differentiable.
@@ -118,7 +118,7 @@ def body_to_coco(joints: Tensor) -> Tensor:
     """The 17 key points of COCO from the 14 joints of the radar body.
 
     Eyes and ears are placed about the nose in a frame that neck and nose (which give its size too) and the
-    line of the shoulders span: a head that turns against the trunk turns them in part only.
+    line of the shoulders span: they follow only a part of a rotation of the head relative to the trunk.
 
     Args:
         joints: (..., 14, 3) metres, order of ``tensorsim.JOINTS``, any frame with right-handed axes.
@@ -140,7 +140,7 @@ def body_to_coco(joints: Tensor) -> Tensor:
     across = joints[..., 2, :] - joints[..., 5, :]
     right = across - (across * reach).sum(dim=-1, keepdim=True) * reach
     right = right / right.norm(dim=-1, keepdim=True)
-    beside = torch.linalg.cross(right, reach)  # a quarter turn from `reach`, back to up as forward to right
+    beside = torch.linalg.cross(right, reach)  # `reach` turned by 90 degrees, backwards
     angle = math.atan2(NOSE_FORWARD, NOSE_UP)
     up = math.cos(angle) * reach + math.sin(angle) * beside
     forward = math.sin(angle) * reach - math.cos(angle) * beside

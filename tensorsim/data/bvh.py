@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.data.skeletons import Motion, motion_of, plain_name
 from tensorsim.errors import TensorsimError
 from tensorsim.files import reading
@@ -62,7 +63,7 @@ def _size(joints: Tensor) -> float:
     def length(a: Tensor, b: Tensor) -> float:
         return float((a - b).norm(dim=-1).median())
 
-    hips = (joints[:, 8] + joints[:, 11]) / 2
+    hips = mid_hips(joints)
     return (
         length(joints[:, 1], hips) + length(joints[:, 8], joints[:, 9]) + length(joints[:, 9], joints[:, 10])
     )

@@ -1,4 +1,4 @@
-"""From images to a detector's square input, and from its dense predictions to separate boxes.
+"""Boxes: overlap and suppression; letterbox images for a detector and its dense predictions as boxes.
 
 Boxes are ``xyxy`` pixels in the convention of COCO: (0, 0) is the outer corner of the first pixel and (W, H)
 that of the last one.
@@ -14,9 +14,9 @@ from tensorsim.errors import is_exporting
 def resize_8bit(images: Tensor, height: int, width: int) -> Tensor:
     """Resize as ``cv2.resize`` (INTER_LINEAR, uint8) does, to the bit.
 
-    Bilinear without antialiasing, in fixed point: weights in 1/2048, each row's share cut to a quarter of a
-    grey level. Detectors were trained on such pictures, and one grey level can decide between two boxes of
-    nearly the same score.
+    Bilinear without antialiasing, in fixed point: weights in 1/2048, the share of each row truncated to a quarter
+    of a grey level. Detectors were trained on such images, and one grey level can decide between two boxes of
+    nearly equal score.
 
     Args:
         images: (B, C, H, W) uint8, or floating point in [0, 1], which is rounded to 8 bits.

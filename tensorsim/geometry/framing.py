@@ -10,9 +10,9 @@ from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 
-#: A body reaches beyond its joints by so much, upwards from the nose and downwards from the ankles.
+#: Extent of a body beyond its joints: above the nose and below the ankles.
 _ABOVE_M, _BELOW_M = 0.25, 0.10
-#: Nobody is filmed through a longer lens than this, however small the motion.
+#: Smallest field of view, also for small motion.
 _NARROWEST_RAD = math.radians(40.0)
 
 
@@ -24,13 +24,13 @@ def camera_on(
     margin: float = 0.12,
     position_m: tuple[float, float, float] = CameraConfig.position_m,
 ) -> CameraConfig:
-    """A still camera turned, tilted and zoomed so that whole bodies stay in its picture.
+    """A static camera with yaw, pitch and field of view such that whole bodies stay in its picture.
 
     Args:
         joints: (P, T, 14, 3) world metres.
-        valid: (P, T) bool; who is not there need not be seen. Points beside or behind the camera are left out.
+        valid: (P, T) bool, who is present. Points beside or behind the camera are left out.
         height, width: of the picture in pixels.
-        margin: free part of the half picture.
+        margin: free share of each half of the picture.
         position_m: where it stands, by default at the radar.
 
     Raises:
@@ -68,7 +68,7 @@ def seen_keypoints(
         height, width: of the picture in pixels.
 
     Returns:
-        (..., 17, 2) pixels and scores (..., 17): 1 in the picture, else 0. Who is not there is at 0 with score 0.
+        (..., 17, 2) pixels and scores (..., 17): 1 in the picture, else 0. Absent people are at 0 with score 0.
     """
     points = torch.where(valid[..., None, None], body_to_coco(joints), 0.0)
     focal, center = focal_length(camera, width), principal_point(camera, height, width)

@@ -1,4 +1,4 @@
-"""A movement at given times, and the parts that the scripts of activities are made of.
+"""A movement at given times, and the building blocks of the scripts of activities.
 
 Everybody is right-handed here, starts at the origin and faces +y; times in seconds, angles in degrees.
 """
@@ -35,8 +35,8 @@ class Act(NamedTuple):
         support: (B, T, 2) weight on the right and left ankle, sum 1.
         offset: (B, T, 3) m of the hips on top of that: right, forward, up.
         path: (B, T) m walked.
-        hold: (B, T, 2) how firmly each foot is held by the floor, 0 to 1.
-        moment: (B, K, 2) times at which the feet are where they are held, step by step.
+        hold: (B, T, 2) weight with which each foot is fixed to the floor, 0 to 1.
+        moment: (B, K, 2) times at which the feet are at their fixed places, step by step.
         step: (B, T, 2) int64, the step of each time.
         other: (B, T, 2) int64, the step that the foot comes from or goes to.
         progress: (B, T, 2) towards that one, as a share of the way; None for feet that do not walk.
@@ -141,7 +141,7 @@ def _reach_ahead(who: People, gait: Gait) -> Tensor:
 
 
 def with_gait(time: Tensor, who: People, base: BodyPose, pace: Tensor, path: Tensor) -> Act:
-    """Walking on top of what the body does else, ``pace`` (B, T) of it between 0 and 1."""
+    """Walking added to the other movement, ``pace`` (B, T) of it between 0 and 1."""
     leg = (who.proportions.thigh + who.proportions.shank) * who.height_m
     relative_speed = who.speed_m_s / leg
     cycle = cycle_s(relative_speed)[:, None]

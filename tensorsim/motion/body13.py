@@ -13,7 +13,7 @@ class Node(NamedTuple):
 
     Attributes:
         name: of the node.
-        parent: the node that it hangs from; None is the root.
+        parent: the parent node; None is the root.
         rcs_m2: radar cross section in m^2.
         joints: names of ``tensorsim.JOINTS`` with their weights (sum 1); the node is their weighted mean.
     """

@@ -1,4 +1,4 @@
-"""Feet that stand: legs are bent so that ankles reach given places, with the bones as long as before."""
+"""Standing feet: inverse kinematics of the legs for given ankles, with constant bone lengths."""
 
 from typing import NamedTuple
 
@@ -58,7 +58,7 @@ class Tread(NamedTuple):
     """Steps of both feet, right and left.
 
     Attributes:
-        hold: (B, T, 2) in [0, 1], how firmly a foot is held by the floor.
+        hold: (B, T, 2) in [0, 1], weight with which a foot is fixed to the floor.
         since: (B, T, 2) cycles since (or, negative, until) the nearest middle of standing.
         step: (B, T, 2) int64, the number of that step.
         other: (B, T, 2) int64, the number of the step after it or, until its middle, before it.
@@ -80,8 +80,8 @@ def tread(time: Tensor, cycle_s: Tensor, phase: Tensor, middle: float, hold: flo
         cycle_s: (B,) length of a cycle.
         phase: (B,) cycles of the right leg at time 0; the left leg is half a cycle apart.
         middle: phase of the middle of standing.
-        hold, blend: parts of a cycle for which the foot is held fast, and over which it gets hold and leaves
-            it; ``hold + 2 blend <= 1``.
+        hold, blend: parts of a cycle for which the foot is fixed, and over which its weight rises and
+            falls; ``hold + 2 blend <= 1``.
     """
     begin = phase[:, None] + torch.tensor([0.0, 0.5], dtype=time.dtype) - middle  # (B, 2) at time 0
     cycles = (time / cycle_s[:, None])[..., None] + begin[:, None]

@@ -1,4 +1,4 @@
-"""Who moves: bodies and habits drawn at random, from distributions that a frozen config holds."""
+"""People: bodies and manners of moving, drawn at random from the distributions of a frozen config."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from tensorsim.errors import TensorsimError
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
 VARIED_NUMBERS = 24
 
-#: Nobody starts or is kept farther away than this.
+#: Largest distance at which people start or are kept.
 FARTHEST_M = 1e6
 
 Range = tuple[float, float]
@@ -89,7 +89,7 @@ class PeopleConfig:
 
 
 class People(NamedTuple):
-    """Drawn bodies and habits; every field has one entry per person.
+    """Drawn bodies and manners of moving; every field has one entry per person.
 
     Attributes:
         height_m, mass_kg: (B,).
@@ -121,7 +121,7 @@ class People(NamedTuple):
 
 
 def nominal_people(count: int, height_m: float = 1.75, speed_m_s: float = 1.1) -> People:
-    """The mean body, moving exactly by the book: facing the radar from 4 m, right-handed."""
+    """The mean body without individual deviations: facing the radar from 4 m, right-handed."""
 
     def full(value: float, *tail: int) -> Tensor:
         return torch.full((count, *tail), value, dtype=torch.float64)

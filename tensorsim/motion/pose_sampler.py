@@ -1,4 +1,4 @@
-"""A seeded sampler of human poses: what people in activity videos do, family by family.
+"""A seeded sampler of human poses of activity videos, family by family.
 
 The shipped pose library is made of it and of the activities (``tensorsim library build --generate N``).
 """
@@ -216,7 +216,7 @@ def _jump(draw: _Draw) -> BodyPose:
     )
 
 
-#: What people in activity videos do, and how often the sampler draws it.
+#: Families of poses in activity videos, and the relative frequency with which the sampler draws them.
 _FAMILIES: tuple[tuple[Callable[[_Draw], BodyPose], float], ...] = (
     (_walk, 0.18),
     (_walk_and_reach, 0.08),

@@ -1,7 +1,7 @@
 """From joints at video rate to joints at pulse rate.
 
-Straight lines between frames have piecewise constant velocity, which a radar shows as a staircase of spectral
-lines at the frame rate. A C2 cubic spline has continuous velocity and acceleration; it is the default.
+Linear interpolation has a piecewise constant velocity, which gives spectral lines at the frame rate in the
+radar data. A C2 cubic spline has continuous velocity and acceleration; it is the default.
 
 Source: C. de Boor, "A Practical Guide to Splines" (1978), ch. IV, in terms of second derivatives.
 """
@@ -25,7 +25,7 @@ def natural_spline_curvature(y: Tensor, interval: float) -> Tensor:
     """Second derivatives, at its knots, of the natural cubic spline through equidistant knots.
 
     They solve ``m[k-1] + 4 m[k] + m[k+1] = 6 (y[k-1] - 2 y[k] + y[k+1]) / interval^2`` with ``m = 0`` at both
-    ends. Continued as an odd function beyond the ends the system is circulant: the FFT solves it without a
+    ends. Extended as an odd function beyond the ends the system is circulant: the FFT solves it without a
     loop over knots.
 
     Args:
@@ -50,8 +50,8 @@ def natural_spline_curvature(y: Tensor, interval: float) -> Tensor:
 def evaluate_cubic(y: Tensor, curvature: Tensor, interval: float, times: Tensor) -> Tensor:
     """Piecewise cubic with values ``y`` and second derivatives ``curvature`` at equidistant knots.
 
-    Beyond the last knot it goes on straight with the velocity that it has there (a natural spline does so by
-    definition, with continuous acceleration). Without curvature it is the polygon through the knots.
+    Beyond the last knot it continues linearly with the velocity there (for a natural spline with continuous
+    acceleration). Without curvature it is the piecewise linear interpolant.
 
     Args:
         y, curvature: (..., T, J, 3), T >= 2.
@@ -79,9 +79,9 @@ class PoseResampler(nn.Module):
     """Joints at video rate -> joints at the pulse rate of the radar.
 
     Frame k is at ``k / fps``, pulse m at ``m / prf_hz``. T frames last ``T / fps``, so a clip has
-    ``M = round(T / fps * prf_hz)`` pulses; those after the last frame go on straight with its velocity.
+    ``M = round(T / fps * prf_hz)`` pulses; those after the last frame continue linearly with its velocity.
 
-    The result is float64 whatever the joints are: float32 metres are too coarse for the phase of a carrier of
+    The result is always float64: float32 metres are too coarse for the phase of a carrier of
     77 GHz (a floor near -60 dB).
 
     Args:
@@ -185,7 +185,7 @@ class PoseResampler(nn.Module):
             )
         times = torch.arange(start, stop, dtype=torch.float64, device=coefficients.device) * fps / self.prf_hz
         positions, accelerations = coefficients.unbind(-4)
-        # In pieces that stay in the cache of a processor: several times faster than all pulses at once.
+        # In pieces that fit the cache of the processor: several times faster than all pulses at once.
         per_pulse = max(1, positions.numel() // positions.shape[-3])
         pieces = times.split(max(1, 131072 // per_pulse))
         return torch.cat(

@@ -22,7 +22,7 @@ def polynomial_basis(window: int, order: int) -> Tensor:
 
 
 def savitzky_golay(x: Tensor, basis: Tensor, dim: int, direct_window: int = 64) -> Tensor:
-    """The middle of the polynomial that fits each window best; at the ends, all of the last polynomial.
+    """The centre of the least-squares polynomial of each window; at the ends, all of the last polynomial.
 
     Args:
         x: real tensor with at least ``window`` samples along ``dim``.
@@ -68,7 +68,7 @@ class SavitzkyGolay(nn.Module):
         torch.Size([2, 60, 14, 3])
 
     Raises:
-        TensorsimError: a window that is not odd and positive, or an order that it cannot determine.
+        TensorsimError: a window that is not odd and positive, or an order that is not below it.
     """
 
     basis: Tensor

@@ -1,4 +1,4 @@
-"""Courses of movements in time: from rest to rest, there and back, speeding up, toppling over."""
+"""Time courses of movements: from rest to rest, there and back, accelerating, falling over."""
 
 import math
 

@@ -17,7 +17,7 @@ _DEGREE = math.pi / 180
 
 
 class Gait(NamedTuple):
-    """Angles (radians) and translations (leg lengths) of a walking body; senses are those of ``BodyPose``.
+    """Angles (radians) and translations (leg lengths) of a walking body; signs are those of ``BodyPose``.
 
     Attributes:
         hip, knee, ankle, shoulder, elbow: (..., T, 2) flexion, right then left; of the ankle, toes up.
@@ -154,7 +154,7 @@ def pelvis_roll(relative_speed: Tensor, phase: Tensor) -> Tensor:
 def boulic_gait(relative_speed: Tensor, phase: Tensor) -> Gait:
     """The body at phases of the gait cycle; phase 0 is the heel strike of the right foot.
 
-    The published signs of lateral shift, trunk pitch and the yaw of pelvis and thorax are those of other axes;
+    The published signs of lateral shift, trunk pitch and the yaw of pelvis and thorax refer to other axes;
     here the body sways over the standing foot, bows forward, and turns the side of the leading leg forward.
 
     Args:

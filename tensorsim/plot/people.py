@@ -6,17 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tensorsim.body.skeleton import LIMBS
 from tensorsim.plot.figure import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Bones of the 14-joint radar body and of COCO-17, as pairs of indices.
+#: Lines of the drawn 14-joint radar body and of COCO-17, as pairs of indices.
+BODY_BONES = ((0, 1), (1, 2), (1, 5), (1, 8), (1, 11), (8, 11), *LIMBS)
 # fmt: off
-BODY_BONES = (
-    (0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7),
-    (1, 8), (8, 9), (9, 10), (1, 11), (11, 12), (12, 13), (8, 11),
-)
 COCO_BONES = (
     (0, 1), (0, 2), (1, 3), (2, 4), (5, 6), (5, 7), (7, 9), (6, 8), (8, 10),
     (5, 11), (6, 12), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16),

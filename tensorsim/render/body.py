@@ -11,15 +11,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tensorsim.body import proportions
+from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.render.cast import Volumes
 
 REFERENCE_HEIGHT_M = 1.75
-#: Shank, thigh and trunk of the body, in heights (the proportions of ``tensorsim.motion``).
-SEGMENTS_PER_HEIGHT = 0.779
 #: The nose before the middle of the head, and the place of the head over the middle of the shoulders.
 NOSE_FORWARD, NOSE_UP = 0.102, -0.005
-#: Direction from the middle of the shoulders to the nose of a body that looks ahead: this far before upright.
-NOSE_TILT = math.atan2(0.06, 0.11)
+#: Angle from upright to the direction of the nose from the middle of the shoulders, of a body that looks ahead.
+NOSE_TILT = math.atan2(proportions.NOSE_FORWARD, proportions.NOSE_UP)
 
 #: Eyes and ears from the middle of the head, (right, front, up), right side.
 EYE = (0.032, 0.086, 0.028)
@@ -36,7 +36,7 @@ class Body(NamedTuple):
         volumes: :class:`Volumes` with leading (T, S).
         part: (S,) int64 index into PARTS.
         keypoints: (T, 17, 3) COCO keypoints in the world.
-        height_m: standing height, from the median lengths of bones.
+        height_m: standing height, the median over time of that from the lengths of bones.
     """
 
     volumes: Volumes
@@ -52,22 +52,16 @@ def frame(up: Tensor, right: Tensor) -> Tensor:
     return torch.stack([right, torch.linalg.cross(up, right), up], dim=-2)
 
 
-def body_height(joints: Tensor) -> float:
-    """Standing height in metres of a skeleton (T, 14, 3), from its median trunk, thighs and shanks."""
-
-    def length(a: Tensor, b: Tensor) -> float:
-        return float((a - b).norm(dim=-1).median())
-
-    hips = (joints[:, 8] + joints[:, 11]) / 2
-    legs = sum(length(joints[:, a], joints[:, b]) for a, b in ((8, 9), (9, 10), (11, 12), (12, 13)))
-    return (length(joints[:, 1], hips) + legs / 2) / SEGMENTS_PER_HEIGHT
-
-
 class _Builder:
-    """Collects volumes, each given in the coordinates (right, front, up) of a part's frame."""
+    """Collects volumes, each given in the coordinates (right, front, up) of a part's frame.
 
-    def __init__(self, girth: float) -> None:
-        self.girth = girth
+    Args:
+        girth: factor on all radii.
+        scale: of the body over the reference height.
+    """
+
+    def __init__(self, girth: float, scale: float) -> None:
+        self.girth, self.scale = girth, scale
         self.rows: list[tuple[Tensor, ...]] = []
         self.parts: list[int] = []
 
@@ -79,17 +73,18 @@ class _Builder:
         start: Tensor | tuple[float, float, float],
         end: Tensor | tuple[float, float, float],
         radii: tuple[float, float],
-        scale: float,
         depth: float = 1.0,
         length: Tensor | None = None,
     ) -> None:
+        """One tapered capsule between points of the world (tensors) or of the frame (tuples, reference metres)."""
+
         def place(point: Tensor | tuple[float, float, float]) -> Tensor:
             if isinstance(point, Tensor):
                 return point
-            return origin + scale * (origin.new_tensor(point) @ axes)
+            return origin + self.scale * (origin.new_tensor(point) @ axes)
 
         frames = origin.shape[0]
-        ra, rb = (origin.new_full((frames,), radius * scale * self.girth) for radius in radii)
+        ra, rb = (origin.new_full((frames,), radius * self.scale * self.girth) for radius in radii)
         if length is None:
             length = origin.new_ones(frames)
         squash = origin.new_full((frames,), depth)
@@ -100,79 +95,68 @@ class _Builder:
 def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> Body:
     """A body on the joints of one person.
 
-    The head looks where the nose is from the shoulders; the trunk twists with shoulders and hips; hands go on
-    from the forearms and feet stand square to the shanks, but not into the floor.
+    The head faces the direction of the nose from the shoulders; the trunk twists with shoulders and hips; hands
+    continue the forearms and feet are at right angles to the shanks, but not below the floor.
 
     Args:
         joints: (T, 14, 3) metres, order of ``tensorsim.JOINTS``.
         girth: thickness of everything, 1 for the median adult.
         long_hair: hair down to the shoulders.
     """
-    height = body_height(joints)
-    s = height / REFERENCE_HEIGHT_M
-    neck, hips = joints[:, 1], (joints[:, 8] + joints[:, 11]) / 2
+    height = float(body_height(joints).median())
+    scale = height / REFERENCE_HEIGHT_M
+    build = _Builder(girth, scale)
+    head_build = _Builder(1.0, scale)  # the size of heads does not depend on the girth
+    up = joints[:, 1] - mid_hips(joints)
+    chest = frame(up, joints[:, 2] - joints[:, 5])
+    _add_trunk(build, joints, chest)
+    face = _add_head(build, head_build, joints, chest, long_hair)
+    _add_arms(build, joints)
+    _add_legs(build, joints)
+    rows = build.rows + head_build.rows
+    volumes = Volumes(*(torch.stack(column, dim=1) for column in zip(*rows, strict=True)))
+    part = torch.tensor(build.parts + head_build.parts, device=joints.device)
+    # COCO alternates left and right from the shoulders to the ankles; the body goes limb by limb.
+    order = [5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10]
+    return Body(volumes, part, torch.cat([face, joints[:, order]], dim=1), height)
+
+
+def _add_trunk(build: _Builder, joints: Tensor, chest: Tensor) -> None:
+    """Hips, waist and chest. Lengths along the trunk follow the skeleton, so they are given in the world."""
+    s, neck, hips = build.scale, joints[:, 1], mid_hips(joints)
     shoulder_line, hip_line = joints[:, 2] - joints[:, 5], joints[:, 8] - joints[:, 11]
-    chest = frame(neck - hips, shoulder_line)
     pelvis = frame(neck - hips, hip_line)
     waist = frame(neck - hips, F.normalize(shoulder_line, dim=-1) + F.normalize(hip_line, dim=-1))
-    build = _Builder(girth)
     tall = (neck - hips).norm(dim=-1)
 
-    # Trunk: from the hips up. Lengths along it follow the skeleton, so they are given in the world.
     def along(share: float, forward: float, axes: Tensor) -> Tensor:
         return hips + share * (neck - hips) + forward * s * axes[:, 1]
 
-    build.add(
-        "hips", pelvis, hips, (-0.065, -0.01, -0.01), (0.065, -0.01, -0.01), (0.115, 0.115), s, 0.92, tall
-    )
-    build.add(
-        "hips",
-        pelvis,
-        hips,
-        along(0.0, 0.0, pelvis),
-        along(0.2, 0.005, pelvis),
-        (0.158, 0.142),
-        s,
-        0.70,
-        tall,
-    )
-    build.add(
-        "trunk",
-        waist,
-        hips,
-        along(0.2, 0.005, waist),
-        along(0.45, 0.01, waist),
-        (0.140, 0.136),
-        s,
-        0.70,
-        tall,
-    )
-    build.add(
-        "trunk",
-        chest,
-        hips,
-        along(0.45, 0.01, chest),
-        along(0.75, 0.01, chest),
-        (0.138, 0.156),
-        s,
-        0.68,
-        tall,
-    )
-    build.add(
-        "trunk", chest, hips, along(0.75, 0.01, chest), along(0.86, 0.0, chest), (0.156, 0.128), s, 0.66, tall
-    )
+    build.add("hips", pelvis, hips, (-0.065, -0.01, -0.01), (0.065, -0.01, -0.01), (0.115, 0.115), 0.92, tall)
+    for part, axes, start, end, radii, depth in (
+        ("hips", pelvis, (0.0, 0.0), (0.2, 0.005), (0.158, 0.142), 0.70),
+        ("trunk", waist, (0.2, 0.005), (0.45, 0.01), (0.140, 0.136), 0.70),
+        ("trunk", chest, (0.45, 0.01), (0.75, 0.01), (0.138, 0.156), 0.68),
+        ("trunk", chest, (0.75, 0.01), (0.86, 0.0), (0.156, 0.128), 0.66),
+    ):
+        build.add(part, axes, hips, along(*start, axes), along(*end, axes), radii, depth, tall)
     for joint, side in ((2, 1.0), (5, -1.0)):
         inner = neck + s * (side * 0.05 * chest[:, 0] + 0.035 * chest[:, 2])
-        build.add("trunk", chest, hips, inner, joints[:, joint], (0.052, 0.058), s, 1.0, tall)
+        build.add("trunk", chest, hips, inner, joints[:, joint], (0.052, 0.058), 1.0, tall)
         low = hips + 0.70 * (neck - hips) + side * 0.10 * s * chest[:, 0]
-        build.add(
-            "trunk", chest, hips, low, joints[:, joint] - 0.02 * s * chest[:, 2], (0.07, 0.055), s, 1.0, tall
-        )
+        high = joints[:, joint] - 0.02 * s * chest[:, 2]
+        build.add("trunk", chest, hips, low, high, (0.07, 0.055), 1.0, tall)
 
-    # Head and neck. One point tells of the head, so its nod is taken half as large as the nose has it. The head
-    # stays upright as long as the trunk is nearly so, and over the neck: some skeletons mark its middle.
+
+def _head_frame(joints: Tensor, chest: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """Frame (T, 3, 3) and centre (T, 3) of the head.
+
+    The nose alone gives the orientation, so half of its pitch is used. The head stays upright as long as the trunk
+    nearly is, and over the neck: in some skeletons the joint is its centre.
+    """
+    neck = joints[:, 1]
     nose = joints[:, 0] - neck
-    yaw = torch.asin(((nose * chest[:, 0]).sum(-1) / (0.105 * s)).clamp(-0.9, 0.9))
+    yaw = torch.asin(((nose * chest[:, 0]).sum(-1) / (0.105 * scale)).clamp(-0.9, 0.9))
     ahead = torch.cos(yaw)[:, None] * chest[:, 1] + torch.sin(yaw)[:, None] * chest[:, 0]
     nod = torch.atan2((nose * ahead).sum(-1), (nose * chest[:, 2]).sum(-1)) - NOSE_TILT
     nod = 0.5 * nod.clamp(0, 1.2)
@@ -180,95 +164,89 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
     up = (1 - upright) * chest[:, 2] + upright * F.pad(torch.zeros_like(neck[:, :2]), (0, 1), value=1.0)
     up = torch.cos(nod)[:, None] * up + torch.sin(nod)[:, None] * ahead
     head = frame(up, torch.linalg.cross(ahead, chest[:, 2]))
-    center = joints[:, 0] - s * (NOSE_FORWARD * head[:, 1] + NOSE_UP * head[:, 2])
-    behind = ((neck - center) * ahead).sum(-1, keepdim=True) - 0.01 * s
-    center = center + behind.clamp(min=0) * ahead
+    center = joints[:, 0] - scale * (NOSE_FORWARD * head[:, 1] + NOSE_UP * head[:, 2])
+    behind = ((neck - center) * ahead).sum(-1, keepdim=True) - 0.01 * scale
+    return head, center + behind.clamp(min=0) * ahead
+
+
+def _add_head(
+    build: _Builder, head_build: _Builder, joints: Tensor, chest: Tensor, long_hair: bool
+) -> Tensor:
+    """Head and neck; the keypoints of the face (T, 5, 3): nose, eyes and ears."""
+    s = build.scale
+    head, center = _head_frame(joints, chest, s)
 
     def on_head(*point: float) -> Tensor:
         return center + s * (center.new_tensor(point) @ head)
 
-    thin = _Builder(1.0)  # heads do not grow with the girth
-    thin.add("head", head, center, (0, -0.012, 0.030), (0, -0.004, 0.014), (0.080, 0.078), s, 1.20)
-    thin.add("head", head, center, (0, 0.012, 0.0), (0, 0.035, -0.072), (0.072, 0.040), s, 1.0)
-    thin.add("head", head, center, (0, 0.086, 0.018), (0, NOSE_FORWARD - 0.006, -0.008), (0.008, 0.014), s)
-    for side in (1.0, -1.0):
-        thin.add(
-            "head",
-            head,
-            center,
-            (side * 0.076, -0.008, 0.02),
-            (side * 0.074, -0.004, -0.012),
-            (0.016, 0.011),
-            s,
-        )
-    if long_hair:
-        thin.add("head", head, center, (0, -0.035, 0.03), (0, -0.065, -0.16), (0.082, 0.066), s, 0.7)
-    build.add(
-        "neck",
-        head,
-        center,
-        neck - s * (0.01 * chest[:, 2]),
-        on_head(0, -0.02, -0.06),
-        (0.060, 0.054),
-        s,
-    )
+    def add(
+        start: tuple[float, float, float],
+        end: tuple[float, float, float],
+        radii: tuple[float, float],
+        depth: float = 1.0,
+    ) -> None:
+        head_build.add("head", head, center, start, end, radii, depth)
 
-    ground = joints[:, (10, 13), 2].min()  # the floor that these feet stand on
-    for first, side, line in ((2, 1.0, shoulder_line), (5, -1.0, shoulder_line)):
+    add((0, -0.012, 0.030), (0, -0.004, 0.014), (0.080, 0.078), 1.20)
+    add((0, 0.012, 0.0), (0, 0.035, -0.072), (0.072, 0.040))
+    add((0, 0.086, 0.018), (0, NOSE_FORWARD - 0.006, -0.008), (0.008, 0.014))
+    for side in (1.0, -1.0):
+        add((side * 0.076, -0.008, 0.02), (side * 0.074, -0.004, -0.012), (0.016, 0.011))
+    if long_hair:
+        add((0, -0.035, 0.03), (0, -0.065, -0.16), (0.082, 0.066), 0.7)
+    low = joints[:, 1] - s * (0.01 * chest[:, 2])
+    build.add("neck", head, center, low, on_head(0, -0.02, -0.06), (0.060, 0.054))
+    face = [on_head(side * place[0], *place[1:]) for place in (EYE, EAR) for side in (-1.0, 1.0)]
+    return torch.stack([on_head(0, NOSE_FORWARD, NOSE_UP), *face], dim=1)
+
+
+def _add_arms(build: _Builder, joints: Tensor) -> None:
+    """Upper arms, forearms and hands."""
+    line = joints[:, 2] - joints[:, 5]
+    for first, side in ((2, 1.0), (5, -1.0)):
         shoulder, elbow, wrist = joints[:, first], joints[:, first + 1], joints[:, first + 2]
         upper, lower = frame(shoulder - elbow, line), frame(elbow - wrist, line)
         arm, fore = (shoulder - elbow).norm(dim=-1), (elbow - wrist).norm(dim=-1)
         bulge = shoulder + 0.35 * (elbow - shoulder)
-        build.add("upper_arm", upper, shoulder, shoulder, bulge, (0.056, 0.050), s, 1.0, arm)
-        build.add("upper_arm", upper, shoulder, bulge, elbow, (0.050, 0.041), s, 1.0, arm)
+        build.add("upper_arm", upper, shoulder, shoulder, bulge, (0.056, 0.050), 1.0, arm)
+        build.add("upper_arm", upper, shoulder, bulge, elbow, (0.050, 0.041), 1.0, arm)
         bulge = elbow + 0.25 * (wrist - elbow)
-        build.add("forearm", lower, elbow, elbow, bulge, (0.041, 0.043), s, 1.0, fore)
-        build.add("forearm", lower, elbow, bulge, wrist, (0.043, 0.027), s, 1.0, fore)
-        build.add("hand", lower, wrist, (0, 0, -0.01), (0, 0.005, -0.085), (0.027, 0.040), s, 0.6)
-        build.add("hand", lower, wrist, (0, 0.005, -0.09), (0, 0.025, -0.165), (0.036, 0.017), s, 0.55)
-        build.add("hand", lower, wrist, (0, 0.01, -0.03), (-side * 0.03, 0.035, -0.095), (0.018, 0.011), s)
+        build.add("forearm", lower, elbow, elbow, bulge, (0.041, 0.043), 1.0, fore)
+        build.add("forearm", lower, elbow, bulge, wrist, (0.043, 0.027), 1.0, fore)
+        build.add("hand", lower, wrist, (0, 0, -0.01), (0, 0.005, -0.085), (0.027, 0.040), 0.6)
+        build.add("hand", lower, wrist, (0, 0.005, -0.09), (0, 0.025, -0.165), (0.036, 0.017), 0.55)
+        build.add("hand", lower, wrist, (0, 0.01, -0.03), (-side * 0.03, 0.035, -0.095), (0.018, 0.011))
+
+
+def _add_legs(build: _Builder, joints: Tensor) -> None:
+    """Thighs, shanks and shoes."""
+    s, line = build.scale, joints[:, 8] - joints[:, 11]
+    pelvis = frame(joints[:, 1] - mid_hips(joints), line)
+    ground = joints[:, (10, 13), 2].min()  # the floor that these feet stand on
     for first, side in ((8, 1.0), (11, -1.0)):
         hip, knee, ankle = joints[:, first], joints[:, first + 1], joints[:, first + 2]
-        upper, lower = frame(hip - knee, hip_line), frame(knee - ankle, hip_line)
+        upper, lower = frame(hip - knee, line), frame(knee - ankle, line)
         thigh, shank = (hip - knee).norm(dim=-1), (knee - ankle).norm(dim=-1)
         inward = hip - side * 0.020 * s * pelvis[:, 0]
-        build.add("thigh", upper, hip, inward, hip + 0.3 * (knee - hip), (0.088, 0.082), s, 1.0, thigh)
-        build.add("thigh", upper, hip, hip + 0.3 * (knee - hip), knee, (0.082, 0.056), s, 1.0, thigh)
+        build.add("thigh", upper, hip, inward, hip + 0.3 * (knee - hip), (0.088, 0.082), 1.0, thigh)
+        build.add("thigh", upper, hip, hip + 0.3 * (knee - hip), knee, (0.082, 0.056), 1.0, thigh)
         calf = knee + 0.30 * (ankle - knee) - 0.012 * s * lower[:, 1]
-        build.add("shank", lower, knee, knee, calf, (0.054, 0.056), s, 1.0, shank)
-        build.add("shank", lower, knee, calf, ankle, (0.056, 0.037), s, 1.0, shank)
+        build.add("shank", lower, knee, knee, calf, (0.054, 0.056), 1.0, shank)
+        build.add("shank", lower, knee, calf, ankle, (0.056, 0.037), 1.0, shank)
         foot = _level_foot(lower, ankle, ground, s)
-        build.add("shoe", foot, ankle, (0, -0.045, -0.035), (0, 0.02, -0.015), (0.034, 0.042), s)
-        build.add(
-            "shoe", foot, ankle, (0, 0.01, -0.028), (side * 0.008, 0.115, -0.042), (0.040, 0.040), s, 1.0
-        )
-        build.add(
-            "shoe",
-            foot,
-            ankle,
-            (side * 0.008, 0.115, -0.042),
-            (side * 0.004, 0.165, -0.046),
-            (0.040, 0.027),
-            s,
-        )
-
-    rows = build.rows + thin.rows
-    volumes = Volumes(*(torch.stack(column, dim=1) for column in zip(*rows, strict=True)))
-    part = torch.tensor(build.parts + thin.parts, device=joints.device)
-    face = [on_head(side * place[0], *place[1:]) for place in (EYE, EAR) for side in (-1.0, 1.0)]
-    keypoints = torch.stack([on_head(0, NOSE_FORWARD, NOSE_UP), *face], dim=1)
-    # COCO alternates left and right from the shoulders to the ankles; the body goes limb by limb.
-    order = [5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10]
-    return Body(volumes, part, torch.cat([keypoints, joints[:, order]], dim=1), height)
+        toes = (side * 0.008, 0.115, -0.042)
+        build.add("shoe", foot, ankle, (0, -0.045, -0.035), (0, 0.02, -0.015), (0.034, 0.042))
+        build.add("shoe", foot, ankle, (0, 0.01, -0.028), toes, (0.040, 0.040))
+        build.add("shoe", foot, ankle, toes, (side * 0.004, 0.165, -0.046), (0.040, 0.027))
 
 
 def _level_foot(shank: Tensor, ankle: Tensor, ground: Tensor, scale: float) -> Tensor:
-    """Frame of a foot square to the shank (T, 3, 3), its toes lifted out of the floor."""
+    """Frame of a foot at right angles to the shank (T, 3, 3), its toes not below the floor."""
     toe = ankle + scale * 0.165 * shank[:, 1]
     clearance = ankle[:, 2] - ground  # 0 on the floor
     lowest = (ground - 0.01 * scale + 0.4 * clearance.clamp(min=0)).minimum(ankle[:, 2])
     short = (lowest - toe[:, 2]).clamp(min=0)
-    # Only feet near the floor stand on it; a foot in the air or of a lying body hangs as it likes.
+    # Only feet near the floor stand on it; those in the air and of lying bodies keep their orientation.
     lift = short * (clearance < 0.25 * scale)
     forward = F.normalize(toe + F.pad(lift[:, None], (2, 0)) - ankle, dim=-1)
     up = torch.linalg.cross(shank[:, 0], forward)

@@ -1,8 +1,8 @@
 """Ray casting of round volumes: tapered capsules, made elliptical by squashing, with a depth buffer.
 
 A tapered capsule is the union of the spheres whose centre runs from a to b while the radius goes linearly from
-ra to rb. Rays meet it in closed form; a squashed one is a round one met by squashed rays, at the same ray
-parameter.
+ra to rb. Intersections with rays have a closed form; for a squashed one space is stretched so that it becomes round,
+which keeps the ray parameter.
 """
 
 import math
@@ -45,11 +45,11 @@ class Volumes(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What the rays of a picture met first.
+    """The first intersections of the rays of a picture.
 
     Attributes:
-        depth: (H * W,) ray parameter; infinite where nothing was met.
-        volume: (H * W,) int64 index of the volume; -1 where nothing was met.
+        depth: (H * W,) ray parameter; infinite without an intersection.
+        volume: (H * W,) int64 index of the volume; -1 without one.
         normal: (H * W, 3) unit vectors out of the body, smooth from one volume of a person to the next.
     """
 
@@ -119,7 +119,7 @@ class View(NamedTuple):
             pixel, depth = self.project(point)
             extent = self.scale * radius
             if self.pinhole:
-                # A sphere off the axis is seen longer than f r / z: the secant of its angle, bounded.
+                # The image of a sphere off the axis is longer than f r / z: by the secant of its angle, bounded.
                 slant = (pixel - pixel.new_tensor(self.center)).abs().amax(dim=-1) / self.scale
                 extent = extent / (depth - radius).clamp(min=NEAR_M) * (1 + slant)
                 front = front & (depth - radius > NEAR_M)
@@ -142,11 +142,11 @@ def cast(volumes: Volumes, owner: Tensor, view: View, blend_m: float = 0.015) ->
     """First hits of the rays of a picture with S volumes.
 
     Where volumes of one person meet, their normals are averaged with weights ``exp(-depth / blend_m)`` beyond
-    the nearest, which shades the joint like one skin.
+    the nearest, which shades the transition smoothly.
 
     Args:
         volumes: (S, ...) of one instant.
-        owner: (S,) int64, whose each is.
+        owner: (S,) int64, the person each volume belongs to.
         view: the rays.
         blend_m: length over which volumes blend.
     """

@@ -1,4 +1,4 @@
-"""What people wear: skin, hair and clothes with patterns, as colours of points on the body."""
+"""Appearance of people: skin, hair and clothes with patterns, as colours of points on the body."""
 
 from typing import NamedTuple
 
@@ -35,7 +35,7 @@ PATTERNS = ("plain", "stripes", "checks", "print", "jacket")
 
 
 class Look(NamedTuple):
-    """One person's looks; colours are (3,) sRGB in [0, 1].
+    """Appearance of one person; colours are (3,) sRGB in [0, 1].
 
     Attributes:
         skin: tone of the skin.
@@ -67,7 +67,7 @@ class Look(NamedTuple):
 
     @classmethod
     def draw(cls, generator: torch.Generator) -> "Look":
-        """Random looks."""
+        """A random appearance."""
 
         def number(low: float, high: float) -> float:
             return low + (high - low) * float(torch.rand((), generator=generator))
@@ -95,7 +95,7 @@ class Look(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Points on one body that a picture shows.
+    """Visible points of one body.
 
     Attributes:
         point: (K, 3) metres from the origin of their part along its right, front and up.
@@ -153,7 +153,7 @@ def paint(look: Look, surface: Surface) -> Paint:
     put(shoe, torch.where((z < -0.062)[:, None], 0.5 + 0.4 * look.shoes.to(like), look.shoes.to(like)))
     cloth = shirt | trousers
 
-    # Folds run along the limbs and sag: waves with phases turned by one another.
+    # Folds run along the limbs: waves that modulate the phases of one another.
     phase = surface.point @ look.folds.to(like).mT
     phase = phase + 0.8 * torch.sin(0.5 * phase.roll(1, dims=-1))
     amount = torch.where(cloth, 0.10, 0.0)[:, None]

@@ -1,7 +1,6 @@
-"""People rendered from their joints: video of known motion, with the labels that a camera cannot give.
+"""People rendered from their joints: video of known motion with exact labels.
 
-Ray-cast bodies of round volumes stand in a lit room and cast shadows; a lens, a sensor and a codec then spoil the
-picture as real ones do. Made for truth: what the joints were is exactly known.
+Ray-cast bodies of round volumes stand in a lit room and cast shadows; lens blur, sensor noise and compression follow.
 """
 
 import math
@@ -22,7 +21,7 @@ from tensorsim.render.scene import GAMMA, Light, Scene, picture_scene, room_scen
 
 #: COCO's visibility flags.
 OUTSIDE, HIDDEN, VISIBLE = 0, 1, 2
-#: Flesh in metres that a keypoint may lie under and count as seen: little on the face, much at the hips.
+#: Depth in metres below the surface up to which a keypoint counts as visible: small on the face, large at the hips.
 FLESH_M = (0.05, 0.04, 0.04, 0.05, 0.05) + (0.12,) * 2 + (0.09,) * 4 + (0.18,) * 2 + (0.11,) * 4
 
 
@@ -33,8 +32,8 @@ class RenderedVideo(NamedTuple):
         frames: (T, 3, H, W) uint8 RGB.
         boxes: (P, T, 4) ``xyxy`` pixels around what is seen of each person; zeros where nothing is.
         masks: (P, T, H, W) bool, the pixels that show each person.
-        keypoints: (P, T, 17, 2) COCO keypoints in pixels, where they are or would be.
-        visibility: (P, T, 17) int64, as in COCO: 0 out of the picture or not there, 1 hidden, 2 seen.
+        keypoints: (P, T, 17, 2) COCO keypoints in pixels, visible or not.
+        visibility: (P, T, 17) int64, as in COCO: 0 outside of the picture or absent, 1 hidden, 2 visible.
         keypoints_m: (P, T, 17, 3) the same in world metres.
         joints: (P, T, 14, 3) world metres, order of ``tensorsim.JOINTS``: the input.
         valid: (P, T) bool, whether the person is in the picture.
@@ -55,7 +54,7 @@ class RenderedVideo(NamedTuple):
 class PersonRenderer:
     """Films people whose joints are known.
 
-    Looks, clothes, light, room and noise are drawn from the seed of the call.
+    Appearance, light, room and noise are drawn from the seed of the call.
 
     Args:
         camera: pinhole camera; None is the default one, at the radar, looking along +y.
@@ -107,7 +106,7 @@ class PersonRenderer:
             seed: the same seed gives the same film.
             background: (3, H, W) picture, RGB uint8 or floating point in [0, 1], scaled to cover the frame; None
                 makes a room.
-            valid: (P, T) bool, who is there when; None is everybody always. A film without people is empty.
+            valid: (P, T) bool, in which frames each person is present; None is all. A film without people is empty.
 
         Raises:
             TensorsimError: other shapes, no frames or people, NaN.
@@ -232,7 +231,7 @@ class PersonRenderer:
 
 
 class Shadows(NamedTuple):
-    """A depth map of the people as the lamp sees them."""
+    """A depth map of the people from the lamp."""
 
     view: View
     depth: Tensor
@@ -244,12 +243,12 @@ class Shadows(NamedTuple):
         low, high = ends.amin(dim=0), ends.amax(dim=0)
         side = float((high - low).norm()) + 0.5
         view = View.of_light(light.towards.to(ends), (low + high) / 2, side, pixels)
-        # Rays start well before everything: depth is from the middle plane, which bodies straddle.
+        # Depth counts from the plane through the middle of the bodies; rays start well in front of it.
         view = view._replace(origins=view.origins - side * view.axes[2])
         return cls(view, cast(volumes, owner, view).depth - side)
 
     def reach(self, points: Tensor, bias_m: float = 0.04) -> Tensor:
-        """How much of the lamp (...) reaches world points (..., 3); edges are soft."""
+        """Share of the lamp (...) that reaches world points (..., 3); edges are soft."""
         pixel, depth = self.view.project(points)
         size = self.view.size[0]
         margin = 2
@@ -297,7 +296,7 @@ def _visibility(
     index = row * width + column
     person = torch.arange(len(keypoints), device=owner.device)[:, None]
     flesh = depth.new_tensor(FLESH_M)
-    # A keypoint on the outline may round to the background beside it; it is seen.
+    # A keypoint on the outline may round to the background beside it; it is visible.
     seen = ((owner[index] == person) | (owner[index] < 0)) & (depth - front[index] < flesh)
     return torch.where(inside, torch.where(seen, VISIBLE, HIDDEN), OUTSIDE)
 
@@ -318,7 +317,7 @@ def _boxes(masks: Tensor) -> Tensor:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """The many small operations of a frame lose more by waiting for other threads than they gain."""
+    """One thread: the many small operations of a frame are slower on several."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

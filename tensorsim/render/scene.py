@@ -1,4 +1,4 @@
-"""Where rendered people are: procedural rooms and background pictures, with the geometry that shadows need."""
+"""Surroundings of rendered people: procedural rooms and background pictures, with geometry for shadows."""
 
 import math
 from typing import NamedTuple
@@ -14,7 +14,7 @@ GAMMA = 2.2
 
 
 class Light(NamedTuple):
-    """A far lamp and the light from everywhere, in linear RGB.
+    """A distant lamp and ambient light, in linear RGB.
 
     Attributes:
         towards: (3,) unit vector to the lamp.
@@ -47,13 +47,13 @@ class Light(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What the camera sees without people.
+    """The scene without people.
 
     Attributes:
         shade: (H * W, 3) linear RGB under ambient light alone.
-        lamp: (H * W, 3) linear RGB that the lamp adds where nobody stands in its way.
+        lamp: (H * W, 3) linear RGB that the lamp adds outside of shadows.
         points: (H * W, 3) world metres of each pixel; not finite where it is infinitely far.
-        depth: (H * W,) ray parameter; what is further than this is hidden.
+        depth: (H * W,) ray parameter; anything further away is hidden.
     """
 
     shade: Tensor
@@ -147,7 +147,7 @@ def _wall(a: Tensor, z: Tensor, draw: _Draw) -> Tensor:
         tone = tone * (0.85 + 0.3 * brick)
         base = torch.where(mortar[:, None], torch.tensor([0.66, 0.64, 0.60]).to(a), base)
     colour = base * tone[:, None]
-    # Things on the wall: pictures, doors, windows, each a frame around a tinted noise.
+    # Pictures, doors and windows on the wall, each a frame around tinted noise.
     for _ in range(draw.index(3) + 1):
         door = draw.number(0, 1) < 0.25
         width, height = (0.9, 2.05) if door else (draw.number(0.4, 1.3), draw.number(0.3, 0.9))
@@ -180,7 +180,7 @@ def room_scene(view: View, light: Light, low: Tensor, high: Tensor, generator: t
     bounds = torch.cat([walls, walls.new_tensor([[0.0], [ceiling]])], dim=1)
 
     origin, direction = view.origins.expand_as(view.directions), view.directions
-    # Inside a box a ray leaves through the nearest of the three planes that it runs towards.
+    # A ray leaves a box through the nearest of the three planes ahead of it.
     ahead = torch.where(direction > 0, bounds[1], bounds[0])
     reach = torch.where(direction.abs() > 1e-9, (ahead - origin) / direction, math.inf)
     depth, axis = reach.min(dim=-1)

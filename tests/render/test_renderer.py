@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.body.skeleton import body_height
 from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world
-from tensorsim.render.body import body_height, build_body
+from tensorsim.render.body import build_body
 from tensorsim.render.cast import View, Volumes, cast
 from tensorsim.render.look import Look, Surface, paint
 from tensorsim.render.renderer import (
@@ -185,7 +186,7 @@ def test_body_carries_the_keypoints_of_its_joints() -> None:
     joints = person(frames=3, dtype=torch.float64)
     body = build_body(joints)
     coco = body.keypoints
-    assert body_height(joints) == pytest.approx(1.75, abs=1e-6)
+    assert body_height(joints).tolist() == pytest.approx([1.75] * len(joints), abs=1e-6)
     torch.testing.assert_close(coco[:, 0], joints[:, 0])
     for keypoint, joint in ((5, 5), (6, 2), (9, 7), (10, 4), (11, 11), (12, 8), (15, 13), (16, 10)):
         torch.testing.assert_close(coco[:, keypoint], joints[:, joint])

@@ -1,4 +1,4 @@
-"""RTMDet: people (or the 80 classes of COCO) in images, as one module from pixels to separate boxes."""
+"""RTMDet: detection of people (or the 80 classes of COCO) in images, from pixels to final boxes in one module."""
 
 import os
 from typing import Any
@@ -31,7 +31,7 @@ class RTMDet(nn.Module):
         variant: "nano-person", "small-person", "tiny", "s", "m", "l", "x" (80 classes of COCO, 0 = person) or
             "m-person".
         score_threshold: detections score more than this. None, here and below, is the setting of the
-            published figures: 0.05 for one class, 0.001 for 80. To follow people, 0.3 is usual.
+            published figures: 0.05 for one class, 0.001 for 80. For tracking, 0.3 is usual.
         nms_iou: boxes of a class that overlap more are one object. None: 0.6 for one class, 0.65 for 80.
         max_detections: K, the padded count. None: 100 for one class, 300 for 80.
         nms_pre: candidates kept per level. None: 1000 for one class, 30000 for 80.
@@ -101,7 +101,7 @@ class RTMDet(nn.Module):
         Args:
             source: a published ``.pth``, a ``.safetensors`` of its keys, or an ``.onnx`` exported by mmdeploy; or a
                 name that ``tensorsim models list`` prints, such as ``"rtmdet-m-person"``; None: the shipped weights.
-            variant: None tells it from the shapes in the file.
+            variant: None infers it from the shapes in the file.
             **options: further arguments of the constructor. An ``input_size`` and an ``nms_iou`` that a
                 ``.safetensors`` file states are taken unless given here.
 
@@ -158,7 +158,7 @@ class RTMDet(nn.Module):
         if images.is_floating_point():
             if not is_exporting():
                 low, high = images.detach().aminmax()
-                # Interpolation overshoots a little; 0 to 255 and normalised images are far out. NaN fails.
+                # Interpolation overshoots a little; images from 0 to 255 or normalised exceed this. NaN fails.
                 if not bool((low >= -0.5) & (high <= 1.5)):
                     raise TensorsimError(
                         f"images: got values from {float(low)} to {float(high)}, expected RGB in [0, 1]"
@@ -172,10 +172,10 @@ class RTMDet(nn.Module):
 
     @torch.jit.export
     def dense(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """The network: what it says of every cell of the three levels, strides 8, 16, 32.
+        """The network: dense predictions for every cell of the three levels, strides 8, 16, 32.
 
         Args:
-            x: (B, 3, h, w) normalised BGR as ``preprocess`` makes it; h and w multiples of 32.
+            x: (B, 3, h, w) normalised BGR as ``preprocess`` returns it; h and w multiples of 32.
 
         Returns:
             Per level class logits (B, classes, h / stride, w / stride) and distances (B, 4, ...) in pixels of
@@ -189,7 +189,7 @@ class RTMDet(nn.Module):
 
     @torch.jit.export
     def select(self, logits: list[Tensor], distances: list[Tensor], height: int, width: int) -> Detections:
-        """Decode dense predictions, undo the letterbox of (height, width) images, suppress repetitions."""
+        """Decode dense predictions, undo the letterbox of (height, width) images, suppress duplicates."""
         boxes_of_levels: list[Tensor] = []
         scores_of_levels: list[Tensor] = []
         labels_of_levels: list[Tensor] = []
@@ -205,7 +205,7 @@ class RTMDet(nn.Module):
         side = float(self.input_size)
         boxes = undo_letterbox(torch.cat(boxes_of_levels, 1).clamp(0.0, side), height, width, self.input_size)
         scores, labels = torch.cat(scores_of_levels, 1), torch.cat(labels_of_levels, 1)
-        # Distances may be negative; such boxes are turned inside out.
+        # Distances may be negative; the corners of such boxes are in the wrong order.
         valid = (scores > self.score_threshold) & (boxes[..., :2] < boxes[..., 2:]).all(-1)
 
         index, found = non_maximum_suppression(

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 
 class RTMDetSize(NamedTuple):
-    """What tells the published variants apart.
+    """The numbers that define a variant.
 
     Attributes:
         deepen: factor on the number of blocks.
@@ -39,7 +39,7 @@ RTMDET_SIZES = {
     "nano-person": RTMDetSize(
         0.33, 0.25, 1, exp_on_reg=False, depthwise=True, share_conv=False, input_size=320
     ),
-    # Not among the published ones: as fast to train as nano and of more capacity, for weights of our own.
+    # Not a published one: trains as fast as nano, with more capacity.
     "small-person": RTMDetSize(
         0.167, 0.25, 1, exp_on_reg=True, depthwise=False, share_conv=True, input_size=320
     ),

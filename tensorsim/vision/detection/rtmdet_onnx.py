@@ -1,4 +1,4 @@
-"""RTMDet's weights out of an ONNX file of mmdeploy, whose batch norms are folded into the convolutions."""
+"""RTMDet's weights from an ONNX file of mmdeploy, whose batch norms are folded into the convolutions."""
 
 import os
 from collections.abc import Callable

@@ -1,11 +1,11 @@
-"""Which end of each bone is the nearer one.
+"""Which end of each bone is nearer to the camera.
 
-A bone of known length, seen by one camera, leaves two places for its far joint when its near one is known: in front
-of the plane of the picture and behind it (C. J. Taylor, "Reconstruction of articulated objects from point
-correspondences in a single uncalibrated image", 2000). A body of twelve bones has 4096 poses in every frame that all
-look alike. Over time most of them jerk: where a bone passes through the plane of the picture both of its places meet,
-and the sequence that bends least goes on to the other side. Sequences are found by dynamic programming over pairs of
-frames, exactly, first for the four signs of the trunk (hips, spine, shoulders, head) and then, given it, for the two
+If one joint of a bone of known length is known, one camera leaves two positions for the other: in front of the plane
+parallel to the image and behind it (C. J. Taylor, "Reconstruction of articulated objects from point
+correspondences in a single uncalibrated image", 2000). A body of twelve bones has 4096 poses in every frame with the
+same projection. Over time most of them have large accelerations: where a bone is parallel to the image both positions
+coincide, and the smoothest sequence continues on the other side. Sequences are found by exact dynamic programming over
+pairs of frames, first for the four signs of the trunk (hips, spine, shoulders, head) and then, given it, for the two
 of each arm and leg.
 """
 
@@ -46,7 +46,7 @@ def smoothest_sequence(places: Tensor, cost: Tensor, weight: float) -> Tensor:
 def reach(line: Tensor, start: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
     """Where a line of sight is at a given distance from a point: at ``middle - half`` and ``middle + half``.
 
-    Where it is nowhere that near, both are its nearest place.
+    Where it stays further away, both are its nearest point.
 
     Args:
         line: (..., 3) direction, not necessarily of unit length.
@@ -63,7 +63,7 @@ def reach(line: Tensor, start: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def half_spread(first: Tensor, second: Tensor, middle: Tensor, length: Tensor) -> Tensor:
-    """How much further than ``middle`` the first and nearer the second of two joints is, ``length`` apart.
+    """Half the difference of the distances of two joints that are ``length`` apart, the first being further away.
 
     Args:
         first, second: (..., 3) unit lines of sight.
@@ -80,12 +80,12 @@ def half_spread(first: Tensor, second: Tensor, middle: Tensor, length: Tensor) -
 def unlikely(
     places: Tensor, expected: Tensor, trust: float, spread_m: float, height: Tensor, floor_m: float
 ) -> Tensor:
-    """Cost (N, T, K) of candidates (N, T, K, J): far from what is expected (N, T, J), or below the floor.
+    """Cost (N, T, K) of candidates (N, T, K, J) that are far from the expected (N, T, J), or below the floor.
 
     Args:
         places, expected: distances along lines of sight.
         trust, spread_m: weight and deviation of expected ones, under Cauchy's loss.
-        height: (N, T, J, 2) of joints over their lowest place, at distance 0 and how much more per metre.
+        height: (N, T, J, 2) of joints over where they rest: at distance 0, and its increase per metre.
         floor_m: deviation of joints below it.
     """
     cost = trust * torch.log1p(((places - expected[:, :, None]) / spread_m).square())
@@ -114,7 +114,7 @@ def choose_branches(
         distance: (S, T, 13) from the camera.
         lines: (S, T, 13, 3) unit lines of sight.
         lengths: (S, 8) in metres, in the order of ``tensorsim.vision.lifting.bone_cost.LENGTH_SHARES``.
-        given: (S, T, 13) distances that the lifter gave.
+        given: (S, T, 13) distances of the lifter.
         trust: weight of these.
         spread_m: their deviation about the hips.
         height: (S, T, 13, 2), see :func:`unlikely`.

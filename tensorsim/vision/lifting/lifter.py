@@ -79,7 +79,7 @@ class NearestPoseLifter(nn.Module):
     Each frame takes the ``neighbours`` best matches of
     :class:`~tensorsim.vision.lifting.pose_search.PoseSearch`, weighted by how well they fit and, with
     ``temporal`` > 0, by how well they agree with those of the frames before and after (:func:`smooth_assignment`),
-    so that depths do not flip between frames that look alike. ``neighbours=1`` is the paper's nearest match.
+    so that depths do not flip between similar frames. ``neighbours=1`` is the paper's nearest match.
 
     Args:
         library: (L, 14, 3) poses in any unit of length (x right, y away, z up); None is the shipped pool.
@@ -160,7 +160,7 @@ class NearestPoseLifter(nn.Module):
         with torch.no_grad():
             index = self.search(keypoints.flatten(0, 1), weights.flatten(0, 1))
             index = index.reshape(tracks, frames, self.neighbours)
-            # A few joints fit many poses: such a frame chooses among those of the nearest better one.
+            # Few joints fit many poses: such a frame takes its candidates from the nearest better one.
             known = nearest_valid(seen.gather(1, source) >= self.search_joints)
             index = index.gather(1, known[..., None].expand_as(index))
         poses = self.search.poses(index).to(keypoints.dtype)
@@ -176,7 +176,7 @@ class NearestPoseLifter(nn.Module):
         )
 
     def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:
-        """Weight of each candidate, (S, T, K) summing to one; frames (S, T) not ``placeable`` say nothing."""
+        """Weight of each candidate, (S, T, K) summing to one; only frames (S, T) that are ``placeable`` count."""
         emission = -0.5 / self.tolerance**2 * distance
         if self.temporal == 0.0 or self.neighbours == 1:
             return torch.softmax(emission, dim=-1)
@@ -189,8 +189,8 @@ class NearestPoseLifter(nn.Module):
         product = torch.matmul(a, b.transpose(-1, -2))
         change = a.square().sum(dim=-1)[..., None] + b.square().sum(dim=-1)[:, :, None, :] - 2.0 * product
         transition = -0.5 * self.temporal / self.change**2 * change.clamp(min=0.0)
-        # A frame without a pose of its own has the candidates of its neighbour: it passes them on unchanged, so
-        # that empty frames before, between and after do not count as evidence.
+        # A frame without a pose has the candidates of its neighbour and keeps their probabilities, so that empty
+        # frames do not count as evidence.
         same = torch.eye(self.neighbours, dtype=torch.bool, device=poses.device)
         passed = torch.where(same, 0.0, -1e9).to(transition.dtype)
         alone = placeable[:, :-1] & placeable[:, 1:]

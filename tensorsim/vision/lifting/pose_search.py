@@ -2,7 +2,7 @@
 
 The pool is sorted once into blocks of similar poses. A frame looks only into blocks that the triangle inequality
 does not rule out, there with matrix products in bfloat16 whose rounding error is bounded, and computes in float64
-what the bound leaves over: the answer is that of a full search, whatever the pool.
+what the bound does not exclude: the result equals that of a full search.
 """
 
 import math
@@ -33,7 +33,7 @@ def seen_along_depth(poses: Tensor) -> Tensor:
 
 
 def weighted_cosine(keypoints: Tensor, weights: Tensor, poses: Tensor) -> Tensor:
-    """How well poses fit key points: the cosine between both, weighted and each about its weighted mean.
+    """Agreement of poses with key points: the cosine between both, weighted and each about its weighted mean.
 
     The best scale a > 0 and shift b leave ``sum_j w_j |k_j - a p_j - b|^2 = (1 - cos^2) sum_j w_j |k_j - k|^2``;
     a pose that fits only upside down has a cosine below zero.
@@ -136,13 +136,13 @@ class PoseSearch(nn.Module):
     projections of unit norm, which the paper compares.
 
     1. The angle between a frame and any pose of a block is at least that to the centre of the block less
-       ``asin(sqrt(max w) r / |centre|)``, r the largest distance of the block's poses from it (any angle is
-       possible where that is no sine): centring shortens, and a weighted norm is at most ``sqrt(max w)`` times
-       the plain one. The best poses of the block with the nearest centre say how large the angle may be; blocks
-       beyond are left out.
+       ``asin(sqrt(max w) r / |centre|)``, r the largest distance of the block's poses from it (any angle where
+       the argument exceeds 1): centring shortens, and a weighted norm is at most ``sqrt(max w)`` times
+       the plain one. The best poses of the block with the nearest centre bound the angle; blocks beyond it
+       are skipped.
     2. In the others cosines come from matrix products. With equal weights these are in bfloat16, about the
-       centre of the block: what rounding can change is the product of small numbers, and is bounded by the
-       rounding errors' norms (Cauchy-Schwarz). With other weights they are in float32.
+       centre of the block: the effect of rounding is a product of small numbers, bounded by the
+       norms of the rounding errors (Cauchy-Schwarz). With other weights they are in float32.
     3. Poses whose upper bound reaches the least of the best are compared in float64.
 
     Args:
@@ -208,11 +208,11 @@ class PoseSearch(nn.Module):
         if is_exporting():
             return self._scan(moment, w)
         index = torch.arange(self.neighbours, device=keypoints.device).repeat(keypoints.shape[0], 1)
-        tells = (moment != 0).any(dim=-1)
+        informative = (moment != 0).any(dim=-1)
         equal = (w == w[:, :1]).all(dim=-1)
         tile = min(max(self.chunk // self.block, 1), 512)
         for uniform in (True, False):
-            for rows in torch.nonzero(tells & (equal == uniform))[:, 0].split(tile):
+            for rows in torch.nonzero(informative & (equal == uniform))[:, 0].split(tile):
                 if rows.shape[0] > 0:
                     index[rows] = self._search(keypoints[rows], moment[rows], w[rows], uniform)
         return index
@@ -225,7 +225,7 @@ class PoseSearch(nn.Module):
         slip = torch.where(reach < 1.0, torch.asin(reach.clamp(max=1.0)), math.pi)
         bound = torch.cos((torch.acos(cosine.clamp(-1.0, 1.0)) - slip).clamp(min=0.0))
 
-        # Any poses will do for a lower bound of the best; those of the nearest block make it a good one.
+        # Any poses give a lower bound of the best; those of the nearest block give a tight one.
         home = cosine.argmax(dim=-1)
         guess = torch.zeros((frames, self.neighbours), dtype=torch.int64, device=keypoints.device)
         homes: list[int] = torch.nonzero(torch.bincount(home))[:, 0].tolist()
@@ -293,7 +293,7 @@ class PoseSearch(nn.Module):
         return score, slack
 
     def _scan(self, moment: Tensor, weights: Tensor) -> Tensor:
-        """The search without looking at values, for graphs that cannot: every frame with every pose."""
+        """Full search without data-dependent control flow, for exported graphs: every frame with every pose."""
         best = torch.full((moment.shape[0], self.neighbours), -2.0, dtype=moment.dtype, device=moment.device)
         index = torch.zeros((moment.shape[0], self.neighbours), dtype=torch.int64, device=moment.device)
         for block in range(len(self.starts) - 1):

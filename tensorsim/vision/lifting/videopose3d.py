@@ -48,7 +48,7 @@ class _ConvBN(nn.Module):
 
 
 class _Block(nn.Module):
-    """A wide and a pointwise convolution beside a shortcut, which loses the ends that the wide one loses."""
+    """A wide and a pointwise convolution with a shortcut, which is cropped like the output of the wide one."""
 
     def __init__(self, channels: int, kernel: int, dilation: int, dropout: float) -> None:
         super().__init__()
@@ -91,10 +91,10 @@ class _Head(nn.Module):
 
 
 class VideoPose3D(nn.Module):
-    """(..., T, 17, 2) joints in the picture -> (..., T, 17, 3) joints about the pelvis in metres, Human3.6M order.
+    """(..., T, 17, 2) joints in the image -> (..., T, 17, 3) joints relative to the pelvis in metres, Human3.6M order.
 
-    Coordinates of the picture are pixels from its middle over half its width, u right and v down; those put out are
-    of the camera: x right, y down, z away. Every frame is estimated from ``receptive_field`` frames around it; beyond
+    Image coordinates are pixels from the centre over half the width, u right and v down; the results are in
+    camera axes: x right, y down, z away. Every frame is estimated from ``receptive_field`` frames around it; beyond
     the ends of a track its first and last frame are repeated.
 
     Args:

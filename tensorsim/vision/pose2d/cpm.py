@@ -1,7 +1,7 @@
 """Convolutional pose machine: crops of people to heat maps of the 17 COCO keypoints, refined in six stages.
 
 S.-E. Wei, V. Ramakrishna, T. Kanade, Y. Sheikh, "Convolutional Pose Machines", CVPR 2016. Every stage sees features
-of the image and the maps of the stage before, through kernels so large that it sees the whole body. Layer sizes and
+of the image and the maps of the stage before, with a receptive field that covers the whole body. Layer sizes and
 names are those of MMPose, whose checkpoints load key by key. The original simulator offers it beside HRNet.
 """
 
@@ -32,7 +32,7 @@ class _ConvBN(nn.Module):
 
 
 class _Maps(nn.Module):
-    """A 1x1 convolution that makes the maps."""
+    """A 1x1 convolution to the maps."""
 
     def __init__(self, channels_in: int, maps: int) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class CPM(nn.Module):
     crop: half the resolution of :class:`HRNet`'s maps.
 
     Args:
-        stages: how often the maps are refined, the first guess included.
+        stages: number of stages, the first estimate included.
         input_size: (H, W) of the crops that its weights are meant for; :class:`TopDownPose` crops to it.
 
     Raises:
@@ -125,7 +125,7 @@ class CPM(nn.Module):
 
     @torch.jit.export
     def stages(self, crops: Tensor) -> list[Tensor]:
-        """Heat maps of every stage, each of which is trained to be right."""
+        """Heat maps of every stage; training supervises each of them."""
         layout = "(N, 3, H, W) RGB in [0, 1], H and W multiples of 8"
         check_floating(crops, "CPM crops")
         check_rank(crops, 4, "CPM crops", layout)

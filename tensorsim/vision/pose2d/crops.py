@@ -1,4 +1,4 @@
-"""Crops of people: an upright affine warp of each box, as top-down pose networks expect it, and the way back.
+"""Crops of people: an upright affine warp of each box, as top-down pose networks expect it, and its inverse.
 
 Pixel centres are at integers, in images and in crops. The crop of a box with centre c keeps the aspect ratio
 of the crop size (W, H): the padded box is enlarged along its short side to (s W, s H), and crop pixel x'

@@ -1,4 +1,4 @@
-"""Heat maps to points: the highest pixel of each map, refined below the pixel.
+"""Heat maps to points: the highest pixel of each map, refined to a fraction of a pixel.
 
 Pixel centres are at integers, and pixel (u, v) of a map stands for pixel (4u, 4v) of the crop: a network
 trained on Gaussians drawn at keypoint / 4 is decoded without bias by multiplying with 4.
@@ -27,7 +27,7 @@ def pixel(maps: Tensor, u: Tensor, v: Tensor) -> Tensor:
 def decode_quarter(maps: Tensor) -> tuple[Tensor, Tensor]:
     """Highest pixel, moved a quarter pixel towards its higher neighbour in each direction.
 
-    A direction is left alone at the border: u needs 1 < u < w - 1 and v > 0, v likewise (the gates of
+    A direction is not refined at the border: u needs 1 < u < w - 1 and v > 0, v likewise (as in
     mmpose).
 
     Args:
@@ -45,7 +45,7 @@ def decode_quarter(maps: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
-    """Highest pixel p, moved to the peak of the Gaussian that the map is taken for: p - H^-1 g.
+    """Highest pixel p, moved to the peak of a Gaussian with the local derivatives of the map: p - H^-1 g.
 
     g and H are gradient and Hessian of the log of the smoothed map at p, by central differences (F. Zhang et
     al., "Distribution-Aware Coordinate Representation for Human Pose Estimation", CVPR 2020, eq. 9). The step
@@ -66,7 +66,7 @@ def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
     smooth = maps.reshape(-1, 1, height, width)
     smooth = F.conv2d(smooth, kernel.view(1, 1, -1, 1), padding=[half, 0])
     smooth = F.conv2d(smooth, kernel.view(1, 1, 1, -1), padding=[0, half]).view(maps.shape)
-    # Back to the height it had, which matters to the floor under the logarithm alone.
+    # Back to the original height, which matters only for the lower bound under the logarithm.
     tiny = 1e-10
     smooth = smooth * (score / smooth.amax((-2, -1)).clamp_min(tiny)).unsqueeze(-1).unsqueeze(-1)
     f = smooth.clamp_min(tiny).log()
@@ -88,7 +88,7 @@ def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
 class HeatmapDecoder(nn.Module):
     """Heat maps (..., h, w) to points of the crop, ``uv`` in crop pixels (..., 2), and scores (...).
 
-    A map without a positive value still gives its highest pixel; its score tells.
+    A map without a positive value still gives its highest pixel, with a score that is not positive.
 
     Args:
         method: ``"dark"`` (:func:`decode_dark`, differentiable) or ``"quarter"`` (:func:`decode_quarter`).

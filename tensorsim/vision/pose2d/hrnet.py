@@ -1,7 +1,7 @@
 """HRNet for human pose: crops of people to heat maps of the 17 COCO keypoints.
 
 K. Sun, B. Xiao, D. Liu, J. Wang, "Deep High-Resolution Representation Learning for Human Pose Estimation",
-CVPR 2019. The net keeps a branch at a quarter of the input resolution all the way and adds branches of half
+CVPR 2019. The network keeps a branch at a quarter of the input resolution throughout and adds branches of half
 the resolution and twice the channels; after every group of residual blocks each branch receives the sum of
 all of them. Module names are those of the authors' code, so published checkpoints load key by key.
 """
@@ -27,14 +27,14 @@ _EXPANSION = 4
 
 @dataclass(frozen=True)
 class HRNetConfig:
-    """The numbers that tell one HRNet from another.
+    """The numbers that define an HRNet.
 
     Attributes:
         width: channels C of the branch of highest resolution; branch b has 2^b C.
         blocks: residual blocks of a branch in each exchange module.
         modules: exchange modules of stages 2, 3 and 4 (of 2, 3 and 4 branches).
         bottlenecks: bottleneck blocks of stage 1.
-        planes: inner channels of those; they put out 4 times as many.
+        planes: inner channels of those; their outputs have 4 times as many.
 
     Raises:
         TensorsimError: a number below one, or not three counts of modules.
@@ -105,7 +105,7 @@ class _Bottleneck(nn.Module):
 
 
 def _exchange(source: int, target: int, width: int) -> nn.Module:
-    """What carries branch ``source`` to the resolution and channels of branch ``target``."""
+    """Layers that bring branch ``source`` to the resolution and channels of branch ``target``."""
     channels_in, channels_out = width * 2**source, width * 2**target
     if source == target:
         return nn.Identity()
@@ -171,7 +171,7 @@ class _Stage(nn.ModuleList):
 
 
 class _Transition(nn.ModuleList):
-    """One more branch: made of the last one at half its resolution. The others pass."""
+    """Adds a branch, computed from the last one at half its resolution; the others are unchanged."""
 
     def __init__(self, first: nn.Module, kept: int, channels_in: int, channels_out: int) -> None:
         new = nn.Sequential(*_conv_bn(channels_in, channels_out, 3, stride=2), nn.ReLU())
@@ -262,13 +262,13 @@ class HRNet(nn.Module):
     ) -> "HRNet":
         """Load a ``.pth`` or ``.safetensors`` checkpoint, in evaluation mode.
 
-        The variant is read off the shapes of the tensors; names may be those of the authors' code or of
+        The variant follows from the shapes of the tensors; names may be those of the authors' code or of
         mmpose 0.x and 1.x.
 
         Args:
             source: a path, or a name that ``tensorsim models list`` prints, such as ``"hrnet-w32-coco"``; None: the
                 shipped weights.
-            width: insist on this variant.
+            width: accept this variant only.
             input_size: (H, W) of the crops the weights were trained on. None: as a ``.safetensors`` file states it
                 or a published file has it in its name (``...384x288...``), else (256, 192).
 

@@ -17,14 +17,14 @@ class OnnxHeatmaps(nn.Module):
     maps.
 
     The file's one input must take ImageNet-normalised RGB, N or 1 crops at a time, and its first output must
-    be the heat maps. It is an edge of the graph: it runs on the CPU in float32, gives no gradients, and
-    neither scripts nor exports. Pickles and copies hold the path, and open the file again on use.
+    be the heat maps. It runs on the CPU in float32, has no gradients, and neither scripts nor exports. Pickles and
+    copies hold the path, and open the file again on use.
 
     Args:
         path: the ``.onnx`` file.
 
     Attributes:
-        input_size: (H, W) of the crops it takes; (256, 192) where the file leaves it open.
+        input_size: (H, W) of the crops it takes; (256, 192) where the file does not fix it.
 
     Raises:
         TensorsimError: no ONNX Runtime, a file that it cannot read, inputs or outputs of another layout,
@@ -40,7 +40,7 @@ class OnnxHeatmaps(nn.Module):
         self._session: Any = None
         inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
         shape, maps = inputs[0].shape, outputs[0].shape
-        # Sizes left open come as names or None.
+        # Dynamic sizes are names or None.
         fits = len(inputs) == 1 and len(shape) == 4 and len(maps) == 4
         fits = (
             fits

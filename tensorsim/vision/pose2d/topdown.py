@@ -1,4 +1,4 @@
-"""Top-down pose: boxes of people in images to their COCO-17 keypoints, by way of crops and heat maps."""
+"""Top-down pose estimation: boxes of people in images to COCO-17 keypoints, through crops and heat maps."""
 
 import torch
 from torch import Tensor, nn
@@ -8,7 +8,7 @@ from tensorsim.errors import TensorsimError, check_finite, check_rank, check_siz
 from tensorsim.vision.pose2d.crops import BoxCrop, check_boxes, crop_to_image
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 
-#: For each COCO keypoint, the one that shows at its place in a mirror.
+#: For each COCO keypoint, the one that takes its place in a mirror image.
 MIRRORED = tuple(
     COCO_KEYPOINTS.index(
         name.replace("left", "right") if name.startswith("left") else name.replace("right", "left")
@@ -18,10 +18,10 @@ MIRRORED = tuple(
 
 
 class FlipTest(nn.Module):
-    """A heat-map network asked twice, about the crop and about its mirror image; the answers are averaged.
+    """Flip test: a heat-map network runs on the crop and on its mirror image, and the maps are averaged.
 
-    The mirrored maps are turned back, left and right keypoints change places, and the maps move right by one
-    pixel: crop pixel 4u comes to W - 1 - 4u in the mirror, whose map turned back has it at u - 3/4.
+    The maps of the mirror image are flipped back, left and right keypoints are exchanged, and the maps are shifted
+    right by one pixel: crop pixel 4u is at W - 1 - 4u in the mirror image, whose map flipped back has it at u - 3/4.
 
     Args:
         network: (N, 3, H, W) -> (N, 17, h, w), as :class:`HRNet`.
@@ -51,7 +51,7 @@ class TopDownPose(nn.Module):
         network: :class:`HRNet`, :class:`OnnxHeatmaps` or any module that maps crops (N, 3, H, W), RGB in [0,
             1], to heat maps (N, 17, H/4, W/4), or H/s and W/s if it has a ``stride`` s, as :class:`CPM`.
         decode: ``"dark"`` or ``"quarter"``, see :class:`HeatmapDecoder`.
-        flip_test: average with the mirror image, see :class:`FlipTest`: better, at twice the cost.
+        flip_test: average with the mirror image, see :class:`FlipTest`: more accurate, at twice the cost.
         padding: boxes are enlarged by this factor.
         crop_size: (H, W) of the crops; None takes the ``input_size`` of the network, or (256, 192) if it has
             none.

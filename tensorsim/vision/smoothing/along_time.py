@@ -1,4 +1,4 @@
-"""Filters along the time of tracks: filling gaps, smoothing with outliers, a running low quantile."""
+"""Filters along the time of tracks: gap filling, robust smoothing, running quantiles."""
 
 import torch
 import torch.nn.functional as F
@@ -8,7 +8,7 @@ from torch import Tensor
 def nearest_valid(valid: Tensor) -> Tensor:
     """For every frame the index of the nearest valid one, itself if valid: (..., T) bool -> (..., T) int64.
 
-    Without any valid frame every frame is its own.
+    Without any valid frame each frame gets its own index.
     """
     frames = valid.shape[-1]
     time = torch.arange(frames, device=valid.device).expand(valid.shape)
@@ -36,8 +36,8 @@ def brief_gaps(seen: Tensor, longest: int) -> Tensor:
 def local_linear(x: Tensor, weights: Tensor, sigma: float) -> Tensor:
     """Local linear regression along time with a Gaussian kernel (Fan and Gijbels, 1996, section 3.1).
 
-    Reproduces straight lines exactly, up to the ends, whatever the weights. The kernel is cut at 4 sigma;
-    where it sees no weight at all, the result is the value itself.
+    Reproduces straight lines exactly, up to the ends, for any weights. The kernel is truncated at 4 sigma;
+    where all weights under it are zero, the result is the value itself.
 
     Args:
         x: (..., T) values.
@@ -58,7 +58,7 @@ def local_linear(x: Tensor, weights: Tensor, sigma: float) -> Tensor:
     total = s[:, 0].clamp(min=1e-12)
     where, mean = s[:, 1] / total, t[:, 0] / total  # centres of gravity in time and value
     spread = s[:, 2] / total - where.square()
-    # Ridge: a kernel that sees one frame only has no slope.
+    # Ridge term: with a single frame under the kernel there is no slope.
     slope = (t[:, 1] / total - where * mean) / (spread.clamp(min=0.0) + 1e-6 * sigma**2)
     return torch.where(s[:, 0] > 1e-12, mean - slope * where, flat[:, 0]).reshape(x.shape)
 
@@ -73,19 +73,19 @@ def masked_median(x: Tensor, valid: Tensor) -> Tensor:
 
 
 def robust_smooth(x: Tensor, valid: Tensor, sigma: float, rounds: int = 3) -> Tensor:
-    """Local linear smoothing that outliers do not bend (lowess: Cleveland, 1979, with bisquare weights).
+    """Local linear smoothing, robust against outliers (lowess: Cleveland, 1979, with bisquare weights).
 
     Args:
         x: (..., T) values; those of invalid frames do not matter but must be finite.
         valid: (..., T) bool.
         sigma: standard deviation of the kernel in frames.
-        rounds: how often residuals are weighed anew.
+        rounds: number of reweightings by the residuals.
 
     Returns:
         (..., T), continued over invalid frames. Differentiable.
     """
     x = fill_gaps(x, valid)
-    # A filled gap weighs next to nothing, but is there to be smoothed where a gap is longer than the kernel.
+    # Filled gaps have a small weight, for gaps longer than the kernel.
     base = valid.to(x.dtype) + 1e-4
     smooth = local_linear(x, base, sigma)
     for _ in range(rounds):
@@ -97,7 +97,7 @@ def robust_smooth(x: Tensor, valid: Tensor, sigma: float, rounds: int = 3) -> Te
 
 
 def running_quantile(x: Tensor, window: int, quantile: float) -> Tensor:
-    """Low (or any) quantile of a centred window of frames; the window is cut short at the ends.
+    """Low (or any) quantile of a centred window of frames; the window is shortened at the ends.
 
     Args:
         x: (..., T) values.

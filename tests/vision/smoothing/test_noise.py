@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tensorsim.vision.smoothing.noise import acceleration_density, jitter
+from tensorsim.vision.smoothing.noise import acceleration_density, jitter, keypoint_noise
 
 FPS = 30.0
 
@@ -55,3 +55,11 @@ def test_density_follows_motion_in_time_and_is_least_where_nothing_moves() -> No
         0.3
     ]
     assert acceleration_density(x[:8], valid[:8], x[:8], FPS, 0.13, 0.15, 0.3).unique().tolist() == [0.3]
+
+
+def test_keypoint_noise_by_hand() -> None:
+    scores = torch.tensor([[1.0, 0.5, 0.0], [1.2, 0.25, 0.9]])
+    found = keypoint_noise(scores, torch.tensor([180.0, 17.5]), 1.76)
+    half = 0.5 * 1.76 / 17.5  # far away a pixel is larger than a cell
+    expected = torch.tensor([[0.0171875, 0.034375, 0.0859375], [half, 4 * half, half / 0.9]])
+    torch.testing.assert_close(found, expected[..., None])
