@@ -3,6 +3,7 @@
 from tensorsim.body.skeleton import body_to_coco
 from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion
 from tensorsim.motion.body13 import Body13Scatterers
+from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import People, PeopleConfig
 from tensorsim.motion.resample import PoseResampler
@@ -14,6 +15,7 @@ from tensorsim.motion.walking import boulic_gait
 __all__ = [
     "ActivityGenerator",
     "Body13Scatterers",
+    "BodyScatterers",
     "GeneratedMotion",
     "JointScatterers",
     "LimbScatterers",
