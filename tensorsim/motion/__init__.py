@@ -10,6 +10,8 @@ from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers
 from tensorsim.motion.shadowing import Shadowing
+from tensorsim.motion.sway import PosturalSway
+from tensorsim.motion.vital_signs import VitalSigns
 from tensorsim.motion.walking import boulic_gait
 
 __all__ = [
@@ -22,8 +24,10 @@ __all__ = [
     "People",
     "PeopleConfig",
     "PoseResampler",
+    "PosturalSway",
     "SavitzkyGolay",
     "Shadowing",
+    "VitalSigns",
     "body_to_coco",
     "boulic_gait",
 ]

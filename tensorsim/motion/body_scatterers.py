@@ -10,7 +10,7 @@ from tensorsim.config import JOINTS, Vector
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.motion.limb_scatterers import POINTS, SEGMENTS, TOES, bisector, unit
 from tensorsim.motion.rough_surface import cylinder_rcs, patch_rcs, skin_reflectivity
-from tensorsim.motion.scatterers import check_antenna, check_people, one_scene, weights
+from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
 
 #: The torso is an elliptical cylinder: semi-axes to the right and forward, in body heights, from the neck to this
 #: many lengths of the line to the middle of the hips.
@@ -126,7 +126,6 @@ class BodyScatterers(nn.Module):
         place, normal, width = torso_columns(TORSO_RIGHT * height_m, TORSO_FORWARD * height_m, COLUMNS)
         down = TORSO_LENGTH * (torch.arange(ROWS, dtype=torch.float64) + 0.5) / ROWS
         area = width * TORSO_LENGTH * TRUNK * height_m / ROWS * reflectivity
-        right = {"right_shoulder": 0.5, "right_hip": 0.5, "left_shoulder": -0.5, "left_hip": -0.5}
         buffers = {
             "tx": torch.tensor(tx_m, dtype=torch.float64),
             "rx": torch.tensor(rx_m, dtype=torch.float64),
@@ -134,7 +133,7 @@ class BodyScatterers(nn.Module):
             "limb_axes": end - start,
             "limb_area": 2 * sizes[:, :1] * sizes[:, 2:] * share,
             "limb_cap": math.pi * sizes[:, :1].square() * share,
-            "right": weights(JOINTS, right),
+            "right": weights(JOINTS, RIGHTWARD),
             "trunk": weights(JOINTS, {"neck": 1.0}, {"right_hip": 0.5, "left_hip": 0.5}),
             "knees": weights(JOINTS, {"right_knee": 1.0}, {"left_knee": 1.0}),
             "ankles": weights(JOINTS, {"right_ankle": 1.0}, {"left_ankle": 1.0}),
