@@ -94,6 +94,10 @@ def one_scene(points: Tensor, rcs: Tensor, fade: Tensor) -> tuple[Tensor, Tensor
     return points.transpose(-4, -3).flatten(-3, -2), shown.transpose(-3, -2).flatten(-2)
 
 
+#: Weights of the joints whose sum points to the right of the body.
+RIGHTWARD = {"right_shoulder": 0.5, "right_hip": 0.5, "left_shoulder": -0.5, "left_hip": -0.5}
+
+
 def check_antenna(name: str, position: Vector) -> None:
     """Refuse an antenna position without three finite numbers."""
     if len(position) != 3 or not all(isinstance(v, Real) and math.isfinite(v) for v in position):

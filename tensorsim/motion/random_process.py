@@ -1,0 +1,87 @@
+"""Stationary random motion as a function of time: a sum of sinusoids with the power of a given spectrum.
+
+The value at a time does not depend on the times that are asked for before, so a long clip can be made in pieces.
+Shinozuka and Deodatis, *Simulation of stochastic processes by spectral representation*, Appl. Mech. Rev. 44, 1991.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError, check_floating, check_positive
+
+
+def sinusoids(time_s: Tensor, frequency_hz: Tensor, amplitude: Tensor, phase: Tensor) -> Tensor:
+    """Sum over k of ``amplitude_k cos(2 pi f_k t + phase_k)``.
+
+    Args:
+        time_s: (...) seconds.
+        frequency_hz: (C, K) Hz.
+        amplitude: (K,), shared by the C processes.
+        phase: (C, K) radians.
+
+    Returns:
+        (..., C) in the unit of the amplitude and the dtype of the time.
+    """
+    # Whole turns are taken off in float64: hours of float32 phase would be noise.
+    turns = time_s.double()[..., None, None] * frequency_hz
+    angle = 2 * math.pi * (turns - turns.detach().floor()) + phase
+    return (amplitude * torch.cos(angle)).sum(-1).to(time_s.dtype)
+
+
+class RandomProcess(nn.Module):
+    """Independent Gaussian processes with one power spectrum.
+
+    Args:
+        spectrum: one-sided power density by frequency in Hz, in any unit: only its form counts.
+        band_hz: lowest and highest frequency; the band is cut into cells of equal ratio, and each process has
+            one sinusoid at a random place in every cell.
+        rms: root mean square of each process.
+        copies: how many processes.
+        seed: of frequencies and phases.
+        count: sinusoids of a process.
+
+    Shapes: seconds (...) -> (..., copies). Differentiable.
+
+    Raises:
+        TensorsimError: a band that is not ascending and positive, an rms below 0, counts below 1, a time that is
+            not floating point.
+    """
+
+    frequency_hz: Tensor
+    amplitude: Tensor
+    phase: Tensor
+
+    def __init__(
+        self,
+        spectrum: Callable[[Tensor], Tensor],
+        band_hz: tuple[float, float],
+        rms: float,
+        copies: int,
+        seed: int,
+        count: int = 48,
+    ) -> None:
+        super().__init__()
+        check_positive(band_hz[0], "band_hz")
+        if not band_hz[0] < band_hz[1] < math.inf:
+            raise TensorsimError(f"band_hz: got {band_hz}, expected ascending positive frequencies")
+        if not 0 <= rms < math.inf:
+            raise TensorsimError(f"rms: got {rms}, expected a finite number >= 0")
+        if copies < 1 or count < 1:
+            raise TensorsimError(f"copies, count: got {copies} and {count}, expected at least 1")
+        generator = torch.Generator().manual_seed(seed)
+        edge = torch.logspace(math.log10(band_hz[0]), math.log10(band_hz[1]), count + 1, dtype=torch.float64)
+        width = edge.diff()
+        place = torch.rand(copies, count, generator=generator, dtype=torch.float64)
+        power = spectrum((edge[1:] * edge[:-1]).sqrt()) * width
+        phase = 2 * math.pi * torch.rand(copies, count, generator=generator, dtype=torch.float64)
+        self.register_buffer("frequency_hz", edge[:-1] + place * width, persistent=False)
+        self.register_buffer("amplitude", rms * (2 * power / power.sum()).sqrt(), persistent=False)
+        self.register_buffer("phase", phase, persistent=False)
+
+    def forward(self, time_s: Tensor) -> Tensor:
+        """Seconds (...) to values (..., copies)."""
+        check_floating(time_s, "time_s")
+        return sinusoids(time_s, self.frequency_hz.double(), self.amplitude.double(), self.phase.double())

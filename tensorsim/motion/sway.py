@@ -1,0 +1,86 @@
+"""Postural sway: nobody stands still."""
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.proportions import SHANK, THIGH
+from tensorsim.config import JOINTS
+from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive, check_size
+from tensorsim.motion.random_process import RandomProcess
+from tensorsim.motion.scatterers import RIGHTWARD, weights
+
+#: Height of the centre of mass over the ankles, of a body of 1.75 m; sway is quoted there.
+MASS_HEIGHT_M = (SHANK + THIGH + 0.03) * 1.75
+#: Frequencies of quiet standing in Hz.
+BAND_HZ = (0.03, 4.0)
+#: Above this frequency the power falls with its square.
+CORNER_HZ = 0.3
+
+
+def sway_spectrum(frequency_hz: Tensor) -> Tensor:
+    """Form of the power density of sway: flat at first, with the inverse square from 0.3 Hz on."""
+    return 1 / (1 + (frequency_hz / CORNER_HZ).square())
+
+
+class PosturalSway(nn.Module):
+    """Lets bodies sway over their ankles, each person like an inverted pendulum of its own.
+
+    A joint moves horizontally in proportion to its height over the lower ankle: standing bodies sway, lying ones do
+    not. Forward and sideways sway are independent. Root mean squares of the centre of mass of young adults with open
+    eyes are 3 to 6 mm forward and 2 to 4 mm sideways (Prieto et al., *Measures of postural steadiness*, IEEE Trans.
+    Biomed. Eng. 43, 1996); above about 0.3 Hz the power falls with the square of the frequency, as that of a random
+    walk (Collins and De Luca, *Open-loop and closed-loop control of posture*, Exp. Brain Res. 95, 1993).
+
+    Sway is a function of time alone: pieces of a clip give what the whole clip gives.
+
+    Args:
+        rate_hz: rate of the joints, video's or the pulses'.
+        forward_rms_m, sideways_rms_m: at the height of the centre of mass, 0.91 m over the ankles.
+        people: persons with a sway of their own; person p has that of ``p % people``.
+        seed: of the sway.
+
+    Shapes: joints (..., P, T, 14, 3) metres -> likewise. Differentiable.
+
+    Raises:
+        TensorsimError: a rate that is not positive, an rms below 0, ``people`` below 1, joints of another shape.
+    """
+
+    right: Tensor
+
+    def __init__(
+        self,
+        rate_hz: float,
+        forward_rms_m: float = 0.005,
+        sideways_rms_m: float = 0.003,
+        people: int = 8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        check_positive(rate_hz, "rate_hz")
+        if people < 1:
+            raise TensorsimError(f"people: got {people}, expected at least 1")
+        self.rate_hz, self.people, self.mass_height_m = float(rate_hz), people, MASS_HEIGHT_M
+        self.forwards = RandomProcess(sway_spectrum, BAND_HZ, forward_rms_m, people, 2 * seed)
+        self.sideways = RandomProcess(sway_spectrum, BAND_HZ, sideways_rms_m, people, 2 * seed + 1)
+        self.register_buffer("right", weights(JOINTS, RIGHTWARD), persistent=False)
+
+    def forward(self, joints: Tensor, start: int = 0) -> Tensor:
+        """Joints of frames ``start`` onwards, swaying; frame k is at ``k / rate_hz``."""
+        layout = "(..., P, T, 14, 3)"
+        check_floating(joints, "joints")
+        check_min_rank(joints, 4, "joints", layout)
+        check_size(joints, -1, 3, "joints", layout)
+        check_size(joints, -2, 14, "joints", layout)
+        persons, frames = joints.shape[-4], joints.shape[-3]
+        time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / self.rate_hz
+        who = torch.arange(persons, device=joints.device) % self.people
+        along = self.forwards(time_s)[:, who].T.to(joints.dtype)[..., None, None]  # (P, T, 1, 1)
+        aside = self.sideways(time_s)[:, who].T.to(joints.dtype)[..., None, None]
+
+        across = (self.right.to(joints.dtype) @ joints)[..., :2]
+        across = across / across.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+        ahead = torch.stack((-across[..., 1], across[..., 0]), -1)  # a quarter turn to the left of right
+        floor = torch.minimum(joints[..., 10, 2], joints[..., 13, 2])  # literals: ankles, for TorchScript
+        lever = (joints[..., 2:] - floor[..., None, None]).clamp_min(0.0) / self.mass_height_m
+        shift = lever * (along * ahead + aside * across)
+        return joints + torch.cat((shift, torch.zeros_like(lever)), -1)
