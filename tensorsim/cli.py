@@ -11,6 +11,7 @@ import tyro
 from tensorsim import process
 from tensorsim.commands.check import Check
 from tensorsim.commands.demo import Demo
+from tensorsim.commands.evaluate_camera import EvaluateCamera
 from tensorsim.commands.evaluate_classifier import EvaluateClassifier
 from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
 from tensorsim.commands.evaluate_detector import EvaluateDetector
@@ -53,6 +54,7 @@ COMMANDS: dict[str, Any] = {
             "detector": EvaluateDetector,
             "pose": EvaluatePose,
             "films": EvaluateFilms,
+            "camera": EvaluateCamera,
             "denoiser": EvaluateDenoiser,
             "classifier": EvaluateClassifier,
         },

@@ -1,6 +1,7 @@
 """Frames -> metric 3D joints at video rate."""
 
 from tensorsim.body.skeleton import coco_to_body
+from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
@@ -16,6 +17,8 @@ from tensorsim.vision.tracking.tracker import GNNTracker
 __all__ = [
     "CPM",
     "BoneFit",
+    "CameraCalibrator",
+    "CameraEstimate",
     "GNNTracker",
     "HRNet",
     "KalmanSmoother",

@@ -1,0 +1,75 @@
+"""``tensorsim evaluate camera``: how well the camera is told from people who walk."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tensorsim.commands.options import check_seed
+from tensorsim.errors import TensorsimError
+
+if TYPE_CHECKING:
+    from tensorsim.evaluation.camera import CameraErrors
+
+
+@dataclass(frozen=True)
+class EvaluateCamera:
+    """Estimate cameras that are known from generated walks, and print the errors of tilt, field of view and range.
+
+    One row per tilt and height, over all fields of view; cameras that do not have the walk in the picture are left
+    out.
+    """
+
+    tilts: tuple[float, ...] = (0.0, 12.0, 24.0, 35.0)
+    """Degrees below level."""
+    heights: tuple[float, ...] = (0.8, 1.5, 3.0)
+    """Metres above the floor."""
+    fovs: tuple[float, ...] = (40.0, 60.0, 90.0)
+    """Horizontal fields of view in degrees."""
+    noise: float = 2.0
+    """Standard deviation of the key points in pixels, in pictures of 640 x 480."""
+    turn: float = 80.0
+    """Angle in degrees by which people turn after half the time; 0 for straight walks."""
+    known_height: bool = True
+    """The height of the person is known; otherwise 1.70 m is assumed."""
+    seed: int = 0
+    """Of people and paths."""
+
+    def run(self) -> None:
+        """Do it."""
+        check_seed(self.seed)
+        if not (self.tilts and self.heights and self.fovs):
+            raise TensorsimError(
+                "evaluate camera: got no tilt, height or field of view, expected at least one each"
+            )
+
+        from tensorsim.evaluation import camera as cameras
+
+        print("| tilt | height | cameras | tilt error | field of view error | range error |")
+        print("| ---: | ---: | ---: | ---: | ---: | ---: |")
+        found: list[CameraErrors] = []
+        seed = self.seed
+        for tilt in self.tilts:
+            for height in self.heights:
+                row = []
+                for fov in self.fovs:
+                    seed += 1
+                    camera = cameras.known_camera(tilt, height, fov)
+                    walk = cameras.walk_before(camera, seed, self.turn)
+                    if walk.seen >= cameras.LEAST_SEEN:
+                        told = cameras.estimate(walk, self.noise, self.known_height, seed)
+                        row.append(cameras.errors_of(told, camera, walk))
+                if row:
+                    print(f"| {tilt:.0f} | {height:.1f} m | {len(row)} | {self._worst(row)} |", flush=True)
+                found += row
+        if not found:
+            raise TensorsimError("evaluate camera: got no camera that has a walk in its picture")
+        tilts = sum(abs(one.pitch_deg) <= 2 for one in found)
+        ranges = sum(abs(one.range) <= 0.07 for one in found)
+        print(f"tilt within 2 degrees: {tilts} of {len(found)}; range within 7 %: {ranges} of {len(found)}")
+
+    @staticmethod
+    def _worst(row: "list[CameraErrors]") -> str:
+        """The largest errors of a row."""
+        pitch = max(abs(one.pitch_deg) for one in row)
+        fov = max(abs(one.fov_deg) for one in row)
+        far = max(abs(one.range) for one in row)
+        return f"{pitch:.1f} deg | {fov:.0f} deg | {100 * far:.0f} %"

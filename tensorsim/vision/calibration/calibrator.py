@@ -1,0 +1,216 @@
+"""The camera of a film, from the people who stand and walk in it."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+    check_size,
+)
+from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
+from tensorsim.vision.calibration.upright import (
+    LEAN,
+    PACE,
+    PACE_SPREAD,
+    STANDING,
+    WALKING,
+    ends_of_body,
+    is_upright,
+    walking_share,
+)
+from tensorsim.vision.smoothing.along_time import local_linear
+
+
+class CameraEstimate(NamedTuple):
+    """What the people of clips tell of their camera; standard deviations say how well.
+
+    Attributes:
+        pitch_rad: (...) upward tilt of the optical axis.
+        roll_rad: (...) about it, positive = clockwise as the camera sees it.
+        height_m: (...) above the floor.
+        horizontal_fov_rad: (...) field of view.
+        pitch_sd_rad, roll_sd_rad, height_sd_m, horizontal_fov_sd_rad: (...) standard deviations.
+        frames: (...) int64 frames of upright people that it rests on; with 0 it is what is assumed beforehand.
+    """
+
+    pitch_rad: Tensor
+    roll_rad: Tensor
+    height_m: Tensor
+    horizontal_fov_rad: Tensor
+    pitch_sd_rad: Tensor
+    roll_sd_rad: Tensor
+    height_sd_m: Tensor
+    horizontal_fov_sd_rad: Tensor
+    frames: Tensor
+
+
+class CameraCalibrator(nn.Module):
+    """Tilt, roll, height and field of view of a still camera from people who stand and walk in its picture.
+
+    People are upright bodies of known or typical height on a level floor (see
+    :mod:`tensorsim.vision.calibration.camera_fit`). Where they tell little, the estimate stays near what is assumed
+    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 +- 0.7 m, field of view 60 +- 15 degrees); somebody who
+    walks through the scene tells everything. The height of the camera goes with that of the people.
+
+    Args:
+        person_height_m: standing heights by order of person; the last one serves all further people.
+        height_sd_m: standard deviation of these heights: 0.08 m for people of unknown height, less for known ones.
+        keypoint_threshold: score from which a key point counts as seen.
+        most_frames: of each person that are used, evenly spread.
+
+    Shape:
+        keypoints (..., P, T, 17, 2) pixels, scores (..., P, T, 17), valid (..., P, T) bool, image height and width in
+        pixels, frames per second -> :class:`CameraEstimate` of shape (...). Computed in float64 without gradients.
+
+    Raises:
+        TensorsimError: heights that are not positive, wrong shapes, NaN.
+    """
+
+    stature: Tensor
+    starts: Tensor
+    mean: Tensor
+    deviation: Tensor
+    standing: Tensor
+    walking: Tensor
+
+    def __init__(
+        self,
+        person_height_m: tuple[float, ...] = (1.70,),
+        height_sd_m: float = 0.08,
+        keypoint_threshold: float = 0.3,
+        most_frames: int = 120,
+    ) -> None:
+        super().__init__()
+        if len(person_height_m) == 0:
+            raise TensorsimError("CameraCalibrator.person_height_m: got no values, expected at least one")
+        for value in person_height_m:
+            check_positive(value, "CameraCalibrator.person_height_m")
+        check_positive(height_sd_m, "CameraCalibrator.height_sd_m")
+        check_positive(keypoint_threshold, "CameraCalibrator.keypoint_threshold")
+        if most_frames < 1:
+            raise TensorsimError(f"CameraCalibrator.most_frames: got {most_frames}, expected at least 1")
+        self.height_sd_m = height_sd_m
+        self.keypoint_threshold = keypoint_threshold
+        self.most_frames = most_frames
+        degree = math.pi / 180
+        self.lean, self.pace, self.pace_spread = LEAN, PACE, PACE_SPREAD
+        self.correlation_s = 0.4  # after which the errors of a body are no longer those of before
+        self.smoothing_s = 0.15
+        mean = [0.0, 0.0, 1.5, 60 * degree]
+        deviation = [20 * degree, 3 * degree, 0.7, 20 * degree]
+        self.register_buffer("standing", torch.tensor(STANDING, dtype=torch.float64), persistent=False)
+        self.register_buffer("walking", torch.tensor(WALKING, dtype=torch.float64), persistent=False)
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float64), persistent=False)
+        self.register_buffer("deviation", torch.tensor(deviation, dtype=torch.float64), persistent=False)
+        self.register_buffer("stature", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
+        starts = [
+            [pitch * degree, 0.0, 1.5, fov * degree] for pitch in (0, -12, -25, -40) for fov in (45, 60, 80)
+        ]
+        self.register_buffer("starts", torch.tensor(starts, dtype=torch.float64), persistent=False)
+
+    def forward(
+        self,
+        keypoints: Tensor,
+        scores: Tensor,
+        valid: Tensor,
+        image_height: int,
+        image_width: int,
+        fps: float,
+    ) -> CameraEstimate:
+        """Key points, scores, valid, image size, frame rate -> the cameras of the clips."""
+        layout = "(..., P, T, 17, 2) key points in pixels"
+        check_floating(keypoints, "keypoints")
+        check_min_rank(keypoints, 4, "keypoints", layout)
+        check_size(keypoints, -2, 17, "keypoints", layout)
+        check_size(keypoints, -1, 2, "keypoints", layout)
+        if list(scores.shape) != list(keypoints.shape[:-1]):
+            raise TensorsimError(
+                f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}"
+            )
+        if list(valid.shape) != list(keypoints.shape[:-2]) or valid.dtype != torch.bool:
+            raise TensorsimError(
+                f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(keypoints.shape[:-2])}"
+            )
+        check_finite(keypoints, "keypoints")
+        check_finite(scores, "scores")
+        if image_height < 1 or image_width < 1:
+            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        check_positive(fps, "fps")
+        shape = keypoints.shape[:-4]
+        people, frames = keypoints.shape[-4], keypoints.shape[-3]
+        clips = valid[..., 0, 0].numel() if people * frames > 0 else 0
+        found: list[Tensor] = []
+        with torch.no_grad():
+            for clip in range(clips):
+                found.append(
+                    self._fit(
+                        keypoints.reshape(-1, people, frames, 17, 2)[clip].double(),
+                        scores.reshape(-1, people, frames, 17)[clip].double(),
+                        valid.reshape(-1, people, frames)[clip],
+                        image_height,
+                        image_width,
+                        fps,
+                    )
+                )
+        if clips == 0:
+            table = torch.cat([self.mean, self.deviation, self.mean.new_zeros(1)])
+            table = table.expand(list(shape) + [9])  # noqa: RUF005  # TorchScript has no stars
+        else:
+            table = torch.stack(found).reshape(list(shape) + [9])  # noqa: RUF005
+        columns = table[..., :8].to(keypoints.dtype)
+        return CameraEstimate(
+            columns[..., 0], columns[..., 1], columns[..., 2], columns[..., 3],
+            columns[..., 4], columns[..., 5], columns[..., 6], columns[..., 7],
+            table[..., 8].long(),
+        )  # fmt: skip
+
+    def _fit(
+        self, keypoints: Tensor, scores: Tensor, valid: Tensor, height: int, width: int, fps: float
+    ) -> Tensor:
+        """Means, deviations and number of frames (9,) of the camera of one clip of key points (P, T, 17, 2)."""
+        people, frames = valid.shape[0], valid.shape[1]
+        upright = is_upright(keypoints, scores, self.keypoint_threshold) & valid
+        count = upright.sum().reshape(1).double()
+        walking = walking_share(keypoints, upright, fps)
+        ends = ends_of_body(keypoints)
+        sigma = self.smoothing_s * fps
+        weights = upright.double()
+        smooth: list[Tensor] = []
+        for end in range(2):
+            for axis in range(2):
+                smooth.append(local_linear(ends[:, :, end, axis], weights, sigma))
+        ends = torch.stack(smooth, dim=-1).unflatten(-1, [2, 2])
+        every = -(-frames // self.most_frames)
+        ends, upright, walking = ends[:, ::every], upright[:, ::every], walking[:, ::every]
+
+        stature = self.stature[torch.arange(people, device=valid.device).clamp(max=self.stature.shape[0] - 1)]
+        middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64, device=valid.device)
+        image = torch.where(upright[..., None, None], (ends - middle) / (width / 2), 0.1)
+        size = torch.linalg.vector_norm(image[..., 0, :] - image[..., 1, :], dim=-1)
+        bodies = Bodies(
+            image,
+            upright,
+            stature[:, None, None] * (self.standing + walking[..., None] * (self.walking - self.standing)),
+            walking,
+            self.lean * stature,
+            ((0.02 * size).square() + (2.0 / (width / 2)) ** 2).sqrt(),
+        )
+        nothing = torch.zeros(people, dtype=torch.float64, device=valid.device)
+        pace = (self.pace * stature).log()
+        mean = torch.cat([self.mean, nothing, pace])
+        deviation = torch.cat([self.deviation, self.height_sd_m / stature, nothing + self.pace_spread])
+        rest = torch.cat([nothing, pace]).expand(self.starts.shape[0], -1)
+        independent = min(every / (self.correlation_s * fps), 1.0)
+        at, covariance, cost = fit_camera(
+            torch.cat([self.starts, rest], dim=-1), mean, deviation, bodies, fps / every, independent
+        )
+        best = int(cost.argmin())
+        sd = torch.diagonal(covariance[best])[:4].sqrt()
+        return torch.cat([at[best, :4], sd, count])

@@ -1,0 +1,141 @@
+"""The camera is told from people who walk, stays as assumed where nothing tells, and knows how well it is told."""
+
+import math
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.evaluation.camera import (
+    FPS,
+    HEIGHT,
+    WIDTH,
+    errors_of,
+    estimate,
+    known_camera,
+    walk_before,
+)
+from tensorsim.vision.calibration.calibrator import CameraCalibrator
+from tensorsim.vision.calibration.camera_fit import camera_axes, place_upright
+from tensorsim.vision.calibration.upright import is_upright
+from tests.film import STANDING
+from tests.stage import StageTester
+
+
+def standing(feet_v: float, size_px: float) -> Tensor:
+    """COCO key points (17, 2) of a body that stands in the middle of the picture, seen from the front."""
+    points = torch.tensor(STANDING, dtype=torch.float64)
+    u = (WIDTH - 1) / 2 + size_px * points[:, 0]
+    return torch.stack([u, feet_v + size_px * (points[:, 1] - 0.96)], dim=-1)
+
+
+class TestCameraCalibrator(StageTester):
+    gradient_arguments: ClassVar[tuple[int, ...]] = ()  # an estimate, not a stage to train through
+    batched_arguments: ClassVar[tuple[int, ...]] = (0, 1, 2)
+    exports: ClassVar[bool] = False  # picks the best of several fits by value
+
+    def make(self) -> nn.Module:
+        return CameraCalibrator(most_frames=10)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        time = torch.arange(20)
+        body = torch.stack([standing(380.0 + 2 * float(t), 200.0 + 2 * float(t)) for t in time]).to(dtype)
+        noise = torch.randn(*batch, 1, 20, 17, 2, generator=torch.Generator().manual_seed(0), dtype=dtype)
+        keypoints = body + noise
+        valid = torch.ones(*batch, 1, 20, dtype=torch.bool)
+        return keypoints, torch.ones(*batch, 1, 20, 17, dtype=dtype), valid, HEIGHT, WIDTH, FPS
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        keypoints, scores, valid, *rest = self.inputs((1,), torch.float32)
+        return [
+            ((keypoints[..., 0], scores, valid, *rest), "keypoints"),
+            ((keypoints, scores[..., :3], valid, *rest), "scores: got shape"),
+            ((keypoints, scores, valid[..., :3], *rest), "valid: got"),
+            ((keypoints * math.nan, scores, valid, *rest), "keypoints"),
+            ((keypoints, scores, valid, 0, *rest[1:]), "image: got 0 x"),
+            ((keypoints, scores, valid, *rest[:2], 0.0), "fps"),
+        ]
+
+
+@pytest.mark.parametrize(
+    ("tilt", "height", "fov"), [(0.0, 0.8, 60.0), (12.0, 1.5, 60.0), (24.0, 3.0, 40.0), (35.0, 3.0, 90.0)]
+)
+def test_somebody_who_walks_tells_the_camera(tilt: float, height: float, fov: float) -> None:
+    camera = known_camera(tilt, height, fov)
+    walk = walk_before(camera, seed=1)
+    assert walk.seen > 0.5
+    found = estimate(walk, noise_px=2.0, known_height=True)
+    errors = errors_of(found, camera, walk)
+    assert abs(errors.pitch_deg) < 2.0
+    assert abs(errors.range) < 0.12
+    assert abs(errors.fov_deg) < 8.0
+    assert abs(errors.pitch_deg) < 4 * math.degrees(float(found.pitch_sd_rad)) + 0.3
+    assert abs(float(found.roll_rad)) < math.radians(2.0)
+    assert int(found.frames) > 100
+
+
+def test_nobody_tells_nothing() -> None:
+    calibrator = CameraCalibrator(most_frames=10)
+    args = TestCameraCalibrator().inputs((), torch.float64)
+    lying = args[0].flip(-1)
+    for keypoints, valid in ((args[0], torch.zeros_like(args[2])), (lying, args[2])):
+        found = calibrator(keypoints, args[1], valid, *args[3:])
+        assert int(found.frames) == 0
+        assert float(found.pitch_rad) == pytest.approx(0.0, abs=1e-6)
+        assert float(found.horizontal_fov_rad) == pytest.approx(math.pi / 3, abs=1e-6)
+        assert float(found.height_m) == pytest.approx(1.5, abs=1e-6)
+        assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0), rel=1e-3)
+    found = calibrator(args[0][:0], args[1][:0], args[2][:0], *args[3:])
+    assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0))
+
+
+def test_a_roll_is_found() -> None:
+    """Everybody leans to the left of a camera that is turned clockwise."""
+    camera = known_camera(12.0, 1.5, 60.0)
+    walk = walk_before(camera, seed=1)
+    roll = math.radians(4.0)
+    c, s = math.cos(roll), math.sin(roll)
+    middle = torch.tensor([(WIDTH - 1) / 2, (HEIGHT - 1) / 2], dtype=torch.float64)
+    turned = (walk.keypoints - middle) @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64) + middle
+    head, feet = turned[:, 0].mean(dim=0), turned[:, 15:].mean(dim=(0, 1))
+    assert head[0] < feet[0]
+    found = estimate(walk._replace(keypoints=turned), noise_px=0.0, known_height=True)
+    assert float(found.roll_rad) == pytest.approx(roll, abs=math.radians(1.5))
+
+
+def test_bodies_are_placed_where_they_stand() -> None:
+    """Against the projection of points written out."""
+    pitch, height, focal = torch.tensor(-0.3, dtype=torch.float64), 2.0, 1.7
+    x, y, z = 0.6, 4.0, (0.1, 1.4)
+    image = []
+    for above in z:
+        forward = y * math.cos(-0.3) + (above - height) * math.sin(-0.3)
+        down = y * math.sin(-0.3) - (above - height) * math.cos(-0.3)
+        image.append([focal * x / forward, focal * down / forward])
+    points = torch.tensor(image, dtype=torch.float64)[None, None]
+    spot, seen = place_upright(
+        camera_axes(pitch, torch.zeros_like(pitch)),
+        torch.tensor(height, dtype=torch.float64),
+        torch.tensor(focal, dtype=torch.float64),
+        points,
+        torch.tensor([[z]], dtype=torch.float64),
+        torch.zeros_like(points),
+    )
+    torch.testing.assert_close(spot[0, 0], torch.tensor([x, y], dtype=torch.float64))
+    torch.testing.assert_close(seen, points)
+
+
+def test_upright_is_upright() -> None:
+    body = standing(400.0, 200.0)
+    seen = torch.ones(17)
+    assert bool(is_upright(body, seen, 0.3))
+    assert not bool(is_upright(body.flip(-1), seen, 0.3)), "lying"
+    assert not bool(is_upright(body * torch.tensor([1.0, -1.0]), seen, 0.3)), "head down"
+    sitting = body.clone()
+    sitting[13:17, 1] -= 0.2 * 200
+    sitting[13:15, 0] += 60
+    assert not bool(is_upright(sitting, seen, 0.3))
+    hidden = seen.clone()
+    hidden[15] = 0.1
+    assert not bool(is_upright(body, hidden, 0.3))
