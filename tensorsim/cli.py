@@ -13,6 +13,7 @@ from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_classifier import EvaluateClassifier
 from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
 from tensorsim.commands.evaluate_detector import EvaluateDetector
+from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
 from tensorsim.commands.library import BuildLibrary
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Any] = {
             "pose": EvaluatePose,
             "denoiser": EvaluateDenoiser,
             "classifier": EvaluateClassifier,
+            "measured": EvaluateMeasured,
         },
     ),
     "train": (

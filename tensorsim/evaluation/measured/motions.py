@@ -9,8 +9,8 @@ from torch import Tensor
 
 from tensorsim.body.kinematics import rotation
 from tensorsim.body.skeleton import mirror
-from tensorsim.motion.activities import perform
 from tensorsim.motion.act import Act
+from tensorsim.motion.activities import perform
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature
 
@@ -73,7 +73,9 @@ def add_unrest(joints: Tensor, draw: Draw, unrest: Unrest) -> Tensor:
     return joints + height * sway[:, :, None] + lively * share * limbs
 
 
-def stage_people(count: int, draw: Draw, config: PeopleConfig, speed_m_s: tuple[float, float] | None) -> People:
+def stage_people(
+    count: int, draw: Draw, config: PeopleConfig, speed_m_s: tuple[float, float] | None
+) -> People:
     """Draw people; speeds beyond those of ``PeopleConfig`` by ``speed_m_s``."""
     people = draw_people(count, config, draw.generator)
     if speed_m_s is not None:

@@ -50,9 +50,7 @@ class ContinuousWaveEcho(nn.Module):
     rx: Tensor
     precision: Tensor
 
-    def __init__(
-        self, carrier_hz: float, tx_m: Vector, rx_m: Vector, antenna_gain_dbi: float = 0.0
-    ) -> None:
+    def __init__(self, carrier_hz: float, tx_m: Vector, rx_m: Vector, antenna_gain_dbi: float = 0.0) -> None:
         super().__init__()
         check_positive(carrier_hz, "carrier_hz")
         check_antenna("tx_m", tx_m)

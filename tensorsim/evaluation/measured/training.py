@@ -1,4 +1,4 @@
-"""The small network of the measured sets, and how it is trained on pictures that fit the memory."""
+"""Training of a small network on pictures that fit the memory."""
 
 from collections.abc import Callable
 
@@ -10,37 +10,16 @@ from torch import Tensor, nn
 Augment = Callable[[Tensor, torch.Generator], Tensor]
 
 
-class PictureNet(nn.Module):
-    """Four convolutions, then mean and maximum along time; what happens when in a clip matters little.
+def shift(shown: Tensor, most: int, dim: int, generator: torch.Generator) -> Tensor:
+    """Pictures (B, C, H, W), each turned along ``dim`` by up to ``most`` cells either way."""
+    by = torch.randint(-most, most + 1, (shown.shape[0],), generator=generator)
+    return torch.stack([torch.roll(picture, int(k), dim) for picture, k in zip(shown, by, strict=True)])
 
-    Args:
-        classes: number of classes.
-        rows: height of the pictures.
-        channels: of the input.
-        width: channels of the first convolution; the last has four times as many.
 
-    Shapes: pictures (B, channels, rows, columns), any number of columns from 8 on -> logits (B, classes).
-    """
-
-    def __init__(self, classes: int, rows: int, channels: int = 1, width: int = 16) -> None:
-        super().__init__()
-        sizes = (channels, width, 2 * width, 3 * width, 4 * width)
-        layers: list[nn.Module] = []
-        for i, (before, after) in enumerate(zip(sizes, sizes[1:], strict=False)):
-            layers += [nn.Conv2d(before, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU()]
-            if i < 3:
-                layers.append(nn.MaxPool2d(2))
-                rows //= 2
-        self.features = nn.Sequential(*layers)
-        self.drop = nn.Dropout(0.3)
-        self.head = nn.Linear(2 * sizes[-1] * rows, classes)
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        """Pictures (B, C, H, W) to logits (B, classes)."""
-        maps = self.features(pictures)
-        both = torch.cat([maps.mean(-1), maps.amax(-1)], dim=1).flatten(1)
-        logits: Tensor = self.head(self.drop(both))
-        return logits
+def drop_cells(shown: Tensor, most: float, generator: torch.Generator) -> Tensor:
+    """Pictures (B, C, H, W), each without a random share, up to ``most``, of its cells."""
+    share = most * torch.rand(shown.shape[0], 1, 1, 1, generator=generator)
+    return shown * (torch.rand(shown.shape, generator=generator) >= share)
 
 
 def fit_pictures(
