@@ -27,8 +27,8 @@ class EvaluateMeasured:
     """Which sets; default all that both folders have."""
     clips: int = 300
     """Simulated clips of each class."""
-    epochs: int = 15
-    """Passes over the simulated clips."""
+    steps: int = 600
+    """Batches of 64 of each training."""
     seed: int = 0
     """Of simulation and training."""
     quiet: bool = False
@@ -37,7 +37,7 @@ class EvaluateMeasured:
     def run(self) -> None:
         """Do it."""
         check_seed(self.seed)
-        for name, count in (("--clips", self.clips), ("--epochs", self.epochs)):
+        for name, count in (("--clips", self.clips), ("--steps", self.steps)):
             if count < 1:
                 raise TensorsimError(f"{name}: got {count}, expected at least 1")
         if self.out.exists() and not self.out.is_dir():
@@ -58,7 +58,7 @@ class EvaluateMeasured:
         results, errors = {}, {}
         for measured in chosen:
             experiment = Experiment(
-                measured, self.train, self.test, self.out, self.clips, self.epochs, self.seed, self.quiet
+                measured, self.train, self.test, self.out, self.clips, self.steps, self.seed, self.quiet
             )
             logits = experiment.quick() if self.quick else experiment.full()
             results[measured.name] = figures(measured, logits, experiment.test_labels)

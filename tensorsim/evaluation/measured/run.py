@@ -53,7 +53,7 @@ class Experiment:
         train, test: folders of measured sets.
         out: where the weights trained on simulation alone go.
         clips: simulated clips of each class.
-        epochs: passes over the simulated clips.
+        steps: batches of 64 of the training on simulation; the others are shorter or as long.
         seed: of simulation and training.
         quiet: no progress bar.
     """
@@ -65,12 +65,12 @@ class Experiment:
         test: Path,
         out: Path,
         clips: int = 300,
-        epochs: int = 15,
+        steps: int = 600,
         seed: int = 0,
         quiet: bool = False,
     ) -> None:
         self.measured, self.out = measured, out
-        self.clips, self.epochs, self.seed, self.quiet = clips, epochs, seed, quiet
+        self.clips, self.steps, self.seed, self.quiet = clips, steps, seed, quiet
         self.train, self.train_labels = measured.load(train)
         self.test, self.test_labels = measured.load(test)
 
@@ -82,7 +82,7 @@ class Experiment:
     def full(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips in each of ``SETTINGS``."""
         simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet)
-        net = self._fit(self._new(), simulated, labels, self.epochs)
+        net = self._fit(self._new(), simulated, labels, self.steps)
         path = self.out / f"{self.measured.weights.replace('-', '_')}.safetensors"
         save_weights(
             net, path, {"trained_on": "simulation alone", "classes": ",".join(self.measured.classes)}
@@ -91,9 +91,9 @@ class Experiment:
         shots = self.train[chosen], self.train_labels[chosen]
         nets = {
             "simulation_only": net,
-            "ten_shot": self._joined(net, simulated, labels, *shots),
-            "ten_shot_alone": self._fit(self._new(), *shots, max(1, 300 * 64 // len(chosen))),
-            "all": self._joined(net, simulated, labels, self.train, self.train_labels),
+            "ten_shot": self._joined(net, simulated, labels, *shots, self.steps // 2),
+            "ten_shot_alone": self._fit(self._new(), *shots, self.steps // 2),
+            "all": self._joined(net, simulated, labels, self.train, self.train_labels, self.steps),
         }
         logits = {name: predict(trained, self.test) for name, trained in nets.items()}
         logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
@@ -103,21 +103,25 @@ class Experiment:
         torch.manual_seed(self.seed)
         return PictureNet(len(self.measured.classes), self.train.shape[-2])
 
-    def _fit(self, net: PictureNet, shown: Tensor, labels: Tensor, epochs: int) -> PictureNet:
-        fit_pictures(net, shown, labels, epochs=epochs, augment=self.measured.augment, seed=self.seed)
+    def _fit(self, net: PictureNet, shown: Tensor, labels: Tensor, steps: int) -> PictureNet:
+        fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=self.seed)
         return net
 
     def _joined(
-        self, net: PictureNet, simulated: Tensor, labels: Tensor, shown: Tensor, shown_labels: Tensor
+        self,
+        net: PictureNet,
+        simulated: Tensor,
+        labels: Tensor,
+        shown: Tensor,
+        shown_labels: Tensor,
+        steps: int,
     ) -> PictureNet:
         """A copy that went on with simulated and measured clips, three of four measured."""
-        both, truth = torch.cat([simulated, shown]), torch.cat([labels, shown_labels])
-        weights = torch.ones(len(truth))
+        weights = torch.ones(len(labels) + len(shown_labels))
         weights[len(labels) :] = 3 * len(labels) / len(shown_labels)
         net = copy.deepcopy(net)
-        steps = max(600, 20 * len(shown_labels) // 64)
         fit_pictures(
-            net, both, truth, epochs=max(1, steps * 64 // len(truth)), augment=self.measured.augment,
-            learning_rate=1e-3, weights=weights, seed=self.seed,
+            net, torch.cat([simulated, shown]), torch.cat([labels, shown_labels]), steps=steps,
+            augment=self.measured.augment, learning_rate=2e-3, weights=weights, seed=self.seed,
         )  # fmt: skip
         return net

@@ -27,9 +27,9 @@ def fit_pictures(
     pictures: Tensor,
     labels: Tensor,
     *,
-    epochs: int,
-    augment: Augment | None = None,
-    learning_rate: float = 2e-3,
+    steps: int,
+    augment: Augment,
+    learning_rate: float = 3e-3,
     weights: Tensor | None = None,
     batch: int = 64,
     seed: int = 0,
@@ -39,30 +39,24 @@ def fit_pictures(
     Args:
         net: changed in place; left in evaluation mode.
         pictures, labels: (N, C, H, W) and (N,) int64.
-        epochs: passes.
+        steps: batches.
         augment: applied to every batch.
         learning_rate: the largest one.
-        weights: (N,) how often each picture is drawn relative to the others; None is once in each pass.
-        batch: pictures per step.
+        weights: (N,) how often each picture is drawn relative to the others; None is alike.
+        batch: pictures per step, drawn with replacement.
         seed: of order, augmentation and dropout.
     """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=learning_rate, weight_decay=1e-2)
-    steps = max(1, len(labels) // batch) * epochs
+    optimiser = torch.optim.AdamW(net.parameters(), lr=learning_rate, weight_decay=2e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1)
     chance = torch.ones(len(labels)) if weights is None else weights
-    net.train()
-    order = torch.empty(0, dtype=torch.int64)
-    size = min(batch, len(labels))
+    net.train().to(memory_format=torch.channels_last)
     for _ in range(steps):
-        if len(order) < size:
-            order = torch.multinomial(chance, len(labels), weights is not None, generator=generator)
-        chosen, order = order[:size], order[size:]
-        shown = pictures[chosen]
-        if augment is not None:
-            shown = augment(shown, generator)
-        loss = F.cross_entropy(net(shown), labels[chosen], label_smoothing=0.1)
+        chosen = torch.multinomial(chance, batch, replacement=True, generator=generator)
+        shown = augment(pictures[chosen], generator).contiguous(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16):  # twice as fast as float32
+            loss = F.cross_entropy(net(shown), labels[chosen], label_smoothing=0.1)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
