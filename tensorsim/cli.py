@@ -16,6 +16,7 @@ from tensorsim.commands.evaluate_classifier import EvaluateClassifier
 from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
 from tensorsim.commands.evaluate_detector import EvaluateDetector
 from tensorsim.commands.evaluate_films import EvaluateFilms
+from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
 from tensorsim.commands.library import BuildLibrary
@@ -57,6 +58,7 @@ COMMANDS: dict[str, Any] = {
             "camera": EvaluateCamera,
             "denoiser": EvaluateDenoiser,
             "classifier": EvaluateClassifier,
+            "measured": EvaluateMeasured,
         },
     ),
     "train": (

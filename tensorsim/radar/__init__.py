@@ -12,14 +12,17 @@ from tensorsim.radar.presets import (
     save_radar_yaml,
 )
 from tensorsim.radar.processing.array import AngleMapper, AngleMaps, align_transmitters
+from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo, doppler_time_map
 from tensorsim.radar.processing.mti import MovingTargetIndicator, two_pulse_canceller
+from tensorsim.radar.processing.point_cloud import PointCloud, Points
 from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile, range_profile
 from tensorsim.radar.processing.ridges import PathRidgeExtractor, RidgeExtractor
 from tensorsim.radar.processing.synchrosqueeze import SynchrosqueezedMap
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.antenna import CosineAntenna, TabulatedAntenna
 from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.continuous_wave import ContinuousWaveEcho
 from tensorsim.radar.synthesis.dechirp import intermediate_frequency
 from tensorsim.radar.synthesis.echo import EchoSynthesizer, SideChannels
 from tensorsim.radar.synthesis.legs import mirror_delays
@@ -33,6 +36,8 @@ __all__ = [
     "AngleMaps",
     "BulkDopplerCompensation",
     "CadenceVelocityDiagram",
+    "CfarDetector",
+    "ContinuousWaveEcho",
     "CosineAntenna",
     "DopplerTimeMap",
     "EchoSynthesizer",
@@ -41,6 +46,8 @@ __all__ = [
     "GaitParameters",
     "MovingTargetIndicator",
     "PathRidgeExtractor",
+    "PointCloud",
+    "Points",
     "RadarScene",
     "RadarSimulator",
     "RangeBinSynthesizer",

@@ -2,6 +2,7 @@
 
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.recognition.map_image import MapToImage, ridge_map
+from tensorsim.recognition.picture_net import PictureNet
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
@@ -11,6 +12,7 @@ __all__ = [
     "ActivityRecognizer",
     "LabelSet",
     "MapToImage",
+    "PictureNet",
     "SPGNet",
     "SPNet",
     "Window",

@@ -26,6 +26,7 @@ from tensorsim.evaluation.measured.motions import (
     stage_people,
     to_and_fro,
 )
+from tensorsim.evaluation.measured.training import drop_cells, shift
 from tensorsim.motion.exercises import drink, fall_down, pick_up
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
 from tensorsim.motion.people import PeopleConfig
@@ -182,3 +183,22 @@ def read(folder: Path) -> tuple[Tensor, Tensor]:
         masks = torch.from_numpy(np.unpackbits(file["dt_packed"], axis=-1).astype(bool))
         labels = torch.from_numpy(file["label"].astype(np.int64))
     return masks[:, ROWS], labels
+
+
+def pictures(masks: Tensor) -> Tensor:
+    """Masks (N, 128, 256) to pictures (N, 1, 40, 64) of +-156 Hz, without the filter's start in the first columns."""
+    shown = masks[:, 24:104].float()
+    shown[..., :4] = 0.0
+    return F.avg_pool2d(shown.unsqueeze(1), (2, 4))
+
+
+def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Pictures moved in time, thickened, thinned, and with cells missing."""
+    count = shown.shape[0]
+    shown = shift(shown, 14, -1, generator)
+    shown = shift(shown, 1, -2, generator)
+    chance = torch.rand(count, 1, 1, 1, generator=generator)
+    thick = F.max_pool2d(shown, (3, 1), 1, (1, 0))
+    thin = -F.max_pool2d(-shown, (3, 1), 1, (1, 0))
+    shown = torch.where(chance < 0.25, thick, torch.where(chance > 0.85, thin, shown))
+    return drop_cells(shown, 0.03, generator)

@@ -21,6 +21,7 @@ from tensorsim.evaluation.measured.motions import (
     stage_people,
     to_and_fro,
 )
+from tensorsim.evaluation.measured.training import drop_cells, shift
 from tensorsim.motion.exercises import box, jump, jumping_jack, squat
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
 from tensorsim.motion.people import PeopleConfig
@@ -151,3 +152,8 @@ def pictures(maps: Tensor) -> Tensor:
     shown = maps.float()
     shown[:, CHIRPS // 2] = 0.0
     return shown.unsqueeze(1)
+
+
+def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Pictures moved in time, with cells missing."""
+    return drop_cells(shift(shown, 20, -1, generator), 0.3, generator)

@@ -19,6 +19,7 @@ from tensorsim.evaluation.measured.motions import (
     place,
     stage_people,
 )
+from tensorsim.evaluation.measured.training import shift
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import creep, run, stride
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
@@ -145,3 +146,12 @@ def read(folder: Path) -> tuple[Tensor, Tensor]:
 def pictures(maps: Tensor) -> Tensor:
     """Doppler maps (N, 64, 15) in dB to pictures (N, 1, 64, 15): 40 to 90 dB become 0 to 1."""
     return ((maps - 40) / 50).clamp(0.0, 1.2).unsqueeze(1)
+
+
+def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Pictures a frame earlier or later, of other levels, with noise."""
+    count = shown.shape[0]
+    shown = shift(shown, 1, -1, generator)
+    factor, offset = torch.rand(2, count, 1, 1, 1, generator=generator)
+    shown = shown * (0.9 + 0.2 * factor) + 0.1 * (offset - 0.5)
+    return shown + 0.03 * torch.randn(shown.shape, generator=generator)

@@ -67,7 +67,7 @@ class ContinuousWaveEcho(nn.Module):
         """Scatterers (..., M, S, 3) m with (..., M, S) m^2 to the baseband signal (..., M)."""
         rcs = check_scene(positions, rcs)
         exact = positions.double()
-        there = (exact - self.tx.double()).norm(dim=-1)
-        back = (exact - self.rx.double()).norm(dim=-1)
+        there = (exact - self.tx.double()).square().sum(-1).sqrt()
+        back = (exact - self.rx.double()).square().sum(-1).sqrt()
         amplitude = self.scale * rcs.double().clamp(min=0.0).sqrt() / (there * back)
         return continuous_wave(there + back, amplitude.to(self.precision.dtype), self.wavelength_m)

@@ -1,0 +1,111 @@
+"""Figures, tables and files of the experiments on measured sets."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tensorsim.evaluation.measured.run import SETTINGS
+from tensorsim.evaluation.measured.sets import MeasuredSet
+from tensorsim.files import complete_file
+
+#: Bins of the confidence for the calibration error.
+BINS = 10
+
+
+def accuracy(logits: Tensor, labels: Tensor) -> float:
+    """Share of clips whose largest logit is that of their class."""
+    return float((logits.argmax(-1) == labels).float().mean())
+
+
+def subset_accuracy(logits: Tensor, labels: Tensor, subset: list[int]) -> float:
+    """Accuracy on the clips of some classes, decided among these classes only; NaN without such clips."""
+    of = torch.isin(labels, torch.tensor(subset))
+    among = torch.full_like(logits, float("-inf"))
+    among[:, subset] = logits[:, subset]
+    return accuracy(among[of], labels[of])
+
+
+def confusion(logits: Tensor, labels: Tensor) -> Tensor:
+    """Counts (classes, classes): row the true class, column the one found."""
+    classes = logits.shape[-1]
+    return torch.bincount(labels * classes + logits.argmax(-1), minlength=classes**2).view(classes, classes)
+
+
+def calibration(logits: Tensor, labels: Tensor) -> tuple[float, list[tuple[int, float, float]]]:
+    """Expected calibration error, and for each bin of confidence: clips, mean confidence, accuracy."""
+    confidence, found = logits.softmax(-1).max(-1)
+    right = (found == labels).double()
+    place = (confidence * BINS).long().clamp(max=BINS - 1)
+    rows, error = [], 0.0
+    for k in range(BINS):
+        here = place == k
+        count = int(here.sum())
+        mean, share = (float(x[here].mean()) if count else 0.0 for x in (confidence.double(), right))
+        rows.append((count, mean, share))
+        error += count / len(labels) * abs(mean - share)
+    return error, rows
+
+
+def figures(measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> dict[str, Any]:
+    """What ``measured.json`` says of a set; settings that were not run are null."""
+    subset = [measured.classes.index(name) for name in measured.subset]
+    part = subset_accuracy(logits["simulation_only"], labels, subset)
+    scores = {name: accuracy(logits[name], labels) if name in logits else None for name in SETTINGS}
+    return {
+        "classes": len(measured.classes),
+        "simulation_only": scores.pop("simulation_only"),
+        "simulation_only_subset": {"classes": list(measured.subset), "accuracy": part},
+        **scores,
+    }
+
+
+def table(results: dict[str, dict[str, Any]], errors: dict[str, float]) -> str:
+    """Markdown: a row per set."""
+    head = ("set", "classes", "simulation only", "of a part", "10 clips", "those alone", "all", "LDA", "ECE")
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for name, row in results.items():
+        cells = [row["simulation_only"], row["simulation_only_subset"]["accuracy"]]
+        cells += [row[key] for key in SETTINGS[1:]]
+        shown = ["-" if cell is None else f"{100 * cell:.1f} %" for cell in cells]
+        lines.append("| " + " | ".join([name, str(row["classes"]), *shown, f"{errors[name]:.3f}"]) + " |")
+    parts = [
+        f"{name}: {', '.join(row['simulation_only_subset']['classes'])}" for name, row in results.items()
+    ]
+    lines += ["", "A part: decided among " + "; ".join(parts) + ".", "ECE: of simulation only."]
+    return "\n".join(lines)
+
+
+def write(out: Path, name: str, measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> float:
+    """Confusion matrices and calibration of a set as CSV; returns the calibration error of simulation alone."""
+    rows: list[list[Any]] = [["setting", "confidence_from", "clips", "confidence", "accuracy"]]
+    first_error = 0.0
+    for setting, values in logits.items():
+        with (
+            complete_file(out / f"confusion_{name}_{setting}.csv") as path,
+            path.open("w", newline="", encoding="utf-8") as file,
+        ):
+            writer = csv.writer(file)
+            writer.writerow(["true \\ found", *measured.classes])
+            for cls, counts in zip(measured.classes, confusion(values, labels).tolist(), strict=True):
+                writer.writerow([cls, *counts])
+        error, bins = calibration(values, labels)
+        if setting == "simulation_only":
+            first_error = error
+        rows += [[setting, k / BINS, n, f"{c:.4f}", f"{a:.4f}"] for k, (n, c, a) in enumerate(bins)]
+        rows.append([setting, "expected calibration error", len(labels), f"{error:.4f}", ""])
+    with (
+        complete_file(out / f"calibration_{name}.csv") as path,
+        path.open("w", newline="", encoding="utf-8") as file,
+    ):
+        csv.writer(file).writerows(rows)
+    return first_error
+
+
+def write_json(path: Path, results: dict[str, dict[str, Any]]) -> None:
+    """``measured.json``."""
+    with complete_file(path) as scratch:
+        scratch.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,127 @@
+"""The experiments: simulation alone, with a few measured clips, with all of them, and their rivals."""
+
+import copy
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.measured.sets import MeasuredSet
+from tensorsim.evaluation.measured.training import fit_pictures, predict
+from tensorsim.recognition.picture_net import PictureNet
+from tensorsim.weights import save_weights
+
+#: What is trained on what, in the order of the tables.
+SETTINGS = ("simulation_only", "ten_shot", "ten_shot_alone", "all", "lda")
+#: Measured clips of each class in ``ten_shot``.
+SHOTS = 10
+
+
+def few(labels: Tensor, shots: int) -> Tensor:
+    """Indices of ``shots`` clips of each class, evenly spread over the order of the files."""
+    chosen = []
+    for label in labels.unique():
+        places = torch.nonzero(labels == label)[:, 0]
+        steps = torch.linspace(0, len(places) - 1, min(shots, len(places)))
+        chosen.append(places[steps.round().long()])
+    return torch.cat(chosen)
+
+
+def lda_logits(train: Tensor, labels: Tensor, test: Tensor, classes: int) -> Tensor:
+    """Log-probabilities (N, classes) of scikit-learn's LDA with shrinkage on pictures of half the height and width."""
+    try:
+        from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+    except ImportError as error:
+        raise TensorsimError(
+            f"LDA: scikit-learn does not import ({error}); install tensorsim[train]"
+        ) from error
+    features = [torch.nn.functional.avg_pool2d(x, 2).flatten(1).double().numpy() for x in (train, test)]
+    model = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features[0], labels.numpy())
+    logits = torch.full((len(test), classes), -100.0)
+    logits[:, torch.as_tensor(model.classes_)] = torch.from_numpy(
+        model.predict_log_proba(features[1]).clip(min=-100.0)
+    ).float()
+    return logits
+
+
+class Experiment:
+    """All settings of one measured set.
+
+    Args:
+        measured: the set.
+        train, test: folders of measured sets.
+        out: where the weights trained on simulation alone go.
+        clips: simulated clips of each class.
+        steps: batches of 64 of the training on simulation; the others are shorter or as long.
+        seed: of simulation and training.
+        quiet: no progress bar.
+    """
+
+    def __init__(
+        self,
+        measured: MeasuredSet,
+        train: Path,
+        test: Path,
+        out: Path,
+        clips: int = 300,
+        steps: int = 600,
+        seed: int = 0,
+        quiet: bool = False,
+    ) -> None:
+        self.measured, self.out = measured, out
+        self.clips, self.steps, self.seed, self.quiet = clips, steps, seed, quiet
+        self.train, self.train_labels = measured.load(train)
+        self.test, self.test_labels = measured.load(test)
+
+    def quick(self) -> dict[str, Tensor]:
+        """Logits (N, classes) of the test clips by the shipped weights."""
+        net = PictureNet.from_pretrained(self.measured.weights)
+        return {"simulation_only": predict(net, self.test)}
+
+    def full(self) -> dict[str, Tensor]:
+        """Logits (N, classes) of the test clips in each of ``SETTINGS``."""
+        simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet)
+        net = self._fit(self._new(), simulated, labels, self.steps)
+        path = self.out / f"{self.measured.weights.replace('-', '_')}.safetensors"
+        save_weights(
+            net, path, {"trained_on": "simulation alone", "classes": ",".join(self.measured.classes)}
+        )
+        chosen = few(self.train_labels, SHOTS)
+        shots = self.train[chosen], self.train_labels[chosen]
+        nets = {
+            "simulation_only": net,
+            "ten_shot": self._joined(net, simulated, labels, *shots, self.steps // 2),
+            "ten_shot_alone": self._fit(self._new(), *shots, self.steps // 2),
+            "all": self._joined(net, simulated, labels, self.train, self.train_labels, self.steps),
+        }
+        logits = {name: predict(trained, self.test) for name, trained in nets.items()}
+        logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
+        return logits
+
+    def _new(self) -> PictureNet:
+        torch.manual_seed(self.seed)
+        return PictureNet(len(self.measured.classes), self.train.shape[-2])
+
+    def _fit(self, net: PictureNet, shown: Tensor, labels: Tensor, steps: int) -> PictureNet:
+        fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=self.seed)
+        return net
+
+    def _joined(
+        self,
+        net: PictureNet,
+        simulated: Tensor,
+        labels: Tensor,
+        shown: Tensor,
+        shown_labels: Tensor,
+        steps: int,
+    ) -> PictureNet:
+        """A copy that went on with simulated and measured clips, three of four measured."""
+        weights = torch.ones(len(labels) + len(shown_labels))
+        weights[len(labels) :] = 3 * len(labels) / len(shown_labels)
+        net = copy.deepcopy(net)
+        fit_pictures(
+            net, torch.cat([simulated, shown]), torch.cat([labels, shown_labels]), steps=steps,
+            augment=self.measured.augment, learning_rate=2e-3, weights=weights, seed=self.seed,
+        )  # fmt: skip
+        return net

@@ -1,0 +1,70 @@
+"""Training of a small network on pictures that fit the memory."""
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+#: A change of pictures (B, C, H, W) that keeps their labels.
+Augment = Callable[[Tensor, torch.Generator], Tensor]
+
+
+def shift(shown: Tensor, most: int, dim: int, generator: torch.Generator) -> Tensor:
+    """Pictures (B, C, H, W), each turned along ``dim`` by up to ``most`` cells either way."""
+    by = torch.randint(-most, most + 1, (shown.shape[0],), generator=generator)
+    return torch.stack([torch.roll(picture, int(k), dim) for picture, k in zip(shown, by, strict=True)])
+
+
+def drop_cells(shown: Tensor, most: float, generator: torch.Generator) -> Tensor:
+    """Pictures (B, C, H, W), each without a random share, up to ``most``, of its cells."""
+    share = most * torch.rand(shown.shape[0], 1, 1, 1, generator=generator)
+    return shown * (torch.rand(shown.shape, generator=generator) >= share)
+
+
+def fit_pictures(
+    net: nn.Module,
+    pictures: Tensor,
+    labels: Tensor,
+    *,
+    steps: int,
+    augment: Augment,
+    learning_rate: float = 3e-3,
+    weights: Tensor | None = None,
+    batch: int = 64,
+    seed: int = 0,
+) -> None:
+    """Train a network in place: AdamW, one cycle of the learning rate, cross-entropy with smoothed labels.
+
+    Args:
+        net: changed in place; left in evaluation mode.
+        pictures, labels: (N, C, H, W) and (N,) int64.
+        steps: batches.
+        augment: applied to every batch.
+        learning_rate: the largest one.
+        weights: (N,) how often each picture is drawn relative to the others; None is alike.
+        batch: pictures per step, drawn with replacement.
+        seed: of order, augmentation and dropout.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=learning_rate, weight_decay=2e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1)
+    chance = torch.ones(len(labels)) if weights is None else weights
+    net.train().to(memory_format=torch.channels_last)
+    for _ in range(steps):
+        chosen = torch.multinomial(chance, batch, replacement=True, generator=generator)
+        shown = augment(pictures[chosen], generator).contiguous(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16):  # twice as fast as float32
+            loss = F.cross_entropy(net(shown), labels[chosen], label_smoothing=0.1)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    net.eval()
+
+
+@torch.no_grad()
+def predict(net: nn.Module, pictures: Tensor, batch: int = 256) -> Tensor:
+    """Logits (N, classes) of pictures (N, C, H, W)."""
+    return torch.cat([net(part) for part in pictures.split(batch)])
