@@ -20,20 +20,84 @@ class TensorsimWarning(UserWarning):
     """A result is returned, but it may not be what the caller expects."""
 
 
+def check_is_tensor(x: Any, name: str) -> None:
+    """Refuse what is no ordinary tensor with values; not called in a scripted graph, whose types are fixed."""
+    if not isinstance(x, Tensor):
+        hint = ", as torch.from_numpy gives it" if type(x).__module__ == "numpy" else ""
+        raise TensorsimError(f"{name}: got {type(x).__name__}, expected a tensor{hint}")
+    if x.layout != torch.strided or (x.is_meta and not is_exporting()):
+        kind = "meta" if x.is_meta else str(x.layout).removeprefix("torch.")
+        raise TensorsimError(f"{name}: got a {kind} tensor, expected a dense one with values")
+
+
+def check_tensor(x: Tensor, name: str, layout: str, dtypes: str = "real", finite: bool = True) -> None:
+    """Refuse anything but a tensor of this layout, kind and with finite values: the check at the top of a stage.
+
+    Args:
+        x: what came.
+        name: what it is, for the message.
+        layout: dimensions in brackets, and what else should be said of them: ``"(..., pulses, 14 joints, 3) metres"``.
+            A dimension that begins with a number has this size; ``...`` at the start stands for any dimensions.
+        dtypes: ``"real"`` for float32 and float64, ``"complex"`` for complex64 and complex128.
+        finite: whether NaN and infinity are refused.
+
+    Raises:
+        TensorsimError: it says what came and what was expected.
+    """
+    if not torch.jit.is_scripting():
+        check_is_tensor(x, name)
+    if dtypes == "complex":
+        if x.dtype != torch.complex64 and x.dtype != torch.complex128:
+            raise TensorsimError(f"{name}: got dtype {x.dtype}, expected a complex tensor")
+        if x.is_conj():
+            raise TensorsimError(f"{name}: got a conjugate that is not resolved, expected x.resolve_conj()")
+    elif x.dtype != torch.float32 and x.dtype != torch.float64:
+        raise TensorsimError(
+            f"{name}: got dtype {x.dtype}, expected a real floating point tensor, float32 or float64"
+        )
+    sizes = layout[1 : layout.find(")")].split(", ")
+    open_lead = sizes[0] == "..."
+    rank = len(sizes) - int(open_lead)
+    fits = x.dim() >= rank if open_lead else x.dim() == rank
+    if fits:
+        for i in range(1, rank + 1):
+            word = sizes[len(sizes) - i].split(" ")[0]
+            if word.isdigit() and x.shape[x.dim() - i] != int(word):
+                fits = False
+    if not fits:
+        raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
+    if finite:
+        check_finite(x, name)
+
+
+def check_like_weights(x: Tensor, weight: Tensor, name: str) -> None:
+    """Refuse pictures of another dtype or on another device than the weights that they meet."""
+    if x.dtype != weight.dtype or x.device != weight.device:
+        raise TensorsimError(
+            f"{name}: got {x.dtype} on {x.device}, expected {weight.dtype} on {weight.device} as the weights"
+        )
+
+
 def check_floating(x: Tensor, name: str) -> None:
     """Refuse an integer, boolean or complex tensor."""
+    if not torch.jit.is_scripting():
+        check_is_tensor(x, name)
     if not x.is_floating_point():
         raise TensorsimError(f"{name}: got dtype {x.dtype}, expected a real floating point tensor")
 
 
 def check_min_rank(x: Tensor, rank: int, name: str, layout: str) -> None:
     """Refuse a tensor with fewer than ``rank`` dimensions; ``layout`` names the expected ones."""
+    if not torch.jit.is_scripting():
+        check_is_tensor(x, name)
     if x.dim() < rank:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
 
 
 def check_rank(x: Tensor, rank: int, name: str, layout: str) -> None:
     """Refuse a tensor without exactly ``rank`` dimensions; ``layout`` names the expected ones."""
+    if not torch.jit.is_scripting():
+        check_is_tensor(x, name)
     if x.dim() != rank:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
 
@@ -61,15 +125,16 @@ def is_exporting() -> bool:
 
 def check_finite(x: Tensor, name: str) -> None:
     """Refuse NaN and infinity; skipped while torch.export traces, where values are unknown."""
-    if not is_exporting() and not bool(torch.isfinite(x).all()):
+    if is_exporting():
+        return
+    # One pass over the values; only sums that are not finite, which large finite values have too, need a look at each.
+    if not bool(torch.isfinite(x.detach().sum())) and not bool(torch.isfinite(x).all()):
         raise TensorsimError(f"{name}: got NaN or infinite values, expected finite numbers")
 
 
 def check_complex_map(x: Tensor, name: str, layout: str) -> None:
-    """Refuse anything but a complex, non-empty (..., M, columns)."""
-    check_min_rank(x, 2, name, layout)
-    if not x.is_complex():
-        raise TensorsimError(f"{name}: got dtype {x.dtype}, expected a complex tensor")
+    """Refuse anything but a complex, finite, non-empty (..., M, columns)."""
+    check_tensor(x, name, layout, "complex")
     if x.numel() == 0:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout} without empty dimensions")
 

@@ -14,6 +14,7 @@ from tensorsim.errors import (
     check_min_rank,
     check_positive,
     check_size,
+    check_tensor,
 )
 
 #: Arms and legs by the indices of their joints, upper segment first.
@@ -129,10 +130,7 @@ def body_to_coco(joints: Tensor) -> Tensor:
     Raises:
         TensorsimError: joints of another shape, or integers.
     """
-    check_floating(joints, "joints")
-    check_min_rank(joints, 2, "joints", "(..., 14, 3)")
-    check_size(joints, -2, len(JOINTS), "joints", "(..., 14, 3)")
-    check_size(joints, -1, 3, "joints", "(..., 14, 3)")
+    check_tensor(joints, "joints", "(..., 14, 3)")
     nose, neck = joints[..., 0, :], joints[..., 1, :]
     reach = nose - neck
     height = reach.norm(dim=-1, keepdim=True) / math.hypot(NOSE_FORWARD, NOSE_UP)

@@ -13,7 +13,8 @@ from tensorsim.data.bvh import read_bvh
 from tensorsim.data.h36m import read_h36m
 from tensorsim.data.npz import motions_in, open_npz, preferred, read_npz
 from tensorsim.data.skeletons import Motion
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import TensorsimError, check_positive, check_tensor
+from tensorsim.limits import check_range
 
 #: Height of ankles over the floor that they stand on.
 ANKLE_HEIGHT_M = 0.07
@@ -92,9 +93,16 @@ def place(motion: Motion, range_m: float | None = None, heading_rad: float = 0.0
         The motion with its lowest joint at ankle height over z = 0.
 
     Raises:
-        TensorsimError: a first person who is never there.
+        TensorsimError: a first person who is never there, joints or a place that are not finite.
     """
     joints = motion.joints
+    check_tensor(joints, "motion", "(P, T, 14, 3)")
+    for value, quantity, option in (
+        (0.0 if range_m is None else range_m, "position", "range_m"),
+        (x_m, "position", "x_m"),
+        (math.degrees(heading_rad), "angle", "heading_rad in degrees"),
+    ):
+        check_range(value, quantity, option)
     if not bool(motion.valid[:1].any()):
         raise TensorsimError("motion: got a first person without a valid frame, expected at least one")
     first = int(motion.valid[0].int().argmax())

@@ -16,6 +16,8 @@ from tensorsim.errors import TensorsimError, check_finite, check_floating, check
 
 #: How a map is scaled to an image for the network, see :class:`MapDenoiser`.
 SCALES = ("peak", "floor")
+#: Ten times the network of the paper either way.
+MAX_DEPTH, MAX_CHANNELS = 200, 640
 
 
 class DnCNN(nn.Module):
@@ -40,9 +42,10 @@ class DnCNN(nn.Module):
 
     def __init__(self, depth: int = 20, channels: int = 64, batch_norm: bool = True) -> None:
         super().__init__()
-        if depth < 2 or channels < 1:
+        if not 2 <= depth <= MAX_DEPTH or not 1 <= channels <= MAX_CHANNELS:
             raise TensorsimError(
-                f"DnCNN: got depth {depth} and {channels} channels, expected at least 2 and at least 1"
+                f"DnCNN: got depth {depth} and {channels} channels, expected a depth of 2 to {MAX_DEPTH} and 1 to "
+                f"{MAX_CHANNELS} channels"
             )
         self.depth = depth
         self.reach = depth
@@ -75,6 +78,7 @@ class DnCNN(nn.Module):
         check_floating(images, "DnCNN")
         check_min_rank(images, 2, "DnCNN", "(..., H, W)")
         check_not_empty(images, "DnCNN")
+        check_finite(images, "DnCNN")
         noise: Tensor = self.model(images.reshape(-1, 1, images.shape[-2], images.shape[-1]))
         return noise.reshape(images.shape)
 

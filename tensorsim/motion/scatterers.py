@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import JOINT_RCS_M2, Vector
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive, check_size
+from tensorsim.errors import TensorsimError, check_min_rank, check_positive, check_tensor
 
 
 def visibility_fade(
@@ -65,13 +65,9 @@ def visibility_fade(
 
 
 def check_people(positions: Tensor, fade: Tensor, joints: int) -> None:
-    """Refuse anything but positions (..., P, M, ``joints``, 3) and fade (..., P, M), both floating point."""
-    layout = f"(..., P, M, {joints}, 3)"
-    check_floating(positions, "positions")
-    check_floating(fade, "fade")
-    check_min_rank(positions, 4, "positions", layout)
-    check_size(positions, -1, 3, "positions", layout)
-    check_size(positions, -2, joints, "positions", layout)
+    """Refuse anything but positions (..., P, M, ``joints``, 3) and fade (..., P, M), both real and finite."""
+    check_tensor(positions, "positions", f"(..., P, M, {joints}, 3)")
+    check_tensor(fade, "fade", "(..., P, M)")
     if fade.shape != positions.shape[:-2]:
         raise TensorsimError(
             f"fade: got shape {list(fade.shape)}, expected (..., P, M) {list(positions.shape[:-2])}"

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_min_rank, check_size
+from tensorsim.errors import TensorsimError, check_min_rank, check_tensor
 from tensorsim.ops import safe_sqrt
 
 
@@ -121,10 +121,7 @@ class AngleMapper(nn.Module):
     def forward(self, profiles: Tensor) -> AngleMaps:
         """(..., V, M, R) to range-angle (..., R, D) and azimuth-time (..., D, M)."""
         layout = f"(..., {self.channels} channels, pulses, range bins)"
-        if not profiles.is_complex():
-            raise TensorsimError(f"profiles: got dtype {profiles.dtype}, expected a complex tensor")
-        check_min_rank(profiles, 3, "profiles", layout)
-        check_size(profiles, -3, self.channels, "profiles", layout)
+        check_tensor(profiles, "profiles", layout, "complex")
         cycles = self.cycles.double()
         by_range = beam_power(profiles.transpose(-1, -2), cycles).transpose(-1, -2)
         by_pulse = beam_power(profiles, cycles) * profiles.shape[-1]

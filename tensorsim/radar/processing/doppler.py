@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map
+from tensorsim.errors import TensorsimError, check_complex_map, check_tensor
 from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.range_profile import gate_bins
 
@@ -189,7 +189,8 @@ class DopplerTimeMap(DopplerFrames):
 
     def forward(self, profiles: Tensor) -> Tensor:
         """Profiles (..., M, R) complex to the map (..., F, K)."""
-        if profiles.dim() > 1 and profiles.shape[-1] <= self.first_bin and profiles.shape[-1] > 0:
+        check_tensor(profiles, "profiles", "(..., pulses, range bins)", "complex", finite=False)
+        if 0 < profiles.shape[-1] <= self.first_bin:
             raise TensorsimError(
                 f"profiles: got shape {list(profiles.shape)}, expected more than the {self.first_bin} range bins "
                 f"before the gate"

@@ -9,6 +9,9 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_positive
 from tensorsim.ops import flatten_batch, unflatten_batch
 
+#: Bins of a Doppler axis, more than any map has; bounds counts of them.
+MAX_BINS = 65_536
+
 
 class Ridges(NamedTuple):
     """C ridges of a map.
@@ -176,10 +179,9 @@ class PathRidgeExtractor(nn.Module):
         floor_db: float = 40.0,
     ) -> None:
         super().__init__()
-        if count < 1 or max_jump < 1 or band < 0:
-            raise TensorsimError(
-                f"count, max_jump, band: got {count}, {max_jump}, {band}, expected at least 1, 1 and 0"
-            )
+        for name, value, least in (("count", count, 1), ("max_jump", max_jump, 1), ("band", band, 0)):
+            if not least <= value <= MAX_BINS:
+                raise TensorsimError(f"{name}: got {value}, expected {least} to {MAX_BINS}")
         check_positive(penalty_db, "penalty_db")
         check_positive(floor_db, "floor_db")
         self.count, self.band = count, band

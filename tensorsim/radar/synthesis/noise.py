@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_min_rank, check_positive
+from tensorsim.errors import TensorsimError, check_complex_map, check_positive
 
 BOLTZMANN_J_PER_K = 1.380649e-23
 REFERENCE_TEMPERATURE_K = 290.0
@@ -146,11 +146,7 @@ class ReceiverNoise(nn.Module):
 
     def forward(self, intermediate: Tensor, target_echo: Tensor | None = None) -> Tensor:
         """IF (..., M, N) complex and the target echo in it to IF with noise."""
-        check_min_rank(intermediate, 2, "IF", "(..., pulses, samples)")
-        if not intermediate.is_complex():
-            raise TensorsimError(f"IF: got dtype {intermediate.dtype}, expected a complex tensor")
-        if intermediate.numel() == 0:
-            raise TensorsimError(f"IF: got an empty tensor of shape {list(intermediate.shape)}")
+        check_complex_map(intermediate, "IF", "(..., pulses, samples)")
         signal = intermediate
         if target_echo is not None:
             if target_echo.shape != intermediate.shape or target_echo.dtype != intermediate.dtype:

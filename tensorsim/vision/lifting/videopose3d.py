@@ -11,7 +11,14 @@ import re
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_not_empty, check_size
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_size,
+)
 
 #: Joints of Human3.6M in its order, those of the published networks in and out.
 H36M_JOINTS = (
@@ -127,6 +134,7 @@ class VideoPose3D(nn.Module):
         check_size(joints, -2, 17, "VideoPose3D joints", layout)
         check_size(joints, -1, 2, "VideoPose3D joints", layout)
         check_not_empty(joints, "VideoPose3D joints")
+        check_finite(joints, "VideoPose3D joints")
         frames, reach = joints.shape[-3], (self.receptive_field - 1) // 2
         x = joints.flatten(-2).reshape(-1, frames, 34).transpose(1, 2)
         x = F.pad(x, [reach, reach], mode="replicate")

@@ -15,7 +15,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tensorsim.config import COCO_KEYPOINTS
-from tensorsim.errors import TensorsimError, check_floating, check_rank, check_size
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_like_weights,
+    check_rank,
+    check_size,
+)
 
 #: Statistics of ImageNet for RGB in [0, 1], which published pose networks were trained with.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -242,6 +249,8 @@ class HRNet(nn.Module):
         check_floating(crops, "HRNet crops")
         check_rank(crops, 4, "HRNet crops", layout)
         check_size(crops, 1, 3, "HRNet crops", layout)
+        check_like_weights(crops, self.mean, "HRNet crops")
+        check_finite(crops, "HRNet crops")
         if crops.shape[2] % 32 != 0 or crops.shape[3] % 32 != 0 or crops.shape[2] * crops.shape[3] == 0:
             raise TensorsimError(f"HRNet crops: got shape {list(crops.shape)}, expected {layout}")
         x = normalise(crops, self.mean, self.std)
