@@ -25,7 +25,7 @@ GREY = 114
 AS_IT_IS = 0.5
 
 
-@functools.lru_cache(maxsize=2048)
+@functools.lru_cache(maxsize=256)
 def shrunk_picture(sample: Sample, longest: int = 448) -> tuple[Picture, float]:
     """A picture, shrunk to at most ``longest`` pixels a side, and by what factor. Few are larger: they are kept."""
     import cv2
