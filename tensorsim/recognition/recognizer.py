@@ -133,7 +133,7 @@ class ActivityRecognizer(nn.Module):
     def from_pretrained(
         cls, radar: RadarConfig, source: str | os.PathLike[str] | None = None
     ) -> "ActivityRecognizer":
-        """Build the recognizer of a weight file of SPNet or SPGNet, with the image settings and classes in its metadata.
+        """Build the recognizer of a weight file of SPNet or SPGNet, with image settings and classes from its metadata.
 
         Args:
             radar: the radar of the maps.
