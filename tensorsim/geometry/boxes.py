@@ -149,6 +149,7 @@ def non_maximum_suppression(
     Returns:
         Indices (B, k) into the n boxes, best first, and whether each was found (B, k). Not differentiable.
     """
+    # kornia.geometry.bbox.nms takes one image, one class and no limit, and does not export.
     batch, count = scores.shape
     picked = torch.zeros((batch, max_detections), dtype=torch.int64, device=scores.device)
     found = torch.zeros((batch, max_detections), dtype=torch.bool, device=scores.device)

@@ -166,3 +166,13 @@ def test_coco_key_points_refuse_other_shapes(joints: Tensor) -> None:
 def test_sampler_refuses_too_few() -> None:
     with pytest.raises(TensorsimError, match="count 3, expected at least 13"):
         sample_poses(3)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rotation_equals_kornia(axis: int) -> None:
+    import kornia.geometry
+
+    angle = torch.linspace(-7, 7, 30, dtype=torch.float64)
+    vector = torch.eye(3, dtype=torch.float64)[axis] * angle[:, None]
+    expected = kornia.geometry.axis_angle_to_rotation_matrix(vector)
+    torch.testing.assert_close(rotation(axis, angle), expected, rtol=0, atol=1e-12)

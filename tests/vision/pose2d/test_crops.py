@@ -150,3 +150,15 @@ def test_constructor_refuses() -> None:
     for arguments in (((0, 192), 1.25), ((256, 192), 0.0), ((256, 192), float("nan")), ((256,), 1.25)):
         with pytest.raises(TensorsimError, match="BoxCrop"):
             BoxCrop(*arguments)  # type: ignore[arg-type]
+
+
+def test_crops_equal_kornia() -> None:
+    import kornia.geometry
+
+    images = torch.rand(2, 3, 60, 80, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    boxes, index = random_boxes(5, 80, 60, torch.float64), torch.arange(5) % 2
+    scale, offset = crop_transform(boxes, 32, 24, 1.25)
+    warp = torch.zeros(5, 2, 3, dtype=torch.float64)
+    warp[:, 0, 0], warp[:, 1, 1], warp[:, :, 2] = 1 / scale[:, 0], 1 / scale[:, 0], -offset / scale
+    expected = kornia.geometry.warp_affine(images[index], warp, (32, 24), align_corners=True)
+    torch.testing.assert_close(BoxCrop((32, 24))(images, boxes, index), expected, rtol=0, atol=1e-9)
