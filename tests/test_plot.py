@@ -9,6 +9,7 @@ import torch
 
 import tensorsim as ts
 from tensorsim import plot
+from tensorsim.plot.overview import overview_figure, save_small
 
 
 def test_decibels_are_below_the_peak_and_clipped() -> None:
@@ -48,7 +49,7 @@ def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
 def test_long_maps_are_thinned_by_power() -> None:
     magnitude = np.zeros((1, 40_000))
     magnitude[0, 100] = 3.0
-    thin = plot.maps._thin_columns(magnitude)
+    thin = plot.maps.thin_columns(magnitude)
     assert thin.shape[1] <= 4000
     assert np.isclose(np.square(thin).sum() * 20, 9.0)
 
@@ -184,3 +185,29 @@ def test_tick_labels_do_not_overlap() -> None:
     ]
     assert len(boxes) > 15
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
+def test_overview_shows_a_run_in_a_small_picture(tmp_path: Path) -> None:
+    frames = [np.full((48, 64, 3), 128, np.uint8)] * 4
+    ts.data.write_video(tmp_path / "overlay.mp4", frames, 10.0)
+    rows = np.zeros((64, 30))
+    rows[40] = 1.0
+    np.savez(
+        tmp_path / "maps.npz",
+        range_time_mti=rows,
+        doppler_time=rows,
+        range_m=np.arange(64.0),
+        doppler_hz=np.arange(64.0) - 32,
+        time_s=np.arange(30) / 10,
+        range_time_rate_hz=10.0,
+    )
+    figure = overview_figure(tmp_path)
+    picture, range_axes, doppler_axes, _ = figure.axes
+    assert np.abs(picture.images[0].get_array().mean() - 128) < 4
+    assert range_axes.get_ylabel() == "range in m"
+    assert np.allclose(doppler_axes.get_ylim(), (-8.8, 8.8))
+    save_small(figure, tmp_path / "overview.png")
+    assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "maps.npz").unlink()
+    with pytest.raises(ts.TensorsimError, match=r"got no maps\.npz"):
+        overview_figure(tmp_path)

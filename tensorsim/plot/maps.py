@@ -109,7 +109,7 @@ def caption(radar: RadarConfig, label: str | None = None, film: str | os.PathLik
     return " | ".join(parts if label is None else [*parts, label])
 
 
-def _thin_columns(magnitude: np.ndarray) -> np.ndarray:
+def thin_columns(magnitude: np.ndarray) -> np.ndarray:
     """Reduce the time axis to about 2000 columns by power averages: more than a picture can show only aliases."""
     block = magnitude.shape[1] // _MAX_COLUMNS
     if block < 2:
@@ -172,7 +172,7 @@ def map_figure(
         low, high = max(low, -half_span), min(high, half_span)
     for axes, (levels, lines, heading) in zip(row, panels, strict=True):
         image = axes.imshow(
-            decibels(_thin_columns(levels), style.dynamic_range_db, peak),
+            decibels(thin_columns(levels), style.dynamic_range_db, peak),
             origin="lower",
             aspect="auto",
             interpolation="nearest",
