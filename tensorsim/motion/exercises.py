@@ -99,12 +99,12 @@ def fall_down(time: Tensor, who: People) -> Act:
 def squat(time: Tensor, who: People) -> Act:
     """Knee bends with the arms stretched forward, one after the other."""
     v = Vary(who)
-    down = torch.sin(math.pi * _cycle_share(time, v(2.6), who)).square()
+    down = torch.sin(math.pi * _cycle_share(time, v(2.9), who)).square()
     knee, hip = REST_KNEE + v(85.0) * down, REST_HIP + v(62.0) * down
     pose = make_pose(
         time,
         who,
-        pitch=v(30.0) * down,
+        pitch=v(24.0) * down,
         hip=(hip, hip),
         knee=(knee, knee),
         flexion=(2 + v(80.0) * down, 2 + v(80.0) * down),
@@ -115,20 +115,20 @@ def squat(time: Tensor, who: People) -> Act:
 def jump(time: Tensor, who: People) -> Act:
     """Jumps on the spot, one after the other: bends the knees, takes off, lands."""
     v = Vary(who)
-    height = v(0.12)
+    height = v(0.1)
     flight = 2 * (2 * height / _GRAVITY).sqrt()
     period = v(0.95)
     since = period * _cycle_share(time, period, who) - 0.5 * period
     aloft = (1 - (2 * since / flight).square()).clamp(min=0.0)
     dip = bell(since, -0.5 * period, -0.5 * flight + 0.04) + bell(since, 0.5 * flight - 0.04, 0.5 * period)
-    knee, hip = REST_KNEE + v(38.0) * dip, REST_HIP + v(26.0) * dip
+    knee, hip = REST_KNEE + v(24.0) * dip, REST_HIP + v(12.0) * dip
     pose = make_pose(
         time,
         who,
-        pitch=v(12.0) * dip,
+        pitch=v(5.0) * dip,
         hip=(hip, hip),
         knee=(knee, knee),
-        flexion=(2 + v(25.0) * dip, 2 + v(25.0) * dip),
+        flexion=(2 + v(12.0) * dip, 2 + v(12.0) * dip),
         elbow=(35.0, 35.0),
     )
     return _in_the_air(on_the_spot(time, pose), height * aloft)

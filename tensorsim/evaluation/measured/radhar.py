@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.config import JOINTS, SPEED_OF_LIGHT_M_S, RadarConfig
 from tensorsim.evaluation.measured.motions import (
     Draw,
     Unrest,
@@ -53,7 +53,7 @@ RADAR = RadarConfig(
 )
 
 
-_HANDS = [i for i, part in enumerate(SEGMENTS) if part.name.endswith("forearm")]
+_WRISTS = [JOINTS.index("right_wrist"), JOINTS.index("left_wrist")]
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,7 @@ class Effects:
     peaks_only: bool = True
     levels: bool = True
     beam: bool = True
+    hands: bool = True
 
 
 class RadHar:
@@ -73,12 +74,12 @@ class RadHar:
 
     def __init__(self, effects: Effects | None = None) -> None:
         self.effects = Effects() if effects is None else effects
-        profile = RangeProfile(RADAR, window="hamming", gate_m=(0.6, 5.4))
+        profile = RangeProfile(RADAR, window="hamming", gate_m=(0.8, 4.6))
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
-        self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)
+        self.scatterers = LimbScatterers(RADAR.tx_m, RADAR.rx_m, per_segment=2)
         # Next to a body that fills many range bins the smaller reference cells are those of noise.
         self.cfar = CfarDetector(
-            (4, 0), (10, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
+            (5, 0), (5, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
         )
         frames = torch.arange(FRAMES, dtype=torch.float64) / FRAME_HZ
         self.at = (frames[:, None] + torch.arange(CHIRPS, dtype=torch.float64) / PRF_HZ).flatten()
@@ -87,7 +88,7 @@ class RadHar:
         """Joints (count, K, 14, 3) at ``KNOT_HZ``."""
         draw = Draw(count, generator)
         people = stage_people(
-            count, draw, PeopleConfig(heading_rad=0.35, facing_radar_share=1.0, speed_m_s=(0.4, 0.95)), None
+            count, draw, PeopleConfig(heading_rad=0.35, facing_radar_share=1.0, speed_m_s=(0.3, 0.75)), None
         )
         time = knots(FRAMES / FRAME_HZ).expand(count, -1)
         if label == 4:
@@ -98,10 +99,10 @@ class RadHar:
             else:
                 joints = act_out(walk, time, people)
             y = joints[:, :, (8, 11), 1].mean(-1)
-            joints = place(joints, draw(-0.4, 0.4), draw(1.6, 3.6) + y[:, :1] - y.mean(1, keepdim=True))
+            joints = place(joints, draw(-0.4, 0.4), draw(1.6, 3.3) + y[:, :1] - y.mean(1, keepdim=True))
         else:
             script = (box, jumping_jack, jump, squat)[label]
-            joints = act_out(script, time * draw(0.7, 1.3) + draw(0.0, 5.0), people)
+            joints = act_out(script, time * draw(0.65, 1.2) + draw(0.0, 5.0), people)
             joints = place(joints, draw(-0.3, 0.3), draw(1.3, 3.5))
         if self.effects.unrest:
             joints = add_unrest(joints, draw, Unrest((0.001, 0.008), (0.0, 0.02)))
@@ -113,17 +114,21 @@ class RadHar:
         draw = Draw(count, generator)
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.beam:
-            rcs = in_beam(positions, rcs, RADAR.tx_positions_m[0][2], draw(16.0, 40.0))
+            rcs = in_beam(positions, rcs, RADAR.tx_m[2], draw(14.0, 32.0))
         if self.effects.dim_limbs:
             gain_db = draw(-8.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
             gain_db[:, 1] = 0.0  # the torso
-            gain_db[:, _HANDS] += draw(0.0, 14.0)  # seen end-on, a forearm is its hand
             rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+        if self.effects.hands:
+            # A forearm seen end-on, as in a punch, is an edge of no size without its hand.
+            hands = (10 ** draw(-2.6, -1.2)).expand(-1, 2)[:, None].expand(-1, joints.shape[1], -1)
+            positions = torch.cat([positions, joints[:, :, _WRISTS]], dim=2)
+            rcs = torch.cat([rcs, hands.to(rcs.dtype)], dim=2)
         echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
         echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
         shape = (*echo.shape[1:],)
         noise = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float()) / 2**0.5
-        level_db = draw(10.0, 32.0) if self.effects.levels else draw(20.0, 20.0)
+        level_db = draw(13.0, 34.0) if self.effects.levels else draw(20.0, 20.0)
         echo = echo * 10 ** (level_db / 20).float().unsqueeze(-1) + noise
         frames = echo.unflatten(1, (FRAMES, CHIRPS)).transpose(2, 3)
         window = torch.hann_window(CHIRPS, periodic=False)

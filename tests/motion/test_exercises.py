@@ -1,0 +1,94 @@
+"""The further movements: no joint is too fast, feet stay on or above the floor, bones keep their length."""
+
+import pytest
+import torch
+
+from tensorsim.body.proportions import ANKLE_HEIGHT
+from tensorsim.config import JOINTS
+from tensorsim.motion.activities import perform
+from tensorsim.motion.exercises import EXERCISES
+from tensorsim.motion.people import PeopleConfig, draw_people
+
+RATE = 200.0
+SPEEDS = {"running": (2.0, 3.4), "striding": (1.3, 2.0), "creeping": (0.4, 1.1)}
+BONES = [("right_hip", "right_knee"), ("left_knee", "left_ankle"), ("neck", "right_shoulder"),
+         ("left_elbow", "left_wrist")]  # fmt: skip
+
+
+def joint(joints, name):
+    return joints[..., JOINTS.index(name), :]
+
+
+@pytest.fixture(scope="module", params=EXERCISES)
+def moved(request):
+    generator = torch.Generator().manual_seed(3)
+    people = draw_people(12, PeopleConfig(), generator)
+    if request.param in SPEEDS:
+        low, high = SPEEDS[request.param]
+        people = people._replace(speed_m_s=torch.linspace(low, high, 12, dtype=torch.float64))
+    time = torch.arange(round(4 * RATE), dtype=torch.float64) / RATE
+    joints = perform(EXERCISES[request.param], time.expand(12, -1), people)
+    return request.param, people, joints
+
+
+def test_nothing_is_faster_than_people_are(moved):
+    _, _, joints = moved
+    speed = joints.diff(dim=1).norm(dim=-1) * RATE
+    assert float(speed.max()) < 12
+    assert float(speed.max()) > 0.5
+
+
+def test_feet_stand_on_the_floor(moved):
+    name, people, joints = moved
+    height = people.height_m[:, None]
+    ankles = torch.stack([joint(joints, f"{side}_ankle") for side in ("right", "left")], dim=-2)[..., 2]
+    lowest = ankles.amin(-1) / height
+    assert float(lowest.min()) > ANKLE_HEIGHT - 0.006
+    if name == "falling":
+        assert float(joint(joints, "head")[:, -1, 2].max()) < 0.6
+    elif name in ("jumping", "jumping jacks", "running"):
+        assert bool((lowest.amin(dim=1) < ANKLE_HEIGHT + 0.012).all())
+        assert float(lowest.max()) > ANKLE_HEIGHT + 0.015
+    else:
+        assert float(lowest.max()) < ANKLE_HEIGHT + 0.012
+    assert float(joints[..., 2].min()) > 0.0
+
+
+def test_bones_keep_their_length(moved):
+    _, _, joints = moved
+    for a, b in BONES:
+        length = (joint(joints, a) - joint(joints, b)).norm(dim=-1)
+        torch.testing.assert_close(length, length[:, :1].expand_as(length), rtol=5e-3, atol=0)
+
+
+def test_gaits_go_at_their_speed_and_the_rest_stays(moved):
+    name, people, joints = moved
+    hips = 0.5 * (joint(joints, "right_hip") + joint(joints, "left_hip"))
+    gone = hips[:, -1, 1] - hips[:, 0, 1]
+    if name in SPEEDS:
+        torch.testing.assert_close(gone, people.speed_m_s * (4 - 1 / RATE), rtol=0.02, atol=0.05)
+    else:
+        assert float(gone.abs().max()) < 1.2
+
+
+def test_standing_feet_do_not_slide_far():
+    """Of a gait: the slower ankle is nearly still at any time at which a foot carries."""
+    generator = torch.Generator().manual_seed(0)
+    people = draw_people(6, PeopleConfig(), generator)._replace(
+        speed_m_s=torch.linspace(0.5, 1.0, 6, dtype=torch.float64)
+    )
+    time = torch.arange(800, dtype=torch.float64) / RATE
+    joints = perform(EXERCISES["creeping"], time.expand(6, -1), people)
+    ankles = torch.stack([joint(joints, "right_ankle"), joint(joints, "left_ankle")], dim=-2)[..., 1]
+    slower = (ankles.diff(dim=1) * RATE).abs().amin(-1)
+    assert float((slower / people.speed_m_s[:, None]).median()) < 0.35
+
+
+def test_squats_and_jumps_have_their_size():
+    people = draw_people(4, PeopleConfig(variation=0.0), torch.Generator().manual_seed(1))
+    time = (torch.arange(800, dtype=torch.float64) / RATE).expand(4, -1)
+    hips = {name: joint(perform(EXERCISES[name], time, people), "right_hip")[..., 2] for name in EXERCISES}
+    assert bool((hips["squats"].amax(1) - hips["squats"].amin(1) > 0.25).all())
+    rise = hips["jumping"].amax(1) - hips["jumping"][:, :1].amin(1)
+    assert bool((rise < 0.35).all())
+    assert bool((hips["drinking"].amax(1) - hips["drinking"].amin(1) < 0.05).all())
