@@ -29,6 +29,7 @@ def punch(time: Tensor, who: People) -> Act:
     v = Vary(who)
     guard, fold, out, straight = v(35.0), v(115.0), v(85.0), v(10.0)
     turn, extend, back, every, first = v(25.0), v(0.16), v(0.28), v(0.6), v(0.4)
+    extend, back, every = (duration / who.tempo[:, None] for duration in (extend, back, every))
 
     def fist(start: Tensor) -> Tensor:
         since = _repeated(time, start, 2 * every)
@@ -59,7 +60,7 @@ def kick(time: Tensor, who: People) -> Act:
     v = Vary(who)
     chamber, extend, recoil, lower = v(0.32), v(0.20), v(0.26), v(0.40)
     start, every, high, folded, more = v(0.4), v(1.8), v(75.0), v(105.0), v(15.0)
-    since = _repeated(time, start, every)
+    since = who.tempo[:, None] * _repeated(time, start, every / who.tempo[:, None])
     t1 = chamber
     t2, t3 = t1 + extend, t1 + extend + recoil
     t4 = t3 + lower
@@ -251,9 +252,9 @@ def toppling(since: Tensor, height_m: Tensor) -> Tensor:
 def walk_to_fall(time: Tensor, who: People) -> Act:
     """Walks, stumbles, topples forward like a rod about the feet, and stays down."""
     v = Vary(who)
-    trip = v(1.55)
-    down = toppling(time - trip, who.height_m) / 88
-    give = bell(time, trip, trip + 1.1)
+    trip, tempo = v(1.55), who.tempo[:, None]
+    down = toppling(tempo * (time - trip), who.height_m) / 88
+    give = bell(time, trip, trip + 1.1 / tempo)
     arms = 2 + 170 * minimum_jerk(down)
     rest = 1 - 0.4 * down
     base = make_pose(
@@ -268,7 +269,7 @@ def walk_to_fall(time: Tensor, who: People) -> Act:
     pace = 1 - segment(time, trip - 0.45, trip + 0.25)
     path = who.speed_m_s[:, None] * (time - travel(time, trip - 0.45, trip + 0.25))
     act = with_gait(time, who, base, pace, path)
-    upright = 1 - segment(time, trip + 0.4, trip + 0.9)
+    upright = 1 - segment(time, trip + 0.4 / tempo, trip + 0.9 / tempo)
     held = upright[..., None]
     return act._replace(hold=act.hold * held, lift=act.lift * held, level=upright)
 

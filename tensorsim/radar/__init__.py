@@ -22,12 +22,16 @@ from tensorsim.radar.processing.synchrosqueeze import SynchrosqueezedMap
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.antenna import CosineAntenna, TabulatedAntenna
 from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.clutter import RoomClutter
 from tensorsim.radar.synthesis.continuous_wave import ContinuousWaveEcho
 from tensorsim.radar.synthesis.dechirp import intermediate_frequency
 from tensorsim.radar.synthesis.echo import EchoSynthesizer, SideChannels
+from tensorsim.radar.synthesis.interference import Interference
 from tensorsim.radar.synthesis.legs import mirror_delays
 from tensorsim.radar.synthesis.noise import ReceiverNoise
 from tensorsim.radar.synthesis.paths import radar_equation_amplitude
+from tensorsim.radar.synthesis.phase_noise import PhaseNoise
+from tensorsim.radar.synthesis.receiver import Converter, DcOffset, QuadratureImbalance, RealReceiver
 from tensorsim.radar.synthesis.wall import two_way_wall_transmission
 
 __all__ = [
@@ -38,23 +42,30 @@ __all__ = [
     "CadenceVelocityDiagram",
     "CfarDetector",
     "ContinuousWaveEcho",
+    "Converter",
     "CosineAntenna",
+    "DcOffset",
     "DopplerTimeMap",
     "EchoSynthesizer",
     "FollowingGate",
     "GaitEstimator",
     "GaitParameters",
+    "Interference",
     "MovingTargetIndicator",
     "PathRidgeExtractor",
+    "PhaseNoise",
     "PointCloud",
     "Points",
+    "QuadratureImbalance",
     "RadarScene",
     "RadarSimulator",
     "RangeBinSynthesizer",
     "RangeDopplerVideo",
     "RangeProfile",
+    "RealReceiver",
     "ReceiverNoise",
     "RidgeExtractor",
+    "RoomClutter",
     "SideChannels",
     "SynchrosqueezedMap",
     "TabulatedAntenna",

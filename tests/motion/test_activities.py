@@ -170,6 +170,23 @@ def test_peak_speeds_of_the_mean_person(number: int) -> None:
         assert peak == pytest.approx(expected, rel=0.25), part
 
 
+@pytest.mark.parametrize(("number", "part"), [(2, "right_wrist"), (3, "right_ankle"), (12, "head")])
+def test_tempo_slows_punches_kicks_and_falls(number: int, part: str) -> None:
+    peaks = []
+    for tempo in (1.0, 0.6):
+        who = nominal_people(1)._replace(tempo=torch.tensor([tempo], dtype=torch.float64))
+        motion = ActivityGenerator().generate(number - 1, duration_s=8.0, rate_hz=RATE, people=who)
+        peaks.append(float(velocity(at(motion.joints, part)).norm(dim=-1).max()))
+    assert peaks[1] / peaks[0] == pytest.approx(0.6, abs=0.08)
+
+
+def test_tempo_leaves_walking_alone() -> None:
+    who = nominal_people(1)
+    slow = who._replace(tempo=0.6 * who.tempo)
+    walks = [ActivityGenerator().generate("walking", people=p).joints for p in (who, slow)]
+    assert torch.equal(*walks)
+
+
 def test_heights_of_the_hips() -> None:
     z = {i: at(nominal(i - 1).joints, "pelvis")[0, :, 2] for i in range(1, 13)}
     for sits in (5, 10):
@@ -380,6 +397,7 @@ def test_paths_stay_in_sight() -> None:
         ({"height_m": (1.9, 1.5)}, r"height_m: got \(1.9, 1.5\), expected an ascending range"),
         ({"height_m": (0.1, 1.5)}, "height_m"),
         ({"speed_m_s": (0.0, 1.0)}, "speed_m_s"),
+        ({"tempo": (0.1, 1.0)}, "tempo: got"),
         ({"speed_m_s": (float("nan"), 1.0)}, "speed_m_s"),
         ({"start_range_m": (1.0, float("inf"))}, "start_range_m"),
         ({"start_side_m": float("inf")}, "start_side_m: got inf"),

@@ -1,0 +1,91 @@
+"""Another FMCW radar that is heard."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.errors import TensorsimError, check_complex_map, check_size
+
+
+class Interference(nn.Module):
+    """Adds the chirps of another FMCW radar to the IF, where they pass through the receiver's band.
+
+    Own sweep and foreign one beat at the difference of their momentary frequencies; what is within half the sample
+    rate of zero is in the IF, a chirp in itself that spreads over all range bins, and what lies beyond is filtered
+    out. One path, direct: amplitude ``sqrt(Pt2 / Pt1 Gt Gr) lambda / (4 pi R)`` (Friis). See Brooker, *Mutual
+    interference of millimeter-wave radar systems*, IEEE Trans. Electromagn. Compat. 49, 2007.
+
+    Times count from pulse 0, so that pieces of a clip give what the whole clip gives. The two clocks are ideal.
+
+    Args:
+        radar: the receiver, of one transmitter and one receiver.
+        other: the other radar, where it stands; its PRF and sweep need not be those of ``radar``.
+        delay_s: time at which its sweep number 0 begins, plus the way to the receiver.
+        power_ratio_db: its transmit power over that of ``radar``.
+
+    Shapes: IF (..., M, N) complex, number of its first pulse -> IF likewise. Differentiable.
+
+    Raises:
+        TensorsimError: an array, a radar at the place of the other, numbers that are not finite, an IF that is not
+            complex or has another number of samples.
+    """
+
+    def __init__(
+        self,
+        radar: RadarConfig,
+        other: RadarConfig,
+        delay_s: float = 0.0,
+        power_ratio_db: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if radar.has_array or other.has_array:
+            raise TensorsimError(
+                "radar, other: got several antennas, expected one transmitter and one receiver each"
+            )
+        if not (math.isfinite(delay_s) and math.isfinite(power_ratio_db)):
+            raise TensorsimError(
+                f"delay_s, power_ratio_db: got {delay_s} and {power_ratio_db}, expected finite numbers"
+            )
+        heard, source = radar.rx_positions_m[0], other.tx_positions_m[0]
+        distance = math.dist(heard, source)
+        if distance == 0:
+            raise TensorsimError(f"other.tx_m: got {source}, where the receiver is, expected another place")
+        gain_db = radar.antenna_gain_dbi + other.antenna_gain_dbi + power_ratio_db
+        wavelength = SPEED_OF_LIGHT_M_S / other.carrier_hz
+        self.amplitude = 10 ** (gain_db / 20) * wavelength / (4 * math.pi * distance)
+        self.samples, self.rate_hz, self.prf_hz = radar.samples_per_chirp, radar.sample_rate_hz, radar.prf_hz
+        self.slope, self.other_slope = radar.slope_hz_per_s, other.slope_hz_per_s
+        self.other_prf_hz, self.other_chirp_s = other.prf_hz, other.chirp_s
+        self.apart_hz = radar.carrier_hz - other.carrier_hz
+        self.carrier_hz = other.carrier_hz
+        self.delay_s = float(delay_s)
+
+    def forward(self, intermediate: Tensor, start: int = 0) -> Tensor:
+        """IF of pulses ``start`` onwards to IF with interference."""
+        layout = f"(..., pulses, {self.samples} samples)"
+        check_complex_map(intermediate, "IF", layout)
+        check_size(intermediate, -1, self.samples, "IF", layout)
+        device = intermediate.device
+        pulse = (start + torch.arange(intermediate.shape[-2], dtype=torch.float64, device=device)).unsqueeze(
+            -1
+        )
+        own = torch.arange(self.samples, dtype=torch.float64, device=device) / self.rate_hz
+        since = pulse / self.prf_hz + own - self.delay_s
+        sweep = torch.floor(since * self.other_prf_hz)
+        theirs = since - sweep / self.other_prf_hz  # time in the sweep that is heard
+
+        beat = self.apart_hz + self.slope * own - self.other_slope * theirs
+        heard = (beat.abs() < self.rate_hz / 2) & (theirs < self.other_chirp_s)
+        # Tx conj(Rx): own phase less that of the wave that comes in, in cycles; carriers are taken at the sample's
+        # time within each sweep, so each of their sweeps begins with the same phase.
+        turns = (
+            self.apart_hz * own
+            + self.slope * own.square() / 2
+            - self.carrier_hz * (theirs - own)
+            - self.other_slope * theirs.square() / 2
+        )
+        angle = 2 * math.pi * (turns - turns.floor())
+        wave = torch.polar(self.amplitude * heard.to(angle.dtype), angle)
+        return intermediate + wave.to(intermediate.dtype)

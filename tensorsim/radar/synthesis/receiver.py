@@ -1,0 +1,129 @@
+"""What a receiver does to the IF: unequal I and Q, offset, one channel in place of two, and a converter of few bits.
+
+See Razavi, *RF Microelectronics*, 2nd ed., ch. 4, and Widrow and Kollar, *Quantization Noise*. All act on every
+sample by itself: a clip may come in pieces.
+"""
+
+import cmath
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError, check_complex_map, check_positive
+
+
+class QuadratureImbalance(nn.Module):
+    """Makes Q larger than I by a gain and turns it by an angle: an image at the negative frequency.
+
+    ``y = a x + b conj(x)`` with ``a = (1 + g exp(-j phi)) / 2``, ``b = (1 - g exp(j phi)) / 2``. In a continuous-wave
+    radar the image is at the opposite Doppler; behind a sweep it is at the negative beat, beyond the range profile.
+
+    Args:
+        gain_db: g, gain of Q over I.
+        phase_rad: phi, by which the two are not a quarter turn apart.
+
+    Shapes: IF (..., M, N) complex -> likewise. Differentiable.
+
+    Attributes:
+        image_rejection_db: power of a tone over that of its image,
+            ``(1 + 2 g cos phi + g^2) / (1 - 2 g cos phi + g^2)``.
+
+    Raises:
+        TensorsimError: numbers that are not finite, an IF that is not complex.
+    """
+
+    def __init__(self, gain_db: float = 0.5, phase_rad: float = math.radians(2.0)) -> None:
+        super().__init__()
+        if not (math.isfinite(gain_db) and math.isfinite(phase_rad)):
+            raise TensorsimError(
+                f"gain_db, phase_rad: got {gain_db} and {phase_rad}, expected finite numbers"
+            )
+        gain = 10 ** (gain_db / 20)
+        self.direct = (1 + gain * cmath.exp(-1j * phase_rad)) / 2
+        self.image = (1 - gain * cmath.exp(1j * phase_rad)) / 2
+        self.image_rejection_db = (
+            math.inf if self.image == 0 else 20 * math.log10(abs(self.direct) / abs(self.image))
+        )
+
+    def forward(self, intermediate: Tensor) -> Tensor:
+        """IF to IF with an image."""
+        check_complex_map(intermediate, "IF", "(..., pulses, samples)")
+        return self.direct * intermediate + self.image * intermediate.conj()
+
+
+class DcOffset(nn.Module):
+    """Adds a constant to the IF, as mixers and amplifiers do: a line at zero beat and zero Doppler.
+
+    Args:
+        offset: complex, in the unit of the IF (amplitude for transmit power 1).
+
+    Shapes: IF (..., M, N) complex -> likewise. Differentiable.
+
+    Raises:
+        TensorsimError: an offset that is not finite, an IF that is not complex.
+    """
+
+    def __init__(self, offset: complex) -> None:
+        super().__init__()
+        self.offset = complex(offset)
+        if not cmath.isfinite(self.offset):
+            raise TensorsimError(f"offset: got {offset}, expected a finite complex number")
+
+    def forward(self, intermediate: Tensor) -> Tensor:
+        """IF to IF with an offset."""
+        check_complex_map(intermediate, "IF", "(..., pulses, samples)")
+        return intermediate + self.offset
+
+
+class RealReceiver(nn.Module):
+    """Keeps I alone. Spectra are mirror-symmetric: ``(x + conj x) / 2`` has the wave and its image at half amplitude.
+
+    A continuous-wave radar then cannot tell approaching from receding; behind a sweep the image is at the negative
+    beat, beyond the range profile, and only the level changes.
+
+    Shapes: IF (..., M, N) complex -> likewise, with imaginary part 0. Differentiable.
+
+    Raises:
+        TensorsimError: an IF that is not complex.
+    """
+
+    def forward(self, intermediate: Tensor) -> Tensor:
+        """IF to its real part."""
+        check_complex_map(intermediate, "IF", "(..., pulses, samples)")
+        in_phase = torch.real(intermediate)
+        return torch.complex(in_phase, torch.zeros_like(in_phase))
+
+
+class Converter(nn.Module):
+    """Quantises I and Q to a number of bits and clips them (an analogue-to-digital converter for each).
+
+    Levels are odd multiples of half a step (mid-rise), ``step = 2 full_scale / 2^bits``. Noise of a signal that covers
+    many steps is ``step^2 / 12`` per channel; a tone of full scale has 6.02 bits + 1.76 dB.
+
+    Args:
+        bits: 1 to 24.
+        full_scale: largest value of I or Q in the unit of the IF (amplitude for transmit power 1); beyond it the
+            converter saturates.
+
+    Shapes: IF (..., M, N) complex -> likewise. The gradient is that of clipping: steps have none.
+
+    Raises:
+        TensorsimError: bits out of range, a full scale that is not positive, an IF that is not complex.
+    """
+
+    def __init__(self, bits: int, full_scale: float) -> None:
+        super().__init__()
+        if not 1 <= bits <= 24:
+            raise TensorsimError(f"bits: got {bits}, expected 1 to 24")
+        check_positive(full_scale, "full_scale")
+        self.step = 2 * full_scale / 2**bits
+        self.highest = full_scale - self.step / 2
+
+    def forward(self, intermediate: Tensor) -> Tensor:
+        """IF to IF on the converter's levels."""
+        check_complex_map(intermediate, "IF", "(..., pulses, samples)")
+        parts = torch.view_as_real(intermediate.resolve_conj()).clamp(-self.highest, self.highest)
+        levels = (torch.floor(parts / self.step) + 0.5) * self.step
+        rounding = levels.clamp(-self.highest, self.highest) - parts
+        return torch.view_as_complex(parts + rounding.detach())
