@@ -6,7 +6,7 @@ from tensorsim import cli
 
 
 def test_a_row_per_tilt_and_height(capsys: pytest.CaptureFixture[str]) -> None:
-    cli.main("evaluate camera --tilts 12 --heights 1.5 --fovs 60 --noise 0".split())
+    cli.main(["evaluate", "camera", "--tilts", "12", "--heights", "1.5", "--fovs", "60", "--noise", "0"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].startswith("| 12 | 1.5 m | 1 | ")
     assert float(lines[2].split("|")[4].split()[0]) < 2.0

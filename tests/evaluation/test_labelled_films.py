@@ -114,6 +114,7 @@ class Always(nn.Module):
     def __init__(self, index: int) -> None:
         super().__init__()
         self.index = index
+        self.class_names = ACTIVITIES
 
     def forward(self, maps: RadarMaps) -> Tensor:
         return torch.nn.functional.one_hot(torch.tensor(self.index), len(ACTIVITIES)).double().mul(4)
