@@ -8,6 +8,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
+from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, camera_config
 
 
 def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
@@ -15,8 +16,21 @@ def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
     return tqdm(desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
 
 
-def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, quiet: bool = False) -> Pose:
+def pose_of_film(
+    stage: VideoToPose,
+    reader: VideoReader,
+    device: torch.device,
+    quiet: bool = False,
+    calibrate: bool = False,
+) -> Pose:
     """Detect and track in a first pass over the film, estimate and lift poses in a second one.
+
+    Args:
+        stage: with the networks.
+        reader: of the film.
+        device: to compute on.
+        quiet: no progress bars.
+        calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
 
     Returns:
         The Pose of one clip (B = 1) on the CPU; equal to ``stage(video, fps)`` of the whole film.
@@ -27,8 +41,31 @@ def pose_of_film(stage: VideoToPose, reader: VideoReader, device: torch.device, 
     detections, observed = detections_of_film(stage, reader, device, quiet)
     tracks = stage.follow(detections, observed)
     keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet)
-    pose = stage.lift(tracks, keypoints, scores, reader.height, reader.width, reader.fps)
+    size = reader.height, reader.width
+    if calibrate:
+        stage, _ = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
+    pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
     return Pose(*(field.cpu() for field in pose))
+
+
+def calibrated(
+    stage: VideoToPose, keypoints: Tensor, scores: Tensor, valid: Tensor, size: tuple[int, int], fps: float
+) -> tuple[VideoToPose, CameraEstimate]:
+    """The stage for the camera that the people of one film tell, and what they tell.
+
+    Args:
+        stage: of another camera.
+        keypoints: (1, P, T, 17, 2) pixels.
+        scores: (1, P, T, 17).
+        valid: (1, P, T) bool.
+        size: (height, width) of the pictures.
+        fps: frames per second.
+    """
+    heights = stage.metric_pose.heights
+    assert isinstance(heights, Tensor)
+    calibrator = CameraCalibrator(tuple(heights.tolist()), keypoint_threshold=stage.keypoint_threshold)
+    found = calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps)
+    return stage.seen_by(camera_config(found)), found
 
 
 def detections_of_film(

@@ -32,6 +32,8 @@ class EvaluateFilms(NetworkOptions):
     """Names of films, or parts of them; default all."""
     stride: int = 1
     """Keep every n-th frame."""
+    calibrate: bool = True
+    """Estimate the camera of each film from its people; otherwise it is level, with a field of view of 60 degrees."""
     seed: int = 0
     """Of the receiver's noise."""
     device: str = "auto"
@@ -64,7 +66,7 @@ class EvaluateFilms(NetworkOptions):
             raise TensorsimError(f"{self.data}: got no film to label, expected at least one")
         device = usable_device(self.device)
         stage = VideoToPose(*load_networks(*networks, self.flip_test)).to(device).eval()
-        reader = FilmReader(stage, networks, self.out / "cache", self.stride)
+        reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:
             config = RadarOptions(scene=name, classifier=self.classifier).configuration()
@@ -93,16 +95,16 @@ class EvaluateFilms(NetworkOptions):
         from tensorsim.evaluation.labelled_films import film_row, followed, judged
 
         video = reader.open(film)
-        pose = reader.people(film, device, self.quiet)
+        pose, camera = reader.people(film, device, self.quiet)
         shown = []
         for name, how in scenes.items():
             verdict, maps = judged(film, pose, video.fps, name, how, self.seed, device, self.quiet)
             axes = None if maps is None else results.axes_of(how.stage, maps)
             shown.append((verdict, maps, axes))
-        figure = contact_sheet(film, video, pose, reader.stage.keypoint_threshold, shown)
+        figure = contact_sheet(film, video, pose, camera, reader.stage.keypoint_threshold, shown)
         plot.save_figure(figure, self.out / f"{film.path.stem}.png")
         verdicts = [verdict for verdict, _, _ in shown]
-        return film_row(film, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
+        return film_row(film, camera, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

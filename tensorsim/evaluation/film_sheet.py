@@ -1,5 +1,6 @@
 """A contact sheet of a film: pictures with the people found in them, Doppler-time maps, and where people are."""
 
+import math
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.evaluation.labelled_films import LabelledFilm, Verdict
 from tensorsim.results import Axes
 from tensorsim.types import Pose, RadarMaps
+from tensorsim.vision.calibration.calibrator import CameraEstimate, camera_config
 
 if TYPE_CHECKING:
     import matplotlib.axes
@@ -25,6 +27,7 @@ def contact_sheet(
     film: LabelledFilm,
     reader: VideoReader,
     pose: Pose,
+    camera: CameraEstimate | None,
     threshold: float,
     scenes: list[tuple[Verdict, RadarMaps | None, Axes | None]],
 ) -> "Figure":
@@ -34,6 +37,7 @@ def contact_sheet(
         film: what is known of the film.
         reader: of the frames that ``pose`` is of.
         pose: the people found, one clip.
+        camera: as estimated from them, whose floor is drawn; None draws none.
         threshold: score from which a key point is drawn.
         scenes: per scene the verdict, and its maps with their axes where there are any.
     """
@@ -45,7 +49,9 @@ def contact_sheet(
     grid = figure.add_gridspec(_ROWS + 1, 12, height_ratios=[1.0] * _ROWS + [1.3])
     count = pose.valid.shape[2]
     chosen = np.unique(np.linspace(0, count - 1, _ROWS * _COLUMNS).round().astype(int))
-    for place, (index, picture) in enumerate(_pictures(reader, pose, threshold, set(chosen.tolist()))):
+    for place, (index, picture) in enumerate(
+        _pictures(reader, pose, camera, threshold, set(chosen.tolist()))
+    ):
         row, column = divmod(place, _COLUMNS)
         axes = figure.add_subplot(grid[row, 3 * column : 3 * column + 3])
         axes.imshow(picture)
@@ -56,12 +62,26 @@ def contact_sheet(
         axes = figure.add_subplot(grid[_ROWS, place * width : (place + 1) * width])
         _draw_map(axes, verdict, maps, map_axes)
     _draw_places(figure.add_subplot(grid[_ROWS, len(scenes) * width :]), pose, reader.fps)
-    figure.suptitle(f"{film.path.name}: {' or '.join(film.accept)}")
+    figure.suptitle(f"{film.path.name}: {' or '.join(film.accept)}{_said_of(camera)}")
     return figure
 
 
+def _said_of(camera: CameraEstimate | None) -> str:
+    """The camera in words."""
+    if camera is None:
+        return ""
+    said = "\ncamera"
+    for name, value, sd in (
+        ("tilt", -camera.pitch_rad, camera.pitch_sd_rad),
+        ("roll", camera.roll_rad, camera.roll_sd_rad),
+        ("field of view", camera.horizontal_fov_rad, camera.horizontal_fov_sd_rad),
+    ):
+        said += f" {name} {math.degrees(float(value)):.0f} +- {math.degrees(float(sd)):.0f} deg,"
+    return f"{said} height {float(camera.height_m):.1f} +- {float(camera.height_sd_m):.1f} m"
+
+
 def _pictures(
-    reader: VideoReader, pose: Pose, threshold: float, chosen: set[int]
+    reader: VideoReader, pose: Pose, camera: CameraEstimate | None, threshold: float, chosen: set[int]
 ) -> list[tuple[int, np.ndarray]]:
     """The chosen frames by number, people drawn on them."""
     boxes, keypoints, scores, valid = (
@@ -74,6 +94,8 @@ def _pictures(
             if index in chosen:
                 picture = _small(frame)
                 scale = picture.shape[1] / frame.shape[-1]
+                if camera is not None:
+                    picture = plot.draw_floor(picture, camera_config(camera))
                 drawn.append(
                     (
                         index,

@@ -6,6 +6,7 @@ happens, and the activities that count as right (``accept``).
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,8 +23,9 @@ from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.results import label_of, people_of
-from tensorsim.streaming import detections_of_film, keypoints_of_film, maps_of_pose
+from tensorsim.streaming import calibrated, detections_of_film, keypoints_of_film, maps_of_pose
 from tensorsim.types import Detections, Pose, RadarMaps
+from tensorsim.vision.calibration.calibrator import CameraEstimate
 
 
 @dataclass(frozen=True)
@@ -112,18 +114,28 @@ class FilmReader:
         networks: files of detector and pose network.
         cache: the folder.
         stride: keep every n-th frame of the films.
+        calibrate: estimate the camera of each film from the people in it.
     """
 
-    def __init__(self, stage: VideoToPose, networks: tuple[Path, Path], cache: Path, stride: int = 1) -> None:
-        self.stage, self.cache, self.stride = stage, cache, stride
+    def __init__(
+        self,
+        stage: VideoToPose,
+        networks: tuple[Path, Path],
+        cache: Path,
+        stride: int = 1,
+        calibrate: bool = True,
+    ) -> None:
+        self.stage, self.cache, self.stride, self.calibrate = stage, cache, stride, calibrate
         self.detector, self.pose = (_digest(path.read_bytes()) for path in networks)
 
     def open(self, film: LabelledFilm) -> VideoReader:
         """The labelled seconds of a film."""
         return VideoReader(film.path, start_s=film.start_s, end_s=film.end_s, stride=self.stride)
 
-    def people(self, film: LabelledFilm, device: torch.device, quiet: bool = False) -> Pose:
-        """The Pose of a film (B = 1) on the CPU."""
+    def people(
+        self, film: LabelledFilm, device: torch.device, quiet: bool = False
+    ) -> tuple[Pose, CameraEstimate | None]:
+        """The Pose of a film (B = 1) on the CPU, and its camera if that is estimated."""
         stage, reader = self.stage, self.open(film)
         cut = f"{film.start_s} {film.end_s} {self.stride} {stage.detection_interval}"
         key = _digest(film.path.read_bytes(), cut.encode(), self.detector.encode())
@@ -140,11 +152,13 @@ class FilmReader:
         keypoints, scores = self._kept(
             f"keypoints-{key}", lambda: keypoints_of_film(stage, reader, tracks, device, quiet)
         )
-        pose = stage.lift(
-            tracks, keypoints.to(device), scores.to(device), reader.height, reader.width, reader.fps
-        )
+        keypoints, scores, size = keypoints.to(device), scores.to(device), (reader.height, reader.width)
+        camera = None
+        if self.calibrate:
+            stage, camera = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
+        pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
         warn_of_empty_clips(pose.valid)
-        return Pose(*(field.cpu() for field in pose))
+        return Pose(*(field.cpu() for field in pose)), camera
 
     def _kept(self, name: str, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Tensors of a file of the cache, made and written first if it is not there."""
@@ -195,14 +209,35 @@ def followed(pose: Pose, fps: float) -> list[dict[str, Any]]:
     return rows
 
 
+def camera_row(camera: CameraEstimate | None) -> dict[str, Any] | None:
+    """What ``films.json`` says of a camera: degrees and metres, each with its standard deviation."""
+    if camera is None:
+        return None
+    row: dict[str, Any] = {"frames": int(camera.frames)}
+    for name, value, sd in (
+        ("pitch_deg", camera.pitch_rad, camera.pitch_sd_rad),
+        ("roll_deg", camera.roll_rad, camera.roll_sd_rad),
+        ("horizontal_fov_deg", camera.horizontal_fov_rad, camera.horizontal_fov_sd_rad),
+    ):
+        row[name] = [round(math.degrees(float(angle)), 1) for angle in (value, sd)]
+    row["height_m"] = [round(float(length), 2) for length in (camera.height_m, camera.height_sd_m)]
+    return row
+
+
 def film_row(
-    film: LabelledFilm, people: list[dict[str, Any]], frames: int, fps: float, verdicts: Iterable[Verdict]
+    film: LabelledFilm,
+    camera: CameraEstimate | None,
+    people: list[dict[str, Any]],
+    frames: int,
+    fps: float,
+    verdicts: Iterable[Verdict],
 ) -> dict[str, Any]:
     """What ``films.json`` says of a film."""
     return {
         "file": film.path.name,
         "seconds": round(frames / fps, 2),
         "accept": list(film.accept),
+        "camera": camera_row(camera),
         "people": people,
         "scenes": {verdict.scene: asdict(verdict) for verdict in verdicts},
     }

@@ -1,5 +1,7 @@
 """Video -> people with smooth 3D joints: detection, tracking, 2D pose, lifting, position, smoothing."""
 
+import copy
+
 import torch
 from torch import Tensor, nn
 
@@ -123,7 +125,12 @@ class VideoToPose(nn.Module):
                 process_noise=tracking.process_noise,
                 measurement_noise=tracking.measurement_noise,
             ),
-            lifter=NearestPoseLifter(library, neighbours=people.neighbours, temporal=people.temporal),
+            lifter=NearestPoseLifter(
+                library,
+                neighbours=people.neighbours,
+                temporal=people.temporal,
+                pitch_rad=people.camera.pitch_rad,
+            ),
             metric_pose=MetricPose(
                 people.camera,
                 people.person_height_m,
@@ -133,6 +140,23 @@ class VideoToPose(nn.Module):
             ),
             smoother=KalmanSmoother(mode=smoothing.mode),
         ).eval()
+
+    def seen_by(self, camera: CameraConfig) -> "VideoToPose":
+        """The same stage, with the same networks, for another camera.
+
+        Raises:
+            TensorsimError: a lifter or metric pose of another class, which may know no camera.
+        """
+        if not isinstance(self.lifter, NearestPoseLifter) or not isinstance(self.metric_pose, MetricPose):
+            raise TensorsimError(
+                f"seen_by: got {type(self.lifter).__name__} and {type(self.metric_pose).__name__}, expected "
+                "NearestPoseLifter and MetricPose"
+            )
+        other = copy.copy(self)
+        other._modules = dict(self._modules)
+        other.lifter = self.lifter.tilted(camera.pitch_rad)
+        other.metric_pose = self.metric_pose.seen_by(camera)
+        return other.eval()
 
     def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Pose:
         """Estimate the people of whole clips.

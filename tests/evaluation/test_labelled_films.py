@@ -114,6 +114,7 @@ class Always(nn.Module):
     def __init__(self, index: int) -> None:
         super().__init__()
         self.index = index
+        self.class_names = ACTIVITIES
 
     class_names = ACTIVITIES
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tensorsim.config import CameraConfig
 from tensorsim.errors import (
     TensorsimError,
     check_finite,
@@ -49,6 +50,19 @@ class CameraEstimate(NamedTuple):
     height_sd_m: Tensor
     horizontal_fov_sd_rad: Tensor
     frames: Tensor
+
+
+def camera_config(found: CameraEstimate) -> CameraConfig:
+    """The camera of one clip above the origin, looking along +y; CameraConfig has no roll.
+
+    Args:
+        found: of one clip, fields of one element.
+    """
+    return CameraConfig(
+        horizontal_fov_rad=float(found.horizontal_fov_rad),
+        position_m=(0.0, 0.0, float(found.height_m)),
+        pitch_rad=float(found.pitch_rad),
+    )
 
 
 class CameraCalibrator(nn.Module):

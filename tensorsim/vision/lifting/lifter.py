@@ -90,6 +90,7 @@ class NearestPoseLifter(nn.Module):
         temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
             body heights and by 1 % of the size; 0 treats frames alone.
         chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair.
+        pitch_rad: upward tilt of the camera; depths are along its optical axis.
 
     Shape:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
@@ -110,6 +111,7 @@ class NearestPoseLifter(nn.Module):
         tolerance: float = 0.05,
         temporal: float = 1.0,
         chunk: int = 2**22,
+        pitch_rad: float = 0.0,
     ) -> None:
         super().__init__()
         poses = load_pose_library() if library is None else standardise_poses(library)
@@ -129,7 +131,15 @@ class NearestPoseLifter(nn.Module):
         # Per frame, at 30 frames a second: a limb that moves at 1.6 m/s, in body heights; somebody 4 m away who
         # walks at 1.2 m/s, in relative size. Sizes that change faster than bodies can move are wrong matches.
         self.change, self.size_change = 0.03, 0.01
-        self.search = PoseSearch(poses, yaws, neighbours, chunk)
+        self.search = PoseSearch(poses, yaws, neighbours, chunk, pitch_rad)
+
+    def tilted(self, pitch_rad: float) -> "NearestPoseLifter":
+        """The same for a camera of another tilt."""
+        search = self.search
+        return NearestPoseLifter(
+            search.library, search.yaws, self.neighbours, self.search_joints, self.tolerance, self.temporal,
+            search.chunk, pitch_rad,
+        ).to(search.library.device)  # fmt: skip
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
         """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""

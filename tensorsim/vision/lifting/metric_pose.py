@@ -174,6 +174,14 @@ class MetricPose(nn.Module):
         self.register_buffer("distances", torch.tensor(distances, dtype=torch.float64), persistent=False)
         self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
 
+    def seen_by(self, camera: CameraConfig) -> "MetricPose":
+        """The same for another camera."""
+        distances = tuple(self.distances.tolist()) if self.distance_gives_focal else None
+        return MetricPose(
+            camera, tuple(self.heights.tolist()), distances, self.keypoint_threshold, self.mode,
+            self.range_smoothing_s, self.floor_window_s, self.calibrated,
+        ).to(self.heights.device)  # fmt: skip
+
     def forward(
         self,
         keypoints: Tensor,

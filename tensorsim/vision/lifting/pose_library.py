@@ -48,6 +48,13 @@ def turn(joints: Tensor, angle: Tensor) -> Tensor:
     return torch.stack([c * x - s * y, s * x + c * y, z.expand_as(c * x)], dim=-1)
 
 
+def seen_from(joints: Tensor, pitch_rad: float) -> Tensor:
+    """Joints (..., J, 3) in the axes right, forward, up of a camera tilted upwards by ``pitch_rad``."""
+    c, s = math.cos(pitch_rad), math.sin(pitch_rad)
+    x, y, z = joints[..., 0], joints[..., 1], joints[..., 2]
+    return torch.stack([x, c * y + s * z, c * z - s * y], dim=-1)
+
+
 def all_headings(poses: Tensor, yaws: int) -> Tensor:
     """Every pose (L, 14, 3) at ``yaws`` evenly spaced headings: (L * yaws, 14, 3).
 

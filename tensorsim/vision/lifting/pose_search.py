@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import is_exporting
-from tensorsim.vision.lifting.pose_library import all_headings, turn
+from tensorsim.vision.lifting.pose_library import all_headings, seen_from, turn
 
 #: Poses of a block at most; half as many at least, in a pool that needs more than one.
 BLOCK = 8192
@@ -151,6 +151,7 @@ class PoseSearch(nn.Module):
         neighbours: how many to return.
         chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair. Blocks of 8192
             poses are its least.
+        pitch_rad: upward tilt of the camera; poses are compared, and given, in its axes right, forward, up.
 
     Shape:
         key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, ``pose * yaws + heading``, best
@@ -165,10 +166,18 @@ class PoseSearch(nn.Module):
     rounding: Tensor
     coarse: Tensor
 
-    def __init__(self, library: Tensor, yaws: int, neighbours: int, chunk: int) -> None:
+    def __init__(
+        self, library: Tensor, yaws: int, neighbours: int, chunk: int, pitch_rad: float = 0.0
+    ) -> None:
         super().__init__()
         self.yaws, self.neighbours, self.chunk = yaws, neighbours, chunk
-        seen = torch.cat([seen_along_depth(all_headings(part, yaws)).float() for part in library.split(8192)])
+        self.pitch_rad = float(pitch_rad)
+        seen = torch.cat(
+            [
+                seen_along_depth(seen_from(all_headings(part, yaws), pitch_rad)).float()
+                for part in library.split(8192)
+            ]
+        )
         self.block = max(BLOCK, 3 * neighbours)
         order, self.starts = blocks_of_similar(seen, self.block)
         centres, radius, rounding = [], [], []
@@ -196,7 +205,8 @@ class PoseSearch(nn.Module):
     def poses(self, index: Tensor) -> Tensor:
         """Poses (..., 14, 3) of indices (...)."""
         base = self.library[torch.div(index, self.yaws, rounding_mode="floor")]
-        return turn(base, (index % self.yaws).to(base.dtype) * (2 * math.pi / self.yaws))
+        turned = turn(base, (index % self.yaws).to(base.dtype) * (2 * math.pi / self.yaws))
+        return seen_from(turned, self.pitch_rad)
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Tensor:
         """Key points (N, 14, 2) and weights (N, 14) -> indices (N, neighbours)."""
