@@ -124,20 +124,3 @@ def test_counts_without_end_are_refused_at_once() -> None:
         with pytest.raises(TensorsimError, match="got"):
             make()
     assert time.process_time() - start < 1.0
-
-
-def test_the_check_is_cheap() -> None:
-    stage = ts.radar.RangeProfile(ts.RadarConfig.free_space())
-    x = torch.randn(4096, 400, dtype=torch.complex64)
-
-    def seconds(run: Callable[[], Any]) -> float:
-        times = []
-        for _ in range(7):
-            start = time.process_time()
-            run()
-            times.append(time.process_time() - start)
-        return min(times)
-
-    # Measured: 0.3 of 49 ms; the bound leaves room for caches that other processes use.
-    check = seconds(lambda: check_tensor(x, "IF", "(..., pulses, samples)", "complex"))
-    assert check < 0.1 * seconds(lambda: stage(x))

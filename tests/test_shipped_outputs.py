@@ -1,0 +1,119 @@
+"""What each shipped network puts out for a fixed picture: a slip in a layer, an axis or a file shows here."""
+
+import hashlib
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+import tensorsim as ts
+from tensorsim import registry
+from tensorsim.recognition import SPGNet
+
+
+def wave(*shape: int) -> Tensor:
+    """A picture in [0, 1] without a random generator: a sine whose frequency varies."""
+    k = torch.arange(torch.Size(shape).numel(), dtype=torch.float64)
+    return (0.5 + 0.5 * torch.sin(0.37 * k + 3 * torch.sin(0.0113 * k))).view(shape).float()
+
+
+def detector_logits(network: ts.vision.RTMDet) -> Tensor:
+    logits, distances = network.dense(network.preprocess(wave(1, 3, 96, 128)))
+    return torch.cat([part.flatten()[::97] for part in (*logits, *distances)])
+
+
+#: The numbers of each class that are looked at.
+LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
+    "SPGNet": lambda network: network(wave(1, 1, 32, 32)),
+    "SPNet": lambda network: network(wave(1, 1, 64, 64)),
+    "DnCNN": lambda network: network.noise(wave(24, 40)).flatten()[::96],  # type: ignore[operator]
+    "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
+    "RTMDet": detector_logits,  # type: ignore[dict-item]
+}
+
+#: First numbers and root mean square of all, by the first digits of the file's SHA-256.
+EXPECTED: dict[str, tuple[list[float], float]] = {
+    "3e31c19d1c08a907": ([-5.78223, 8.07222, -2.6708, -6.05222, -10.15618, -4.5035], 6.0945),  # SPGNet
+    "b4c9d14cc7cd82d5": ([-0.26914, 34.51579, 9.87718, -35.4698, -28.01119, -28.01397], 21.309),  # SPNet
+    "7a15296264b6a721": ([0.74892, 1.13028, 0.24339, 0.36871, 1.25796, 0.71812], 0.76663),  # DnCNN
+    "bb5e978e9c128605": ([-6.66106, -3.67088, -3.76238, -3.3301, -3.37612, -3.54607], 31.623),  # RTMDet
+    "ac94cf65a655eeea": (  # HRNet
+        [-0.00128937, -0.00141716, -0.00127411, -0.00194263, -0.00210953, -0.00169086],
+        0.001421,
+    ),
+}
+
+
+@pytest.mark.parametrize("entry", registry.shipped(), ids=lambda entry: entry.name)
+def test_outputs_are_those_of_the_file(entry: registry.ModelEntry) -> None:
+    rooms = (ts.vision, ts.enhance, ts.recognition)
+    (kind,) = (getattr(room, entry.network) for room in rooms if hasattr(room, entry.network))
+    with torch.no_grad():
+        values = LOOK[entry.network](kind.from_pretrained(entry.name)).double().flatten()
+    digest = hashlib.sha256(entry.path.read_bytes()).hexdigest()[:16]
+    first, rms = [float(f"{v:.6g}") for v in values[:6]], float(values.square().mean().sqrt())
+    line = f'"{digest}": ({first}, {rms:.5g}),  # {entry.file}'
+    assert digest in EXPECTED, (
+        f"{entry.file} is new: once its card's figures are measured, add this line: {line}"
+    )
+    torch.testing.assert_close(
+        torch.tensor([*first, rms]),
+        torch.tensor([*EXPECTED[digest][0], EXPECTED[digest][1]]),
+        rtol=2e-3,
+        atol=2e-4 * rms,
+    )
+
+
+def test_no_values_of_files_that_are_gone() -> None:
+    there = {hashlib.sha256(entry.path.read_bytes()).hexdigest()[:16] for entry in registry.shipped()}
+    assert set(EXPECTED) <= there
+
+
+def spgnet_by_hand(state: dict[str, Tensor], pictures: Tensor) -> Tensor:
+    """SPGNet (s2p6) from its weights alone, written as the paper draws it."""
+
+    def conv_norm(x: Tensor, name: str, stride: int = 1, groups: int = 1) -> Tensor:
+        weight = state[f"{name}.0.weight"]
+        x = F.conv2d(x, weight, None, stride, weight.shape[-1] // 2, groups=groups)
+        scale = state[f"{name}.1.weight"] / torch.sqrt(state[f"{name}.1.running_var"] + 1e-5)
+        shift = state[f"{name}.1.bias"] - state[f"{name}.1.running_mean"] * scale
+        return x * scale[:, None, None] + shift[:, None, None]
+
+    def two_levels(x: Tensor, name: str, stride: int, project: bool) -> Tensor:
+        o1 = conv_norm(conv_norm(x, f"{name}.enter").relu(), f"{name}.first", stride, 6).relu()
+        o2 = conv_norm(o1, f"{name}.second", 1, 6).relu()
+        fused = conv_norm(torch.cat([o1, o2], 1), f"{name}.fuse")
+        if stride == 2:
+            shallow = conv_norm(x, f"{name}.skip.0", 2, x.shape[1])
+            x = conv_norm(shallow, f"{name}.skip.1")
+        elif project:
+            x = conv_norm(x, f"{name}.skip")
+        return (x + fused).relu()
+
+    x = pictures - state["mean"][:, None, None]
+    x = conv_norm(conv_norm(x, "body.0").relu(), "body.1").relu()
+    index = 2
+    for blocks in (4, 8, 3):
+        for block in range(blocks):
+            x = two_levels(x, f"body.{index}", 2 if block == 0 else 1, False)
+            index += 1
+    x = conv_norm(x, f"body.{index}").relu().mean((2, 3))
+    x = x @ state["fc1.weight"].T
+    x = (x - state["norm.running_mean"]) / torch.sqrt(state["norm.running_var"] + 1e-5)
+    x = (x * state["norm.weight"] + state["norm.bias"]).relu()
+    return x @ state["fc2.weight"].T
+
+
+def test_spgnet_is_the_network_of_its_paper() -> None:
+    network = SPGNet.from_pretrained().double()
+    pictures = wave(3, 1, 32, 32).double()
+    with torch.no_grad():
+        expected = spgnet_by_hand(network.state_dict(), pictures)
+        torch.testing.assert_close(network(pictures), expected, rtol=1e-9, atol=1e-9)
+        # Its pieces matter: the order of the two levels, and the mean.
+        swapped = dict(network.state_dict())
+        weight = swapped["body.2.fuse.0.weight"]
+        swapped["body.2.fuse.0.weight"] = torch.cat(weight.chunk(2, 1)[::-1], 1)
+        assert float((spgnet_by_hand(swapped, pictures) - expected).abs().max()) > 1e-3
