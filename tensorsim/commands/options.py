@@ -56,9 +56,14 @@ class RadarOptions(PanelOptions):
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, free-space, through-wall) or a YAML file with fields of
     RadarConfig; a wall that it comes with replaces the scene's, a floor adds its reflections."""
-    body: Literal["joints", "limbs", "version1"] | None = None
+    body: Literal["joints", "limbs", "version1", "surface"] | None = None
     """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
-    cross section follows the aspect, or the 13 points of the original's first version. Default: joints."""
+    cross section follows the aspect, the 13 points of the original's first version, or points over torso and limbs
+    with the energy over speed of measured walks. Default: joints."""
+    sway: bool = False
+    """People sway while they stand."""
+    vital_signs: bool = False
+    """People breathe and their hearts beat."""
     motion: Literal["smooth", "paper"] | None = None
     """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay."""
     integration: Literal["noncoherent", "paper"] | None = None
@@ -160,7 +165,7 @@ class RadarOptions(PanelOptions):
         if self.motion is not None:
             smoothing = SimulationConfig.paper().smoothing if self.motion == "paper" else SmoothingConfig()
             config = config.replace(smoothing=smoothing)
-        for switch in ("leakage", "wall_echo"):
+        for switch in ("leakage", "wall_echo", "sway", "vital_signs"):
             if getattr(self, switch):
                 config = config.replace(**{f"scene__{switch}": True})
         for option, field in FIELDS.items():

@@ -12,7 +12,7 @@ WallPaths = Literal["series", "paper"]
 Incidence = Literal["normal", "oblique", "airy"]
 Polarization = Literal["te", "tm"]
 NoiseReference = Literal["echo", "total", "absolute"]
-Body = Literal["joints", "limbs", "version1"]
+Body = Literal["joints", "limbs", "version1", "surface"]
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,11 @@ class SceneConfig:
         polarization: ``"te"`` or ``"tm"`` at the wall.
         bounces: largest number of pairs of bounces inside the wall on each leg.
         paths: names of propagation paths in place of the switches above, see :class:`tensorsim.radar.EchoSynthesizer`.
-        body: scatterers of a person: the 14 joints, 36 points along the limbs, or the 13 points of the original's
-            first version.
+        body: scatterers of a person: the 14 joints of the panel, 36 points along the limbs, the 13 points of the
+            original's first version, or points over torso and limbs with the energy over speed of measured walks
+            (``"surface"``, :class:`tensorsim.motion.BodyScatterers`).
+        sway: people sway while they stand, see :class:`tensorsim.motion.PosturalSway`.
+        vital_signs: people breathe and their hearts beat, see :class:`tensorsim.motion.VitalSigns`.
         snr_db: signal-to-noise ratio per IF sample in dB (panel: SNR, 50 dB); None is free of noise.
         noise_reference: signal power that ``snr_db`` refers to, see :class:`tensorsim.radar.ReceiverNoise`.
         noise_figure_db: noise figure of the receiver for ``noise_reference="absolute"``.
@@ -56,6 +59,8 @@ class SceneConfig:
     bounces: int = 1
     paths: tuple[str, ...] | None = None
     body: Body = "joints"
+    sway: bool = False
+    vital_signs: bool = False
     snr_db: float | None = 50.0
     noise_reference: NoiseReference = "echo"
     noise_figure_db: float = 10.0

@@ -1,6 +1,6 @@
 """Joints at video rate -> maps of the radar."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -9,10 +9,13 @@ from tensorsim.config import SimulationConfig
 from tensorsim.enhance.dncnn import MapDenoiser
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.body13 import Body13Scatterers
+from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
+from tensorsim.motion.sway import PosturalSway
+from tensorsim.motion.vital_signs import VitalSigns
 from tensorsim.protocols import check_part
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import RadarMaps
@@ -31,6 +34,9 @@ class PoseToDoppler(nn.Module):
         denoiser: optional module on magnitude maps (..., H, W), e.g. ``tensorsim.enhance.MapDenoiser``. It cleans
             the shown maps; the Doppler-time map is computed from data that was not denoised.
         rcs_scale: factor on the cross sections by person; the last one serves the rest.
+        small_motions: motions of the body that no camera resolves, added at the pulse rate, e.g.
+            :class:`tensorsim.motion.PosturalSway` and :class:`tensorsim.motion.VitalSigns`: modules
+            (joints (B, P, M, 14, 3), first pulse) -> joints.
     """
 
     rcs_scale: Tensor
@@ -43,6 +49,7 @@ class PoseToDoppler(nn.Module):
         scatterers: nn.Module | None = None,
         denoiser: nn.Module | None = None,
         rcs_scale: tuple[float, ...] = (1.0,),
+        small_motions: Sequence[nn.Module] = (),
     ) -> None:
         super().__init__()
         self.simulator = simulator
@@ -51,6 +58,7 @@ class PoseToDoppler(nn.Module):
         self.halo = 0 if pulse_smoother is None else pulse_smoother.window
         self.pulse_smoother = pulse_smoother if pulse_smoother is not None else nn.Identity()
         self.scatterers = check_part(JointScatterers() if scatterers is None else scatterers, "scatterers")
+        self.small_motions = nn.ModuleList(small_motions)
         self.denoises = denoiser is not None
         self.denoiser = check_part(nn.Identity() if denoiser is None else denoiser, "denoiser")
         if len(rcs_scale) == 0 or not all(scale > 0 for scale in rcs_scale):
@@ -74,7 +82,17 @@ class PoseToDoppler(nn.Module):
             "joints": JointScatterers,
             "limbs": lambda: LimbScatterers(scene.radar.tx_positions_m[0], scene.radar.rx_positions_m[0]),
             "version1": Body13Scatterers,
+            "surface": lambda: BodyScatterers(
+                scene.radar.tx_positions_m[0],
+                scene.radar.rx_positions_m[0],
+                scene.radar.carrier_hz + scene.radar.bandwidth_hz / 2,
+            ),
         }
+        small_motions: list[nn.Module] = []
+        if scene.sway:
+            small_motions.append(PosturalSway(prf_hz, seed=config.seed))
+        if scene.vital_signs:
+            small_motions.append(VitalSigns(prf_hz, seed=config.seed))
         denoiser = None if processing.denoiser is None else MapDenoiser.from_pretrained(processing.denoiser)
         people = len(config.pose.person_weight_kg)
         return cls(
@@ -84,6 +102,7 @@ class PoseToDoppler(nn.Module):
             bodies[scene.body](),
             denoiser,
             tuple(config.pose.rcs_scale(person) for person in range(people)),
+            small_motions,
         ).eval()
 
     def forward(self, joints: Tensor, valid: Tensor, fps: float) -> RadarMaps:
@@ -112,6 +131,8 @@ class PoseToDoppler(nn.Module):
         first, last = max(0, start - self.halo), min(pulses, stop + self.halo)
         positions = self.pulse_smoother(self.resampler.evaluate(coefficients, fps, first, last))
         positions = positions[:, :, start - first : stop - first]
+        for motion in self.small_motions:
+            positions = motion(positions, start)
         presence = visibility_fade(valid, fps, self.resampler.prf_hz, start, stop)
         # Scatterers scale cross sections with the square of the presence.
         person = torch.arange(valid.shape[1], device=valid.device).clamp(max=self.rcs_scale.shape[0] - 1)

@@ -205,3 +205,28 @@ def test_weights_scale_the_cross_sections() -> None:
     ratio = (rcs[0] / rcs[1]).reshape(4, 3, 14)
     torch.testing.assert_close(ratio[:, 0], torch.full_like(ratio[:, 0], 2**0.425), rtol=1e-5, atol=0)
     torch.testing.assert_close(ratio[:, 1:], torch.ones_like(ratio[:, 1:]), rtol=1e-6, atol=0)
+
+
+def test_bodies_and_small_motions_are_those_of_the_scene() -> None:
+    scene = {"scene__radar": ts.RadarConfig.through_wall(), "scene__snr_db": None}
+    config = ts.SimulationConfig().replace(
+        **scene, scene__body="surface", scene__sway=True, scene__vital_signs=True
+    )
+    stage = PoseToDoppler.from_config(config)
+    assert isinstance(stage.scatterers, ts.motion.BodyScatterers)
+    plain = PoseToDoppler.from_config(ts.SimulationConfig().replace(**scene))
+    body = torch.rand(1, 1, 1, 14, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor(
+        [0.0, 3.0, 0.5]
+    )
+    still, valid = body.expand(1, 1, 60, 14, 3).contiguous(), torch.ones(1, 1, 60, dtype=torch.bool)
+    # A body that stands still is silent without them; pieces of the motion are those of the whole.
+    assert float(plain(still, valid, 30.0).doppler_time.max()) < 1e-6 * float(
+        plain(still, valid, 30.0).range_time.max()
+    )
+    assert float(stage(still, valid, 30.0).doppler_time.max()) > 1e-4 * float(
+        stage(still, valid, 30.0).range_time.max()
+    )
+    coefficients = stage.resampler.coefficients(still, 30.0)
+    whole, part = (stage.scene(coefficients, valid, 30.0, start, 60)[0] for start in (0, 40))
+    torch.testing.assert_close(whole[:, 40:], part)
+    assert_same(torch.jit.script(stage)(still, valid, 30.0), alive, atol=1e-5)
