@@ -59,10 +59,17 @@ EQUATIONS = {
             "test_equal_weights_give_the_nearest_neighbours_of_normalised_poses",
         ),
         Equation(
-            "scale and position in metres",
-            "alpha = person height / pixel height, x = alpha (u_hip - u_hip at the start)",
-            "tensorsim.vision.lifting.metric_pose.paper_pose",
-            "tests/vision/lifting/test_metric_pose.py::test_papers_position_is_pixels_times_alpha_at_constant_range",
+            "scale in metres per pixel",
+            "alpha = person height / pixel height",
+            "tensorsim.vision.lifting.metric_pose.metres_per_pixel",
+            "tests/vision/lifting/test_metric_pose.py::test_papers_position_adds_pixels_times_alpha_at_constant_range",
+        ),
+        Equation(
+            "position in metres",
+            "x(t) = x(t - 1) + alpha(t) (u_hip(t) - u_hip(t - 1))",
+            "tensorsim.vision.lifting.metric_pose.accumulated_displacement",
+            "tests/vision/lifting/test_metric_pose.py::"
+            "test_papers_position_stays_where_the_hips_stay_while_the_scale_changes",
         ),
         Equation(
             "Kalman filter, constant velocity",
