@@ -6,6 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.options import check_seed
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class EvaluateMeasured:
     """Folder of the results."""
     quick: bool = False
     """Take the shipped weights, trained on simulation alone, and train nothing."""
+    ablation: bool = False
+    """Instead: train on simulation without each of its effects in turn, and print what each is worth."""
     sets: tuple[Literal["glasgow_cfar_masks", "kmkim_cw24_iq", "radhar_points"], ...] = ()
     """Which sets; default all that both folders have."""
     clips: int = 300
@@ -46,7 +49,10 @@ class EvaluateMeasured:
             if not folder.is_dir():
                 raise TensorsimError(f"{folder}: no such folder, expected measured sets")
 
-        from tensorsim.evaluation.measured.report import figures, table, write, write_json
+        if self.quick and self.ablation:
+            raise TensorsimError("--quick, --ablation: got both, expected one: an ablation trains")
+
+        from tensorsim.evaluation.measured.report import ablation_table, figures, table, write, write_json
         from tensorsim.evaluation.measured.run import Experiment
         from tensorsim.evaluation.measured.sets import SETS
 
@@ -60,8 +66,15 @@ class EvaluateMeasured:
             experiment = Experiment(
                 measured, self.train, self.test, self.out, self.clips, self.steps, self.seed, self.quiet
             )
+            if self.ablation:
+                rows = ablation_table(measured, experiment.ablation(), experiment.test_labels)
+                with complete_file(self.out / f"ablation_{measured.name}.md") as path:
+                    path.write_text(rows + "\n", encoding="utf-8")
+                print(rows, flush=True)
+                continue
             logits = experiment.quick() if self.quick else experiment.full()
             results[measured.name] = figures(measured, logits, experiment.test_labels)
             errors[measured.name] = write(self.out, measured.name, measured, logits, experiment.test_labels)
             write_json(self.out / "measured.json", results)
-        print(table(results, errors))
+        if results:
+            print(table(results, errors))

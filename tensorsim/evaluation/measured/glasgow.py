@@ -72,12 +72,12 @@ class Effects:
 class Glasgow:
     """Simulated and measured masks; rows ascend from approaching to receding, as in the files."""
 
-    def __init__(self, effects: Effects | None = None) -> None:
-        self.effects = Effects() if effects is None else effects
+    def __init__(self, effects: Effects) -> None:
+        self.effects = effects
         profile = RangeProfile(RADAR, window=None, gate_m=(3.4, 7.6))
         self.bins = profile.last_bin - profile.first_bin + 1
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
-        self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)
+        self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=3)
         self.mti = MovingTargetIndicator("high-pass", RADAR, cutoff_m_s=3.75 * RADAR.doppler_wavelength_m / 2)
         self.maps = DopplerTimeMap(RADAR, window_s=0.2, overlap=0.9)
         self.cfar = CfarDetector(
@@ -87,7 +87,7 @@ class Glasgow:
     def motion(self, label: int, count: int, generator: torch.Generator) -> tuple[Tensor, float]:
         """Joints (count, K, 14, 3) at ``KNOT_HZ`` and the length of the clips in s."""
         draw = Draw(count, generator)
-        config = PeopleConfig(heading_rad=0.4, facing_radar_share=1.0, speed_m_s=(0.7, 1.35))
+        config = PeopleConfig(heading_rad=0.4, facing_radar_share=1.0, speed_m_s=(0.6, 1.25))
         people = stage_people(count, draw, config, None)
         range_m = draw(4.2, 5.6)
         if label == 0:
@@ -105,16 +105,16 @@ class Glasgow:
             duration = 5.0
             time = knots(duration).expand(count, -1)
             script, first_s, start, rate = {
-                1: (sit_down, 0.8, (0.3, 2.6), (0.85, 1.7)),
-                2: (stand_up, 0.7, (0.2, 2.2), (0.85, 1.7)),
-                3: (pick_up, 0.0, (-0.1, 2.2), (0.75, 1.5)),
-                4: (drink, 0.0, (-0.2, 1.8), (0.7, 1.5)),
-                5: (fall_down, 0.0, (-0.1, 2.6), (0.55, 1.1)),
+                1: (sit_down, 0.8, (0.3, 2.6), (0.9, 2.0)),
+                2: (stand_up, 0.7, (0.2, 2.2), (0.95, 2.0)),
+                3: (pick_up, 0.0, (-0.1, 2.2), (0.75, 1.6)),
+                4: (drink, 0.0, (-0.2, 1.8), (0.8, 1.9)),
+                5: (fall_down, 0.0, (-0.1, 2.6), (0.6, 1.3)),
             }[label]
             joints = act_out(script, (time - draw(*start)) * draw(*rate) + first_s, people)
             joints = place(joints, draw(-0.3, 0.3), range_m)
         if self.effects.unrest:
-            joints = add_unrest(joints, draw, Unrest((0.002, 0.015), (0.0, 0.07)))
+            joints = add_unrest(joints, draw, Unrest((0.003, 0.025), (0.0, 0.07)))
         return joints, duration
 
     def masks(self, joints: Tensor, duration: float, generator: torch.Generator) -> Tensor:
@@ -124,7 +124,7 @@ class Glasgow:
         at = torch.arange(pulses, dtype=torch.float64) / RADAR.prf_hz
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.dim_limbs:
-            gain_db = draw(-16.0, 0.0) + 3 * draw.normal(len(SEGMENTS))
+            gain_db = draw(-13.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
             gain_db[:, 1] = 0.0  # the torso
             rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
         positions, rcs = at_instants(positions, at), linear(rcs, at)
@@ -133,7 +133,7 @@ class Glasgow:
         signal_db = draw(28.0, 48.0) if self.effects.levels else draw(38.0, 38.0)
         if self.effects.image:
             # Both senses of motion in each frame: the image of imperfect quadrature and of scattered paths.
-            image_db = draw(-34.0, -8.0)
+            image_db = draw(-45.0, -14.0)
             echo = echo + 10 ** (image_db / 20).float().unsqueeze(-1) * echo.conj()
         x = echo * 10 ** (signal_db / 20).float().unsqueeze(-1)
         x = x + self._receiver(draw, pulses)
@@ -149,7 +149,7 @@ class Glasgow:
         frequency = torch.fft.fftfreq(pulses, 1 / rate)
         if self.effects.residue:
             # Phase noise of antenna leakage, walls and furniture, highest next to the carrier.
-            corner, strength_db = draw(3.0, 7.0).float(), draw(14.0, 38.0).float()
+            corner, strength_db = draw(3.0, 9.0).float(), draw(14.0, 38.0).float()
             spectrum = 10 ** (strength_db / 20) / (1 + (frequency / corner).abs() ** 3)
             white = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float())
             noise = noise + torch.fft.ifft(torch.fft.fft(white, dim=1) * spectrum[..., None], dim=1) / 2**0.5
@@ -168,7 +168,8 @@ class Glasgow:
         """CFAR on the decibels of maps (N, F, K), resized to 128 x 256."""
         db = 20 * maps.clamp(min=1e-6).log10()
         db = db - db.median(dim=-1)[0].median(dim=-1)[0][:, None, None] + level_db.float().unsqueeze(-1)
-        db = F.interpolate(db.flip(-2)[:, None], (128, 256), mode="bilinear", antialias=True)[:, 0]
+        # Doppler 0 in the middle of the measured masks, a third of a row before row 128 of 256.
+        db = F.interpolate(db.flip(-2).roll(1, -2)[:, None], (128, 256), mode="bilinear", antialias=True)[:, 0]
         return self.cfar(db.clamp(min=0.0))
 
     def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:

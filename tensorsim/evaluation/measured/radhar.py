@@ -72,8 +72,8 @@ class Effects:
 class RadHar:
     """Simulated presence maps over Doppler bins and time."""
 
-    def __init__(self, effects: Effects | None = None) -> None:
-        self.effects = Effects() if effects is None else effects
+    def __init__(self, effects: Effects) -> None:
+        self.effects = effects
         profile = RangeProfile(RADAR, window="hamming", gate_m=(0.8, 4.6))
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
         self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)

@@ -99,6 +99,14 @@ class Experiment:
         logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
         return logits
 
+    def ablation(self) -> dict[str, Tensor]:
+        """Logits (N, classes) of the test clips by simulation alone, whole and without each effect in turn."""
+        logits = {}
+        for effect in ("", *self.measured.effect_names):
+            simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet, effect or None)
+            logits[effect] = predict(self._fit(self._new(), simulated, labels, self.steps), self.test)
+        return logits
+
     def _new(self) -> PictureNet:
         torch.manual_seed(self.seed)
         return PictureNet(len(self.measured.classes), self.train.shape[-2])

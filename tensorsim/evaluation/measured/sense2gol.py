@@ -66,8 +66,8 @@ def doppler_maps(iq: Tensor) -> Tensor:
 class Sense2Gol:
     """Simulated bursts of I/Q in counts of the 12-bit converter."""
 
-    def __init__(self, effects: Effects | None = None) -> None:
-        self.effects = Effects() if effects is None else effects
+    def __init__(self, effects: Effects) -> None:
+        self.effects = effects
         self.echo = ContinuousWaveEcho(CARRIER_HZ, ANTENNA_M, ANTENNA_M)
         self.scatterers = LimbScatterers(ANTENNA_M, ANTENNA_M, per_segment=3)
         frames = torch.arange(FRAMES, dtype=torch.float64) * FRAME_S

@@ -1,9 +1,10 @@
 """The measured sets: what each needs of the simulation, of its folder and of the network."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -26,7 +27,8 @@ class MeasuredSet:
         file: what is read in that folder.
         classes: names in the order of the labels.
         subset: classes of the figure for a part of them.
-        simulator: makes something with ``simulate(label, count, generator)`` -> maps (count, H, W).
+        simulator: of some effects, makes something with ``simulate(label, count, generator)`` -> maps (count, H, W).
+        effects: dataclass of what the simulation has beside bodies that move, each a bool.
         read: folder -> maps (N, H, W) and labels (N,).
         pictures: maps -> pictures (N, 1, rows, columns).
         augment: changes of pictures in training.
@@ -37,7 +39,8 @@ class MeasuredSet:
     file: str
     classes: tuple[str, ...]
     subset: tuple[str, ...]
-    simulator: Callable[[], "Simulator"]
+    simulator: Callable[[Any], "Simulator"]
+    effects: type
     read: Callable[[Path], tuple[Tensor, Tensor]]
     pictures: Callable[[Tensor], Tensor]
     augment: Augment
@@ -62,9 +65,16 @@ class MeasuredSet:
             raise TensorsimError(f"{path}: got no clips, expected at least one")
         return self.pictures(maps), labels
 
-    def simulate(self, clips: int, seed: int, quiet: bool) -> tuple[Tensor, Tensor]:
-        """Simulated pictures (N, 1, H, W) and labels (N,), ``clips`` of each class."""
-        simulator = self.simulator()
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        """What can be left out of the simulation."""
+        return tuple(field.name for field in dataclasses.fields(self.effects))
+
+    def simulate(
+        self, clips: int, seed: int, quiet: bool, without: str | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Simulated pictures (N, 1, H, W) and labels (N,), ``clips`` of each class, perhaps without an effect."""
+        simulator = self.simulator(self.effects(**({} if without is None else {without: False})))
         shown, labels = [], []
         bar = tqdm(total=clips * len(self.classes), desc=f"{self.name}: simulated", disable=quiet)
         for label in range(len(self.classes)):
@@ -94,6 +104,7 @@ SETS: tuple[MeasuredSet, ...] = (
         glasgow.CLASSES,
         ("walking", "sitting_down", "standing_up", "falling"),
         glasgow.Glasgow,
+        glasgow.Effects,
         glasgow.read,
         glasgow.pictures,
         glasgow.augment,
@@ -105,6 +116,7 @@ SETS: tuple[MeasuredSet, ...] = (
         sense2gol.CLASSES,
         ("walk", "run", "creep"),
         sense2gol.Sense2Gol,
+        sense2gol.Effects,
         sense2gol.read,
         sense2gol.pictures,
         sense2gol.augment,
@@ -116,6 +128,7 @@ SETS: tuple[MeasuredSet, ...] = (
         radhar.CLASSES,
         ("boxing", "squats", "walk"),
         radhar.RadHar,
+        radhar.Effects,
         radhar.read,
         radhar.pictures,
         radhar.augment,

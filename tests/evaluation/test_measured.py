@@ -1,0 +1,212 @@
+"""The experiments on measured sets: on small folders of their layout, and quickly on the real ones."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim import cli
+from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.measured import glasgow, radhar, report, sense2gol
+from tensorsim.evaluation.measured.run import SETTINGS, few, lda_logits
+from tensorsim.evaluation.measured.sets import SETS
+from tensorsim.evaluation.measured.training import fit_pictures, predict, shift
+from tensorsim.recognition import PictureNet
+
+
+def write_folder(folder: Path, clips: int, seed: int) -> Path:
+    """Random sets of the layout that the README of the measured sets gives."""
+    rng = np.random.default_rng(seed)
+    for name in ("glasgow_cfar_masks", "kmkim_cw24_iq", "radhar_points"):
+        (folder / name).mkdir(parents=True)
+    labels = np.arange(6).repeat(clips).astype(np.int8)
+    masks = rng.random((6 * clips, 256, 256)) < 0.05
+    masks[:, 126:130] = True
+    np.savez(
+        folder / "glasgow_cfar_masks" / "masks.npz", dt_packed=np.packbits(masks, axis=-1), label=labels,
+        classes=np.array(glasgow.CLASSES),
+    )  # fmt: skip
+    labels = np.arange(5).repeat(clips).astype(np.int8)
+    np.savez(
+        folder / "kmkim_cw24_iq" / "clips.npz", label=labels,
+        iq=(2090 + 100 * rng.normal(size=(5 * clips, 2, 1920))).astype(np.int16),
+        classes=np.array(["walk", "run", "stride", "creep", "empty"]),
+    )  # fmt: skip
+    dt = (rng.random((5 * clips, 16, 60)) < 0.1) * np.uint8(120)
+    np.savez(folder / "radhar_points" / "maps.npz", dt=dt, label=labels, classes=np.array(radhar.CLASSES))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("measured")
+    return write_folder(root / "train", 3, 0), write_folder(root / "test", 2, 1)
+
+
+def words(folders, out: Path, *more: str) -> list[str]:
+    train, test = map(str, folders)
+    return ["evaluate", "measured", "--train", train, "--test", test, "--out", str(out), "--quiet", *more]
+
+
+def test_every_experiment_is_run_and_written(folders, tmp_path, capsys):
+    cli.main(words(folders, tmp_path, "--sets", "radhar_points", "--clips", "2", "--steps", "3"))
+    results = json.loads((tmp_path / "measured.json").read_text())
+    assert list(results) == ["radhar_points"]
+    row = results["radhar_points"]
+    assert set(row) == {"classes", "simulation_only_subset", *SETTINGS}
+    assert row["classes"] == 5
+    assert row["simulation_only_subset"]["classes"] == ["boxing", "squats", "walk"]
+    assert all(0 <= row[name] <= 1 for name in SETTINGS)
+    for setting in SETTINGS:
+        with (tmp_path / f"confusion_radhar_points_{setting}.csv").open() as file:
+            rows = list(csv.reader(file))
+        counts = np.array([[int(x) for x in line[1:]] for line in rows[1:]])
+        assert counts.sum(1).tolist() == [2] * 5
+        assert np.trace(counts) / counts.sum() == pytest.approx(row[setting])
+    assert (tmp_path / "calibration_radhar_points.csv").is_file()
+    assert PictureNet.from_pretrained(tmp_path / "measured_radhar.safetensors").rows == 16
+    assert "| radhar_points | 5 |" in capsys.readouterr().out
+
+
+def test_quick_takes_the_shipped_weights(folders, tmp_path, capsys):
+    cli.main(words(folders, tmp_path, "--quick"))
+    results = json.loads((tmp_path / "measured.json").read_text())
+    assert list(results) == [s.name for s in SETS]
+    for row in results.values():
+        assert 0 <= row["simulation_only"] <= 1
+        assert [row[name] for name in SETTINGS[1:]] == [None] * 4
+    assert "glasgow_cfar_masks" in capsys.readouterr().out
+
+
+def test_shipped_weights_know_measured_clips(shared_data, tmp_path):
+    """Simulation alone on the recordings given for development; floors below the figures of the cards."""
+    folder = shared_data / "measured"
+    if not folder.is_dir():
+        pytest.skip("no measured sets beside the checkout")
+    cli.main(words((folder, folder), tmp_path, "--quick"))
+    results = json.loads((tmp_path / "measured.json").read_text())
+    floors = {"glasgow_cfar_masks": (0.55, 0.75), "kmkim_cw24_iq": (0.7, 0.85), "radhar_points": (0.4, 0.5)}
+    for name, (least, least_subset) in floors.items():
+        assert results[name]["simulation_only"] > least
+        assert results[name]["simulation_only_subset"]["accuracy"] > least_subset
+
+
+def test_ablation_leaves_out_each_effect(folders, tmp_path, capsys):
+    cli.main(
+        words(folders, tmp_path, "--ablation", "--sets", "kmkim_cw24_iq", "--clips", "1", "--steps", "1")
+    )
+    text = (tmp_path / "ablation_kmkim_cw24_iq.md").read_text()
+    assert all(f"| {name} |" in text for name in SETS[1].effect_names)
+    assert "| speeding_up |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--clips", "0"), "--clips: got 0"),
+        (("--quick", "--ablation"), "got both"),
+        (("--train", "nowhere"), "nowhere: no such folder"),
+    ],
+)
+def test_bad_requests_are_refused(folders, tmp_path, capsys, more, message):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(words(folders, tmp_path, *more))
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_damaged_folders_are_refused(tmp_path):
+    (tmp_path / "radhar_points").mkdir()
+    with pytest.raises(TensorsimError, match=r"maps\.npz: no such file"):
+        SETS[2].load(tmp_path)
+    np.savez(tmp_path / "radhar_points" / "maps.npz", other=np.zeros(3))
+    with pytest.raises(TensorsimError, match="not the measured clips of radhar_points"):
+        SETS[2].load(tmp_path)
+
+
+@pytest.mark.parametrize("measured", SETS, ids=lambda s: s.name)
+def test_simulation_is_seeded_and_shaped_like_the_measured(folders, measured):
+    shown, labels = measured.simulate(1, 7, quiet=True)
+    real, _ = measured.load(folders[0])
+    assert shown.shape[1:] == real.shape[1:]
+    assert labels.tolist() == list(range(len(measured.classes)))
+    again, _ = measured.simulate(1, 7, quiet=True)
+    assert torch.equal(shown, again)
+    assert not torch.equal(shown, measured.simulate(1, 8, quiet=True)[0])
+
+
+def test_walkers_before_the_glasgow_radar_come_and_go():
+    masks = glasgow.Glasgow(glasgow.Effects()).simulate(0, 2, torch.Generator().manual_seed(0)).float()
+    # Rows: approaching above the middle, receding below; both in 10 s of walking to and fro.
+    assert float(masks[:, 45:60].mean()) > 0.02
+    assert float(masks[:, 70:85].mean()) > 0.02
+    assert float(masks[:, :20].mean()) < 0.05
+
+
+def test_runners_come_at_their_doppler():
+    signal = sense2gol.Sense2Gol(sense2gol.Effects(image=False, unrest=False))
+    maps = signal.simulate(1, 4, torch.Generator().manual_seed(1))
+    hz = (torch.arange(64) - 32) * 3000 / 128
+    strongest = hz[maps[:, :, 4:9].argmax(1)]
+    assert float(strongest.max()) < -150  # towards is negative
+    assert float(strongest.min()) > -560
+
+
+def test_mains_of_the_maps_equal_scipy():
+    """Bursts: mean removed, Hamming window, 128 points, decibels."""
+    from scipy.signal import get_window
+
+    iq = torch.randn(1, 2, 256, generator=torch.Generator().manual_seed(0)) * 50
+    signal = (iq[0, 0] + 1j * iq[0, 1]).numpy().astype(complex)
+    burst = signal[128:] - signal[128:].mean()
+    spectrum = np.fft.fftshift(np.fft.fft(burst * get_window("hamming", 128, fftbins=False)))
+    expected = 10 * np.log10(np.abs(spectrum) ** 2 + 1)
+    np.testing.assert_allclose(sense2gol.doppler_maps(iq)[0, :, 1].numpy(), expected, atol=1e-3)
+
+
+def test_few_takes_as_many_of_each_class_spread_over_the_files():
+    labels = torch.tensor([0] * 30 + [1] * 5 + [2] * 12)
+    chosen = few(labels, 10)
+    assert labels[chosen].bincount().tolist() == [10, 5, 10]
+    assert len(chosen.unique()) == len(chosen)
+    assert {0, 29, 30, 34, 35, 46} <= set(chosen.tolist())
+
+
+def test_figures_by_hand():
+    logits = torch.tensor([[2.0, 1.0, 0.0], [0.0, 1.0, 2.0], [0.0, 3.0, 1.0], [1.0, 0.0, 2.0]])
+    labels = torch.tensor([0, 1, 1, 2])
+    assert report.accuracy(logits, labels) == 0.75
+    # Among classes 0 and 1 all three are right.
+    assert report.subset_accuracy(logits, labels, [0, 1]) == 1.0
+    assert report.confusion(logits, labels).tolist() == [[1, 0, 0], [0, 1, 1], [0, 0, 1]]
+    sure = torch.tensor([[50.0, 0.0]]).repeat(10, 1)
+    error, rows = report.calibration(sure, torch.tensor([0] * 7 + [1] * 3))
+    assert error == pytest.approx(0.3, abs=1e-6)
+    assert rows[-1] == (10, pytest.approx(1.0), pytest.approx(0.7))
+
+
+def test_lda_separates_what_is_linear():
+    generator = torch.Generator().manual_seed(0)
+    shown, labels = torch.rand(60, 1, 8, 8, generator=generator), torch.arange(60) % 3
+    shown = shown + 0.3 * labels.view(-1, 1, 1, 1)
+    logits = lda_logits(shown[:40], labels[:40], shown[40:], 4)
+    assert logits.shape == (20, 4)
+    assert report.accuracy(logits, labels[40:]) > 0.9
+    assert bool((logits[:, 3] == -100).all())
+
+
+def test_training_learns_and_repeats():
+    generator = torch.Generator().manual_seed(0)
+    shown, labels = torch.rand(40, 1, 8, 16, generator=generator), torch.arange(40) % 2
+    shown[labels == 1, :, 2:4] += 1.0
+    logits = []
+    for _ in range(2):
+        torch.manual_seed(1)
+        net = PictureNet(2, 8, width=4)
+        fit_pictures(net, shown, labels, steps=30, augment=lambda x, g: shift(x, 2, -1, g), batch=16)
+        logits.append(predict(net, shown))
+    assert torch.equal(*logits)
+    assert report.accuracy(logits[0], labels) > 0.95
