@@ -46,14 +46,24 @@ def torso_columns(right: float, forward: float, columns: int) -> tuple[Tensor, T
     return normal * axes.square() / (normal * axes).norm(dim=-1, keepdim=True), normal, width
 
 
+def _line_across(share: float) -> dict[str, float]:
+    """Weights of joints for a line to the right, that of the shoulders for a share of 0, of the hips for 1."""
+    return {
+        "right_shoulder": 1 - share,
+        "left_shoulder": share - 1,
+        "right_hip": share,
+        "left_hip": -share,
+    }
+
+
 class BodyScatterers(nn.Module):
     """An extended torso and limbs, with cross sections that follow aspect and carrier.
 
-    The torso is an elliptical cylinder with points all over it, which shine where they face the bisector of
-    transmitter and receiver; a limb is a cylinder of ``per_segment`` points, bright broadside, dim end on; the head is
-    a sphere. All are rough (:mod:`~tensorsim.motion.rough_surface`) and of skin, so that a body reflects a third of
-    what metal would at 77 GHz and half of it at 5.8 GHz. Points are many wavelengths apart: echoes add with whatever
-    phase they have, and the sum fluctuates from pulse to pulse as a measured one does.
+    The torso is an elliptical cylinder, twisted between shoulders and hips, with points all over it, which shine where
+    they face the bisector of transmitter and receiver; a limb is a cylinder of ``per_segment`` points, bright broadside
+    and dim end on; the head is a sphere. All are rough (:mod:`~tensorsim.motion.rough_surface`) and of skin, so that a
+    body reflects a third of what metal would at 77 GHz and half of it at 5.8 GHz. Points are many wavelengths apart:
+    echoes add with whatever phase they have, and the sum fluctuates from pulse to pulse as a measured one does.
 
     A walking person sums to 0.4 m^2 at 77 GHz and 0.6 m^2 at 5.8 GHz; published are 0.37 to 1.9 m^2 at 4.8 GHz and 0.5
     to 1.2 m^2 at 9.4 GHz for a man of 91 kg (Schultz, Burgener and King, Proc. IRE 46, 1958), and averages at 24 and 77
@@ -91,6 +101,7 @@ class BodyScatterers(nn.Module):
     torso_place: Tensor
     torso_normal: Tensor
     torso_down: Tensor
+    torso_right: Tensor
     torso_area: Tensor
 
     def __init__(
@@ -137,9 +148,10 @@ class BodyScatterers(nn.Module):
             "trunk": weights(JOINTS, {"neck": 1.0}, {"right_hip": 0.5, "left_hip": 0.5}),
             "knees": weights(JOINTS, {"right_knee": 1.0}, {"left_knee": 1.0}),
             "ankles": weights(JOINTS, {"right_ankle": 1.0}, {"left_ankle": 1.0}),
-            "torso_place": place.repeat(ROWS, 1),
-            "torso_normal": normal.repeat(ROWS, 1),
-            "torso_down": down.repeat_interleave(COLUMNS).unsqueeze(-1),
+            "torso_place": place,
+            "torso_normal": normal,
+            "torso_down": down.unsqueeze(-1),
+            "torso_right": weights(JOINTS, *(_line_across(float(share)) for share in down)),
             "torso_area": area.repeat(ROWS),
         }
         for name, value in buffers.items():
@@ -159,7 +171,7 @@ class BodyScatterers(nn.Module):
         check_people(positions, fade, 14)
         right = self.right.to(positions.dtype) @ positions
         limbs, limb_rcs = self._limbs(positions, right)
-        torso, torso_rcs = self._torso(positions, right)
+        torso, torso_rcs = self._torso(positions)
         head_rcs = torch.full_like(limb_rcs[..., :1], self.head_rcs)
         points = torch.cat((positions[..., :1, :], limbs, torso), -2)
         return one_scene(points, torch.cat((head_rcs, limb_rcs, torso_rcs), -1), fade)
@@ -179,15 +191,16 @@ class BodyScatterers(nn.Module):
         rcs = cylinder_rcs(self.limb_area.to(positions.dtype), end_on, self.limb_roughness)
         return points, (rcs + self.limb_cap.to(positions.dtype) * end_on).flatten(-2)
 
-    def _torso(self, positions: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    def _torso(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Points (..., R C, 3) on the torso and their cross sections (..., R C)."""
         neck, hips = (self.trunk.to(positions.dtype) @ positions).split(1, -2)
         up = unit(neck - hips)
+        right = self.torso_right.to(positions.dtype) @ positions  # (..., R, 3)
         across = unit(right - (right * up).sum(-1, keepdim=True) * up)
-        frame = torch.cat((across, torch.cross(up, across, dim=-1)), -2)  # to the right, forward
-        points = neck + self.torso_down.to(positions.dtype) * (hips - neck)
-        points = points + self.torso_place.to(positions.dtype) @ frame
-        normal = self.torso_normal.to(positions.dtype) @ frame
+        frame = torch.stack((across, torch.cross(up.expand_as(across), across, dim=-1)), -2)  # right, forward
+        middle = neck + self.torso_down.to(positions.dtype) * (hips - neck)
+        points = (middle.unsqueeze(-2) + self.torso_place.to(positions.dtype) @ frame).flatten(-3, -2)
+        normal = (self.torso_normal.to(positions.dtype) @ frame).flatten(-3, -2)
         view = bisector(points, self.tx.to(positions.dtype), self.rx.to(positions.dtype))
         facing = (normal * view).sum(-1)
         return points, patch_rcs(self.torso_area.to(positions.dtype), facing, self.torso_roughness)

@@ -146,6 +146,27 @@ def test_24_and_77_ghz_are_close() -> None:
     assert 0.3 < totals[1] < totals[0] < 0.8
 
 
+def test_the_torso_twists_with_shoulders_and_hips() -> None:
+    """Shoulders turned by 40 degrees against the hips: the upper row by 28 degrees or so, the lower by about 4."""
+    far = (0.0, -1e4, 1.25)
+    model = BodyScatterers(far, far, 77e9)
+    pose = BodyPose.standing((1,))
+    trunk = pose.trunk.clone()
+    trunk[..., 2] = np.deg2rad(40)
+    straight, twisted = (
+        model(forward_kinematics(p, 1.75).unsqueeze(0), torch.ones(1, 1).double())[0][0, 31:].unflatten(
+            0, (2, 14)
+        )
+        for p in (pose, pose._replace(trunk=trunk))
+    )
+    turns = []
+    for row in (0, 1):
+        a, b = (x[row, 0, :2] - x[row, 7, :2] for x in (straight, twisted))  # opposite columns
+        turns.append(float(torch.rad2deg(torch.atan2(b[1], b[0]) - torch.atan2(a[1], a[0]))))
+    assert 20 < turns[0] < 38
+    assert 2 < turns[1] < 12
+
+
 def test_limbs_are_bright_broadside() -> None:
     far = (0.0, 0.0, 0.4)
     model = BodyScatterers(far, far, 77e9, per_segment=1)
