@@ -43,7 +43,7 @@ class RandomProcess(nn.Module):
         seed: of frequencies and phases.
         count: sinusoids of a process.
 
-    Shapes: seconds (...) -> (..., copies). Differentiable.
+    Shapes: seconds (...) and how many of the copies (the default is all) -> (..., copies). Differentiable.
 
     Raises:
         TensorsimError: a band that is not ascending and positive, an rms below 0, counts below 1, a time that is
@@ -81,7 +81,8 @@ class RandomProcess(nn.Module):
         self.register_buffer("amplitude", rms * (2 * power / power.sum()).sqrt(), persistent=False)
         self.register_buffer("phase", phase, persistent=False)
 
-    def forward(self, time_s: Tensor) -> Tensor:
-        """Seconds (...) to values (..., copies)."""
+    def forward(self, time_s: Tensor, copies: int | None = None) -> Tensor:
+        """Seconds (...) to values (..., copies) of the first ``copies`` processes."""
         check_floating(time_s, "time_s")
-        return sinusoids(time_s, self.frequency_hz.double(), self.amplitude.double(), self.phase.double())
+        frequency_hz, phase = self.frequency_hz.double()[:copies], self.phase.double()[:copies]
+        return sinusoids(time_s, frequency_hz, self.amplitude.double(), phase)

@@ -73,9 +73,9 @@ class PosturalSway(nn.Module):
         check_size(joints, -2, 14, "joints", layout)
         persons, frames = joints.shape[-4], joints.shape[-3]
         time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / self.rate_hz
-        who = torch.arange(persons, device=joints.device) % self.people
-        along = self.forwards(time_s)[:, who].T.to(joints.dtype)[..., None, None]  # (P, T, 1, 1)
-        aside = self.sideways(time_s)[:, who].T.to(joints.dtype)[..., None, None]
+        who, own = torch.arange(persons, device=joints.device) % self.people, min(persons, self.people)
+        along = self.forwards(time_s, own)[:, who].T.to(joints.dtype)[..., None, None]  # (P, T, 1, 1)
+        aside = self.sideways(time_s, own)[:, who].T.to(joints.dtype)[..., None, None]
 
         across = (self.right.to(joints.dtype) @ joints)[..., :2]
         across = across / across.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()

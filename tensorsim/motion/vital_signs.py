@@ -80,14 +80,18 @@ class VitalSigns(nn.Module):
         self.register_buffer("phase", draw[2], persistent=False)
 
     @torch.jit.export
-    def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Chest displacement (..., people) in metres, forward positive, at times (...) in seconds."""
+    def displacement_m(self, time_s: Tensor, people: int | None = None) -> Tensor:
+        """Chest displacement (..., people) in metres, forward positive, at times (...) in seconds.
+
+        ``people`` are the first so many; the default is all.
+        """
         check_floating(time_s, "time_s")
-        wander = self.wander(time_s.double())
-        wander = wander.unflatten(-1, [2, self.people])
-        cycles = time_s.double()[..., None, None] * self.cycle_hz.double() + self.phase.double() + wander
+        own = self.people if people is None else min(people, self.people)
+        wander = self.wander(time_s.double(), 2 * own).unflatten(-1, [own, 2]).transpose(-1, -2)
+        cycles = time_s.double()[..., None, None] * self.cycle_hz.double()[:, :own]
+        cycles = cycles + self.phase.double()[:, :own] + wander
         waves = torch.cos(2 * math.pi * (cycles - cycles.detach().floor()))
-        return (self.depth_m.double() / 2 * waves).sum(-2).to(time_s.dtype)
+        return (self.depth_m.double()[:, :own] / 2 * waves).sum(-2).to(time_s.dtype)
 
     def forward(self, joints: Tensor, start: int = 0) -> Tensor:
         """Joints of frames ``start`` onwards, breathing; frame k is at ``k / rate_hz``."""
@@ -99,7 +103,9 @@ class VitalSigns(nn.Module):
         persons, frames = joints.shape[-4], joints.shape[-3]
         time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / self.rate_hz
         who = torch.arange(persons, device=joints.device) % self.people
-        chest = self.displacement_m(time_s)[:, who].T.to(joints.dtype)[..., None, None]  # (P, T, 1, 1)
+        chest = self.displacement_m(time_s, persons)[:, who].T.to(joints.dtype)[
+            ..., None, None
+        ]  # (P, T, 1, 1)
 
         up, right = self.trunk.to(joints.dtype) @ joints, self.right.to(joints.dtype) @ joints
         ahead = torch.cross(up, right, dim=-1)
