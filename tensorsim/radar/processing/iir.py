@@ -10,7 +10,7 @@ initial state to it.
 
 ``torchaudio.functional.lfilter`` is not used, for three reasons: a scripted module with it loads only in a process that
 has imported torchaudio, since its loop is an operator of that library; it is slower (a fourth-order high-pass of
-32768 pulses x 200 range bins, complex64, one thread: 1.7 s against 0.35 s); and its direct form is less accurate in
+32768 pulses x 200 range bins, complex64, one thread: 1.3 s against 0.2 s); and its direct form is less accurate in
 float32 (1.7e-5 against 2.7e-7 of the input at a cut-off of 0.2 m/s, 4e-4 against 6e-7 at 0.02 m/s).
 """
 
