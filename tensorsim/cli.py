@@ -44,7 +44,7 @@ examples:
 Networks come with tensorsim; others can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE.
 """
 
-#: Commands by name; a command that has commands of its own is a table of them after its description.
+#: Commands by name; a group of commands is its description and a table of them.
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate,
     "demo": Demo,
@@ -105,15 +105,15 @@ def _group(description: str, commands: Mapping[str, Any]) -> Callable[..., Any]:
 
 
 @contextmanager
-def _one_line_of_why() -> Iterator[None]:
-    """Whatever input, the file system or the keyboard stops the program with ends in one line and a status."""
+def _one_line_errors() -> Iterator[None]:
+    """Report bad input, a file error or an interrupt in one line, and exit with a status."""
     try:
         try:
             yield
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        # Who reads the lines has seen enough (`| head`).
+        # The reader has closed the pipe, as `| head` does.
         _drop_output()
         sys.exit(141)
     except TensorsimError as error:
@@ -125,21 +125,21 @@ def _one_line_of_why() -> Iterator[None]:
 
 
 def _drop_output() -> None:
-    """Leave what is not yet printed: Python would try to flush it once more at the exit."""
+    """Discard unprinted output: Python would try to flush it again on exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _stop(status: int, why: str) -> NoReturn:
+def _stop(status: int, message: str) -> NoReturn:
     try:
         sys.stdout.flush()
     except OSError:
         _drop_output()
-    print(f"tensorsim: {' '.join(why.split())}", file=sys.stderr)
+    print(f"tensorsim: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(status)
 
 
 def parse(arguments: list[str] | None = None) -> Any:
-    """The command that these words ask for, by default those of the command line; exits where they ask for none."""
+    """The command that the arguments (default: those of the command line) name; exits if there is none."""
     return tyro.cli(
         _choice(COMMANDS),
         prog="tensorsim",
@@ -153,9 +153,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of the ``tensorsim`` command.
 
     Exit status: 0 done, 2 bad input or a file that cannot be read or written, 129 and 143 ended by SIGHUP and SIGTERM,
-    130 interrupted, 141 nobody reads the output.
+    130 interrupted, 141 output pipe closed.
     """
-    with process.ending_cleanly(), _one_line_of_why():
+    with process.ending_cleanly(), _one_line_errors():
         parse(arguments).run()
 
 

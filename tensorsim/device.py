@@ -6,10 +6,10 @@ from tensorsim.errors import TensorsimError
 
 
 def usable_device(name: str) -> torch.device:
-    """The torch device of this name; ``"auto"`` takes a GPU where there is one.
+    """The torch device of this name; ``"auto"`` is a GPU if there is one, otherwise the CPU.
 
     Raises:
-        TensorsimError: it is not usable here.
+        TensorsimError: the device cannot be used on this machine.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -21,5 +21,5 @@ def usable_device(name: str) -> torch.device:
         why = (str(error) or type(error).__name__).splitlines()[0]
         raise TensorsimError(f"--device: {name!r} is not usable here: {why}") from None
     if not usable:
-        raise TensorsimError(f"--device: {name!r} is not usable here: it does not add up")
+        raise TensorsimError(f"--device: {name!r} is not usable here: it computes a wrong sum")
     return device

@@ -1,4 +1,4 @@
-"""Files that are read with one kind of error; files and folders that appear whole or not at all."""
+"""Reading files with one kind of error; writing files and folders completely or not at all."""
 
 import json
 import math
@@ -12,13 +12,13 @@ from typing import Any
 
 from tensorsim.errors import TensorsimError
 
-#: What says of a folder of results which run they are from.
+#: The file that identifies the run that a results folder is from.
 SUMMARY = "summary.json"
 
 
 @contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
-    """Whatever a reader stumbles over in a file that is damaged or another is one error that names the file."""
+    """Turn any error that a reader raises on a damaged or wrong file into one that names the file."""
     try:
         yield
     except TensorsimError:
@@ -29,10 +29,10 @@ def reading(path: Path, kind: str) -> Iterator[None]:
 
 @contextmanager
 def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A scratch path that becomes ``path`` when the block ends well; otherwise nothing remains of it.
+    """A scratch path that is renamed to ``path`` when the block succeeds, and removed otherwise.
 
-    The folder is made if it is not there. The scratch path lies beside ``path`` and ends in ``.tmp``. The file gets
-    the rights that new files usually have.
+    The folder is created if needed. The scratch path is in the same folder and ends in ``.tmp``. The file gets the
+    permissions that new files usually have.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         scratch.touch()
         rights = scratch.stat().st_mode
         yield scratch
-        os.chmod(scratch, rights)  # safetensors writes for the owner's eyes alone
+        os.chmod(scratch, rights)  # safetensors makes files readable by their owner only
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
@@ -49,14 +49,14 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def complete_or_nothing(out: Path) -> Iterator[Path]:
-    """A scratch folder whose files move to ``out`` when the block ends well; otherwise ``out`` stays as it was.
+    """A scratch folder whose files are moved to ``out`` when the block succeeds; otherwise ``out`` is unchanged.
 
-    Files of other names that are in ``out`` already stay there, but not those that its ``summary.json`` lists under
-    ``files``: they are of an earlier run. ``summary.json`` is the first to go and the last to come, so that a folder
-    that has one holds the files of one run, even after a crash.
+    Other files in ``out`` stay, except those that its ``summary.json`` lists under ``files``: they are from an earlier
+    run. ``summary.json`` is removed first and written last, so that a folder that has one holds the files of one run,
+    even after a crash.
 
     Raises:
-        TensorsimError: another process is writing into ``out``, or a folder lies where a file should.
+        TensorsimError: another process is writing into ``out``, or there is a folder where a file should be.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     with _locked(out):
@@ -99,7 +99,7 @@ def _exchange(out: Path, new: Path, old: Path) -> None:
 
 
 def _listed(out: Path) -> list[str]:
-    """Names of the files that the summary of an earlier run lists, as far as it has a list."""
+    """Names of the files that the summary of an earlier run lists; none without such a summary."""
     try:
         names = json.loads((out / SUMMARY).read_text(encoding="utf-8"))["files"]
         return [name for name in names if Path(name).name == name]
@@ -109,7 +109,7 @@ def _listed(out: Path) -> list[str]:
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Hold a folder for this process; the lock ends with the process, however that ends."""
+    """Lock a folder for this process; the lock is released when the process ends, also by a crash."""
     try:
         import fcntl
     except ImportError:  # not on Windows
@@ -121,7 +121,7 @@ def _locked(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not path.exists() or not os.path.samestat(os.stat(path), os.fstat(file)):
-                raise BlockingIOError  # its last holder removed it, and another run has made a new one since
+                raise BlockingIOError  # its last holder removed it, and another run has made a new one
         except BlockingIOError:
             raise TensorsimError(
                 f"{out}: another run is writing into this folder, expected one at a time"
@@ -135,7 +135,7 @@ def _locked(out: Path) -> Iterator[None]:
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
-    """Write strict JSON: NaN and infinity, which JSON has not, become ``null``. The file appears whole."""
+    """Write strict JSON: NaN and infinity, which JSON cannot express, become ``null``. The file appears complete."""
     with complete_file(path) as scratch:
         text = json.dumps(_finite(content), indent=2, allow_nan=False)
         scratch.write_text(text + "\n", encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Weights that tensorsim knows by name: its own, which come with it, and those that others publish.
+"""Weights by name: those that come with tensorsim, and those that others publish.
 
-A name becomes a file here: shipped ones lie inside the package, others are fetched once into the user's cache and
-checked against their SHA-256. A path always works as well, and needs no registry.
+Shipped files are inside the package; others are downloaded once into the user's cache and checked against their
+SHA-256. Instead of a name, a path always works.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from tensorsim.model_files import manifest, models_dir
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """What is known of one file of weights.
+    """One file of weights.
 
     Attributes:
         name: what ``from_pretrained`` takes.
@@ -26,9 +26,9 @@ class ModelEntry:
         source: who made them from what.
         metrics: accuracy as its makers state it, or a reference to the card.
         preprocessing: what the network expects; the class does it.
-        sha256: whole digest, its first eight digits where only those are published, or "" where none is.
-        url: where it is fetched from; None for a shipped file.
-        default: whether its class takes it when asked for nothing.
+        sha256: full digest, its first eight digits where only those are published, or "" where none is.
+        url: where it is downloaded from; None for a shipped file.
+        default: whether ``from_pretrained()`` without a name loads it.
     """
 
     name: str
@@ -49,7 +49,7 @@ class ModelEntry:
 
     @property
     def assurance(self) -> str:
-        """What its digest says of a file that was just downloaded."""
+        """How well a download is verified, in words."""
         if len(self.sha256) == 64:
             return "whole SHA-256"
         return (
@@ -58,7 +58,7 @@ class ModelEntry:
 
     @property
     def path(self) -> Path:
-        """Where the file is, or will be once it is fetched."""
+        """Where the file is, or will be after its download."""
         return (models_dir() if self.shipped else cache_dir()) / self.file
 
 
@@ -193,22 +193,22 @@ def shipped() -> tuple[ModelEntry, ...]:
 
 
 def entries() -> tuple[ModelEntry, ...]:
-    """Every file of weights that has a name here: shipped ones, then published ones."""
+    """All entries: shipped files, then published ones."""
     return (*shipped(), *PUBLISHED)
 
 
 def cache_dir() -> Path:
-    """Folder of fetched weights: ``tensorsim`` in torch's cache (``$TORCH_HOME``, else ``~/.cache/torch``)."""
+    """Folder of downloaded weights: ``tensorsim`` in torch's cache (``$TORCH_HOME``, else ``~/.cache/torch``)."""
     import torch
 
     return Path(torch.hub.get_dir()) / "tensorsim"
 
 
 def find(name: str, *networks: str) -> ModelEntry:
-    """The entry of this name, of one of these networks if any are named.
+    """The entry of this name, among those of ``networks`` if any are given.
 
     Raises:
-        TensorsimError: no such name; it lists those of the networks, and the nearest.
+        TensorsimError: no such name; the message lists the known names and the most similar one.
     """
     import difflib
 
@@ -224,16 +224,16 @@ def find(name: str, *networks: str) -> ModelEntry:
 
 
 def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
-    """Path of the weights that ``from_pretrained`` was asked for, fetched if need be.
+    """Path of the weights that ``from_pretrained`` was called with, downloaded if necessary.
 
     Args:
-        source: a path (anything with a suffix or a folder in it, or an existing file), the name of an entry, or None
-            for the shipped weights.
-        networks: names of the classes that ask; of shipped weights, those of the first that has any are taken.
+        source: a path (with a suffix or a folder, or an existing file), the name of an entry, or None for the shipped
+            weights.
+        networks: names of the classes that can load them; shipped weights are those of the first class that has any.
 
     Raises:
-        TensorsimError: no such name, no such shipped weights, or it cannot be fetched; a path is returned as it is,
-            also if nothing is there.
+        TensorsimError: no such name, no such shipped weights, or a failed download; a path is returned unchanged,
+            even if there is no such file.
     """
     if source is None:
         defaults = {entry.network: entry for entry in shipped() if entry.default}

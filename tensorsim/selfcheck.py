@@ -1,4 +1,4 @@
-"""``tensorsim check``: is this installation in order?"""
+"""``tensorsim check``: tests of the installation."""
 
 import hashlib
 import importlib
@@ -43,7 +43,7 @@ def _shipped_files() -> str:
 
 
 def _radar_chain() -> str:
-    """A point that approaches at 2 m/s must show at +2 m/s."""
+    """A target that approaches at 2 m/s must appear at +2 m/s."""
     from tensorsim.radar.simulator import RadarSimulator
 
     radar = RadarConfig.free_space()

@@ -1,4 +1,4 @@
-"""Clips whose motion is known at every moment: of the generator, or of motion capture."""
+"""Clips whose motion is known at every instant, from the generator or from motion capture."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,18 +17,18 @@ from tensorsim.motion.resample import PoseResampler
 
 #: Length of the paper's clips.
 CLIP_S = 4.0
-#: Where captured motion is put: y of the hips at the start.
+#: Captured motion starts with its hips at this y.
 CAPTURE_RANGE_M = 4.0
 
 
 @dataclass(frozen=True)
 class ActivityClip:
-    """Somebody who does one of the twelve activities.
+    """A generated person who performs one of the twelve activities.
 
     Attributes:
         row: name of the class, the row of the table that the clip counts for.
         name: of the clip within the row.
-        seed: of the generator, and of what a film of it draws.
+        seed: of the generator, and of the random numbers of a film of it.
     """
 
     row: str
@@ -44,7 +44,7 @@ class ActivityClip:
 
     @property
     def present(self) -> bool:
-        """Whether there is anybody."""
+        """Whether there is a person."""
         return activity_index(self.row) != 0
 
     def joints(self, rate_hz: float) -> Tensor:
@@ -57,12 +57,12 @@ class ActivityClip:
 
 @dataclass(frozen=True)
 class CapturedClip:
-    """Captured motion; between its frames the natural spline through them is the truth.
+    """Captured motion; between its frames the natural cubic spline through them counts as the truth.
 
     Attributes:
         row, name: see :class:`ActivityClip`.
         motion: one person on the floor, cut to the clip.
-        seed: of what a film of it draws.
+        seed: of the random numbers of a film of it.
     """
 
     row: str
@@ -82,7 +82,7 @@ class CapturedClip:
 
     @property
     def present(self) -> bool:
-        """Whether there is anybody."""
+        """Whether there is a person."""
         return True
 
     def joints(self, rate_hz: float) -> Tensor:
@@ -94,7 +94,7 @@ Clip = ActivityClip | CapturedClip
 
 
 def activity_clips(activities: tuple[str, ...], count: int, seed: int) -> dict[str, list[Clip]]:
-    """``count`` clips of each activity (default all), numbered from ``seed`` on, by row; all of different people."""
+    """``count`` clips of each activity (default all), numbered from ``seed`` on, by row; all with different people."""
     indices = [activity_index(name) for name in activities] or list(range(len(ACTIVITIES)))
     return {
         ACTIVITIES[i]: [
@@ -111,11 +111,11 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
 
     Args:
         path: ``.bvh`` or ``.npz``; of an ``.npz`` with several motions the first person of each.
-        count: at most so many.
-        fps: frames per second; overrides the file, needed where it says nothing.
+        count: largest number of clips.
+        fps: frames per second, in place of that of the file; required if the file has none.
 
     Raises:
-        TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; nothing long enough.
+        TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; no motion that is long enough.
     """
     clips: list[Clip] = []
     for key in motion_keys(path):
@@ -132,7 +132,7 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
 
 
 def _kept_away(motion: Motion, nearest_m: float = 1.5, farthest_m: float = 7.0) -> Motion:
-    """Motion moved along y, as far as it takes to stay within the generator's ranges, nearest first."""
+    """Motion moved along y by the least amount that keeps it within the generator's ranges, the nearest one first."""
     y = motion.joints[..., (8, 11), 1]
     shift = (farthest_m - y.max()).clamp(max=0.0)
     shift = torch.maximum(shift, nearest_m - y.min())

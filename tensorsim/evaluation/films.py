@@ -1,4 +1,4 @@
-"""What a camera gives of a clip: the true keypoints in its picture, or what networks find in the rendered film."""
+"""Keypoints of a clip in a camera picture: the true ones, or those that networks find in the rendered film."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from tensorsim.types import Tracks
 #: Frame rate of the films.
 FPS = 30.0
 HEIGHT, WIDTH = 360, 640
-#: Stands behind the radar, far enough for whole bodies from 1.5 m on.
+#: Behind the radar, so that a whole body is in view from 1.5 m on.
 CAMERA = CameraConfig(position_m=(0.0, -2.0, 1.0))
 
 
@@ -40,7 +40,7 @@ class Observed(NamedTuple):
     scores: Tensor
 
     def tracks(self) -> Tracks:
-        """As a tracker gives them, a batch of one clip."""
+        """As the output of a tracker, a batch of one clip."""
         return Tracks(self.boxes[None], self.valid[None], self.valid[None])
 
     def lifted_by(self, stage: VideoToPose) -> tuple[Tensor, Tensor]:
@@ -59,7 +59,7 @@ def project(joints: Tensor) -> tuple[Tensor, Tensor, View]:
 
 
 def true_keypoints(clip: Clip) -> Observed:
-    """The true keypoints of a clip, those inside of the picture with score 1, the others with 0.
+    """The true keypoints of a clip, those inside the picture with score 1, the others with 0.
 
     Hidden ones count, as they do in the labels of COCO; boxes are those of the keypoints and a margin.
     """
@@ -76,11 +76,11 @@ def true_keypoints(clip: Clip) -> Observed:
 
 
 class Filmed(NamedTuple):
-    """What networks make of a rendered film.
+    """Results of the networks on a rendered film.
 
     Attributes:
         found: people detected and tracked.
-        boxed: the pose network on the true boxes.
+        boxed: results of the pose network on the true boxes.
     """
 
     found: Observed
@@ -88,7 +88,7 @@ class Filmed(NamedTuple):
 
 
 def render_and_watch(clip: Clip, detector: nn.Module, pose: nn.Module) -> Filmed:
-    """Render a clip and run detector, tracker and pose network on it; frames are not kept."""
+    """Render a clip and run detector, tracker and pose network on it; the frames are discarded."""
     joints = clip.joints(FPS).float()
     there = torch.full((1, len(joints)), clip.present)
     film = PersonRenderer(CAMERA, HEIGHT, WIDTH)(joints, seed=clip.seed, valid=there)
@@ -107,7 +107,7 @@ def render_and_watch(clip: Clip, detector: nn.Module, pose: nn.Module) -> Filmed
 
 
 def filmed(path: Path, clip: Clip, detector: nn.Module, pose: nn.Module) -> Filmed:
-    """:func:`render_and_watch`, or what it gave before if ``path`` (npz) is there; else writes it."""
+    """:func:`render_and_watch`, stored in ``path`` (npz) the first time and read from there afterwards."""
     if path.is_file():
         with np.load(path, allow_pickle=False) as arrays:
             parts = [

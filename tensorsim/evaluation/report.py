@@ -24,7 +24,7 @@ Cells = list[dict[str, Any]]
 
 
 def mean(values: Iterable[float]) -> float:
-    """Mean of the finite values; NaN without any, infinite where all are (equal maps)."""
+    """Mean of the finite values; NaN if there are none, infinite if all are (equal maps)."""
     listed = [v for v in values if not math.isnan(v)]
     finite = [v for v in listed if math.isfinite(v)]
     if finite:
@@ -33,7 +33,7 @@ def mean(values: Iterable[float]) -> float:
 
 
 def figure_of(cells: Cells, scene: str, name: str, figure: str) -> float:
-    """Mean over the clips of the cells, NaN without any."""
+    """Mean over the clips of the cells; NaN if there are none."""
     return mean(c["scores"].get(scene, {}).get(name, {}).get(figure, math.nan) for c in cells)
 
 
@@ -63,7 +63,7 @@ def _table(heads: list[str], lines: list[list[str]]) -> list[str]:
 
 
 def markdown(cells: Cells) -> str:
-    """Tables of the maps of whole pipelines, of those with one true stage, and of the errors of joints."""
+    """Tables for whole pipelines, for pipelines with one true stage, and for the errors of joints."""
     rows = list(dict.fromkeys(c["row"] for c in cells))
     names = list(dict.fromkeys(c["setting"] for c in cells))
     scenes = list(dict.fromkeys(scene for c in cells for scene in c["scores"]))
@@ -74,7 +74,7 @@ def markdown(cells: Cells) -> str:
         return [c for c in cells if c["setting"] == setting and (row is None or c["row"] == row)]
 
     def overall(setting: str, scene: str, name: str, figure: str) -> float:
-        """Mean of the rows' means, so that rows weigh the same; without rows that are exactly right."""
+        """Mean of the rows' means, so that rows have equal weight; without rows that are exactly right."""
         unequal = [row for row in rows if figure_of(chosen(setting, row), scene, name, "psnr") < math.inf]
         return mean(figure_of(chosen(setting, row), scene, name, figure) for row in unequal)
 

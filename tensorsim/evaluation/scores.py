@@ -1,4 +1,4 @@
-"""How near the maps of an estimate come to those of the truth."""
+"""Similarity of estimated maps to the true ones."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from tensorsim.radar.analysis import metrics
 from tensorsim.types import RadarMaps
 
-#: The three maps by their names in ``RadarMaps``, and how tables call them.
+#: The three maps by their names in ``RadarMaps``, with their names in tables.
 MAPS = {"range_time": "RTM", "range_time_mti": "processed RTM", "doppler_time": "DTM"}
 #: Figures of each map; the envelope is that of the DTM only.
 FIGURES = ("psnr", "psnr_db", "ssim", "ssim_db", "nmse", "envelope_m_s")
@@ -29,7 +29,7 @@ class Maps:
         return cls(*(getattr(maps, name).reshape(getattr(maps, name).shape[-2:]) for name in MAPS))
 
     def like(self, other: "Maps") -> "Maps":
-        """The same with as many columns as ``other``: cut, or padded with nothing."""
+        """The same with as many columns as ``other``: cut, or padded with zeros."""
         return Maps(
             *(
                 F.pad(
@@ -54,8 +54,8 @@ def mean_maps(many: list[Maps]) -> Maps:
 def compare(guess: Maps, truth: Maps, speed_m_s: Tensor) -> dict[str, dict[str, float]]:
     """Figures of each map: PSNR, SSIM (linear, and in dB cut 40 dB below the peak), NMSE, envelope.
 
-    Each map is scaled by its own peak and by nothing else; nothing is shifted. Two maps without any echo are equal
-    (PSNR infinite, NMSE 0), and an envelope that one of both does not have is NaN.
+    Each map is scaled by its own peak; nothing is shifted or fitted. Two maps without any echo are equal (PSNR
+    infinite, NMSE 0). The envelope is NaN if one of the maps has none.
 
     Args:
         guess, truth: maps of one size.

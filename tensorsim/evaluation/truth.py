@@ -24,7 +24,7 @@ from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
 from tensorsim.files import complete_file
 from tensorsim.radar.presets import PRESETS
 
-#: What a trivial guess gets: nothing; the mean of the row's other clips; another clip of the row.
+#: Trivial guesses as a baseline: an empty map; the mean of the row's other clips; another clip of the row.
 GUESSES = ("empty", "mean", "shuffled")
 
 #: Figures of one cell by scene, map and figure.
@@ -36,11 +36,11 @@ class TruthLoop:
     """What to evaluate.
 
     Attributes:
-        out: folder; ``cells/`` in it keeps the figures of every clip and setting, ``films/`` what networks saw.
+        out: folder; ``cells/`` in it has the figures of every clip and setting, ``films/`` the networks' results.
         clips: per row of the table.
-        activities: by name; none is all twelve.
+        activities: by name; an empty tuple is all twelve.
         motions: motion capture files, each a row.
-        motion_fps: their frame rate; overrides what they say.
+        motion_fps: their frame rate, in place of that in the files.
         scenes: names of radar presets.
         sources: of ``SOURCES``.
         stages: also replace every stage by the truth, in the last of the sources that has it.
@@ -85,10 +85,10 @@ class TruthLoop:
         return listed
 
     def run(self, quiet: bool = False) -> list[dict[str, Any]]:
-        """Every missing cell; returns all of them, see :func:`read_cells`.
+        """Compute every missing cell; returns all cells, see :func:`read_cells`.
 
         Raises:
-            TensorsimError: settings that need networks which are not given, unknown names.
+            TensorsimError: settings whose networks are not given, or unknown names.
         """
         self._check()
         work = [
@@ -139,7 +139,7 @@ class TruthLoop:
         return [self.cell(row, c, n) for row, clips in self.rows().items() for c in clips for n in names]
 
     def cell(self, row: str, clip: Clip, setting: str) -> Path:
-        """File of a cell; its name tells the options apart that its figures depend on."""
+        """File of a cell; its name has a hash of the options that its figures depend on."""
         options: dict[str, Any] = {"scenes": self.scenes, "clips": 0, "fps": FPS}
         if setting in GUESSES:  # made of the other clips
             options |= {"clips": self.clips, "seed": self.seed}
@@ -150,16 +150,16 @@ class TruthLoop:
         return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{_key(options)}.json"
 
     def film(self, clip: Clip) -> Path:
-        """File of what the networks saw of a clip."""
+        """File of the results of the networks on a clip."""
         return self.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{_key(self._networks())}.npz"
 
     def _networks(self) -> list[tuple[str, int]]:
-        """Tells networks apart, also those that were trained further: their files and when these were written."""
+        """Identifies the networks, also after more training: their files and modification times."""
         files = [path.resolve() for path in (self.detector, self.pose) if path is not None]
         return [(str(file), file.stat().st_mtime_ns if file.is_file() else 0) for file in files]
 
     def read_cells(self) -> list[dict[str, Any]]:
-        """All cells that are there, each a dictionary of row, clip, setting, scores by scene, pose errors."""
+        """All existing cells, each a dictionary of row, clip, setting, scores by scene, pose errors."""
         return [json.loads(path.read_text("utf-8")) for path in self._cell_paths() if path.is_file()]
 
 
@@ -221,7 +221,7 @@ def evaluate_row(loop: TruthLoop, row: str, tick: Callable[[], Any]) -> None:
                         pipelines.maps(setting, scene, clip, joints, valid), scene, k
                     )
                 except TensorsimError as error:
-                    _warn_of_what_is_left_out(clip, f"{scene}, {setting.name}", error)
+                    _warn_of_omission(clip, f"{scene}, {setting.name}", error)
             _write(
                 loop.cell(row, clip, setting.name),
                 _cell(row, clip, setting.name, scores, pose_errors(joints, valid, clip)),
@@ -246,12 +246,12 @@ def _film(loop: TruthLoop, clip: Clip, networks: list[nn.Module]) -> Filmed:
     return filmed(loop.film(clip), clip, networks[0], networks[1])
 
 
-def _warn_of_what_is_left_out(clip: Clip, what: str, error: TensorsimError) -> None:
+def _warn_of_omission(clip: Clip, what: str, error: TensorsimError) -> None:
     warnings.warn(f"{clip.row} {clip.name}, {what}: left out, {error}", TensorsimWarning, stacklevel=3)
 
 
 class _Truths:
-    """The true maps of a row's clips, each made when it is asked for first."""
+    """The true maps of a row's clips, computed on first use."""
 
     def __init__(self, pipelines: Pipelines, clips: list[Clip], keep: bool) -> None:
         self.pipelines, self.clips, self.keep = pipelines, clips, keep
@@ -265,7 +265,7 @@ class _Truths:
             try:
                 self.made[scene, k] = self.pipelines.truth(scene, self.clips[k])
             except TensorsimError as error:
-                _warn_of_what_is_left_out(self.clips[k], scene, error)
+                _warn_of_omission(self.clips[k], scene, error)
                 self.made[scene, k] = None
         return self.made[scene, k]
 
@@ -290,10 +290,10 @@ class _Truths:
 
 
 def pose_errors(joints: Tensor, valid: Tensor, clip: Clip) -> dict[str, float]:
-    """How far joints (P, T, 14, 3) are off, in metres, for the person followed longest.
+    """Errors of joints (P, T, 14, 3) in metres, for the person followed longest.
 
-    ``root`` is the rms distance of the middle of the hips, ``joints`` the mean distance of the joints after moving
-    the hips onto each other, ``range`` the rms error along y of the joints after that; ``people`` how many there are.
+    ``root`` is the rms distance of the middle of the hips, ``joints`` the mean distance of the joints after aligning
+    the hips, ``range`` the rms error along y of the joints after that; ``people`` the number of people.
     """
     errors = {"people": float(joints.shape[0])}
     if joints.shape[0] == 0 or not clip.present:
@@ -325,7 +325,7 @@ def example_maps(loop: TruthLoop, pipelines: Pipelines, scene: str) -> dict[str,
                 setting = Setting(source)
                 maps = pipelines.maps(setting, scene, clip, *pipelines.joints(setting, clip, film))
                 shown.append((source, maps.doppler_time))
-        except TensorsimError:  # as the loop has told
+        except TensorsimError:  # the loop has warned of it
             continue
         pictures[row] = shown
     return pictures

@@ -1,4 +1,4 @@
-"""The recipe of the activity classifiers: cross-entropy on stored pictures, noise drawn anew for every look."""
+"""The recipe of the activity classifiers: cross-entropy on stored pictures, with new noise at every use."""
 
 import functools
 from collections.abc import Sequence
@@ -33,17 +33,17 @@ class Clip(NamedTuple):
 
 
 def held_out(person: int) -> bool:
-    """Whether a person is kept for validation: every fifth."""
+    """Whether a person is held out for validation: every fifth."""
     return person % 5 == 4
 
 
 def clips_of(
     store: MapStore, scenes: Sequence[str], people: int | None, validation: bool | None
 ) -> list[Clip]:
-    """Clips of the first ``people`` people of a store (None: all); of both parts if ``validation`` is None.
+    """Clips of the first ``people`` people of a store (None: all); training and validation if ``validation`` is None.
 
     Raises:
-        TensorsimError: fewer people there than asked for, or none of this part.
+        TensorsimError: the store has fewer people, or no clips of this part.
     """
     clips = []
     for scene in scenes:
@@ -59,7 +59,7 @@ def clips_of(
 
 
 def picture(store: MapStore, clip: Clip, snr_db: float, size: int) -> Tensor:
-    """A stored clip as a network sees it: (1, size, size) in [0, 1].
+    """A stored clip as the input of a network: (1, size, size) in [0, 1].
 
     Raises:
         TensorsimError: the store's pictures are not a multiple of ``size``.
@@ -108,15 +108,15 @@ class ClassifierRecipe(Recipe):
         store: pictures of at least ``people`` people in each scene.
         scenes: what to train on.
         people: how many, of whom every fifth is held out.
-        snr_db: (lowest, highest) ratio, drawn anew for each picture; (50, 50) is the paper's.
+        snr_db: (lowest, highest) ratio, drawn for each picture; (50, 50) is the paper's.
         seed: of weights, order and noise.
         init: weights to start from.
         size: height and width of the pictures, a divisor of the store's; None takes that of :data:`NETWORKS`.
-        filmed: a second store, of motion that a camera saw, to train on beside the first.
-        filmed_people: how many of it.
+        filmed: a second store, of motion estimated from films, to train on as well.
+        filmed_people: number of people of it.
         learning_rate: of the first half.
         masks: largest part of the rows (speeds) and of the columns (time) of a picture that is masked in training, a
-            width and place drawn for each look; (0, 0) masks nothing. See :func:`masked`.
+            width and place drawn each time; (0, 0) masks nothing. See :func:`masked`.
 
     Raises:
         TensorsimError: an unknown network, a range that does not ascend, masks outside of 0 to 1, or a store without
@@ -213,7 +213,7 @@ class ClassifierRecipe(Recipe):
         return 1.0 if 2 * step < steps else 0.1
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Accuracy in each scene and the mean loss, at ratios drawn once and for all; the lowest loss is best."""
+        """Accuracy in each scene and the mean loss, at fixed random ratios; the score is the negative loss."""
         losses, figures = [], {}
         for name, (store, clips) in self.validation.items():
             logits = logits_of(net, store, clips, self.snr_db, self.size)
@@ -236,7 +236,7 @@ def logits_of(
     size: int,
     batch: int = 64,
 ) -> Tensor:
-    """Logits (N, classes) of N clips, on the CPU. Clip k has the k-th draw of the ratios, whatever the network."""
+    """Logits (N, classes) of N clips, on the CPU. Clip k has the k-th draw of the ratios for every network."""
     parameter = next(net.parameters())
     found = []
     for first in range(0, len(clips), batch):
@@ -258,7 +258,7 @@ class Classifier(NamedTuple):
 
 
 def load_classifier(path: Path) -> Classifier:
-    """The network of a weight file, whichever of the two it is, and the size of its pictures.
+    """The network of a weight file, SPNet or SPGNet, and the size of its pictures.
 
     Raises:
         TensorsimError: no such file, or weights of neither.

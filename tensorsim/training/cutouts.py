@@ -1,4 +1,4 @@
-"""People cut out of rendered pictures, with exact outlines, to be pasted on pictures of places.
+"""People cut out of rendered pictures, with exact outlines, to be pasted on background pictures.
 
 A shard is a tar of ``KEY.png`` (RGBA, straight alpha, cropped to the person) and ``KEY.json`` with
 ``{"keypoints": [[x, y, v] * 17]}`` in pixels of it (centres at integers; v as in COCO).
@@ -44,10 +44,10 @@ class Cutout(NamedTuple):
 
 
 class Cutouts(Sequence[Cutout]):
-    """The cut-outs of shards, in the order of the files and of their names inside them, decoded when asked for.
+    """The cut-outs of shards, in the order of the files and of their names inside them, decoded on access.
 
     Raises:
-        TensorsimError: a path that is not such a shard.
+        TensorsimError: a file that is not such a shard.
     """
 
     def __init__(self, paths: Iterable[str | os.PathLike[str]]) -> None:
@@ -78,12 +78,12 @@ class Cutouts(Sequence[Cutout]):
 
 
 def render_cutout(pose: Tensor, seed: int, side: int = 288) -> Cutout:
-    """One person in this pose, seen from somewhere, in some clothes and light.
+    """Render one person in this pose with a random view, clothes and light.
 
     Args:
         pose: (14, 3) body heights, as :func:`tensorsim.motion.pose_sampler.sample_poses` draws them.
-        seed: of looks, light, the way that the person faces and the camera.
-        side: longest side of the result in pixels, about.
+        seed: of appearance, light, heading and camera.
+        side: approximate longest side of the result in pixels.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -94,13 +94,13 @@ def render_cutout(pose: Tensor, seed: int, side: int = 288) -> Cutout:
     turn = rotation(2, torch.tensor(number(-math.pi, math.pi), dtype=pose.dtype))
     joints = rest_on_floor((turn @ pose[..., None])[..., 0] * height, height)
     distance, camera_height = number(2.2, 8.0), number(0.5, 2.8)
-    # The camera looks at the body, now and then a little past it, and is never quite level.
+    # The camera looks at the body and is not level.
     centre = (joints.amin(dim=0) + joints.amax(dim=0)) / 2
     position = (float(centre[0]), float(centre[1]) - distance, camera_height)
     pitch = math.atan2(float(centre[2]) - camera_height, distance)
     camera = CameraConfig(position_m=position, pitch_rad=pitch)
     pixels = side * OVERSAMPLING
-    # The focal length and the principal point that make joints, with flesh around them, fill the picture.
+    # Focal length and principal point for which the joints and a margin for the flesh fill the picture.
     x, y, z = ((joints - joints.new_tensor(position)) @ camera_to_world(camera)[:, :3].to(joints)).unbind(-1)
     low, high = torch.stack([x / z, y / z], dim=-1).aminmax(dim=0)
     flesh = 0.17 * height / 1.75 / distance
@@ -129,7 +129,7 @@ def _shrink(picture: Tensor) -> Tensor:
 
 
 def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bool = False) -> list[Path]:
-    """Render people in sampled poses into shards ``cutouts-NNN.tar``; shards that are there are kept.
+    """Render people in sampled poses into shards ``cutouts-NNN.tar``; existing shards are kept.
 
     ``cutouts.json`` beside them tells number and seed. A folder of shards without one is taken as it is.
 

@@ -1,4 +1,4 @@
-"""The recipe of the map denoiser: patches of simulated maps with and without noise, the noise to be predicted.
+"""The recipe of the map denoiser: patches of simulated maps with noise, of which the network predicts the noise.
 
 Every clip is simulated twice with one draw of the noise, at a ratio between 0 and 40 dB and at 50 dB, which counts as
 clean. Images and noise are on the ``"floor"`` scale of ``MapDenoiser``, so the network learns what it will be asked.
@@ -41,7 +41,7 @@ _DISPLAY_HZ = 256.0
 
 
 def simulate_pair(scene: str, activity: int, seed: int, snr_db: float) -> tuple[RadarMaps, RadarMaps]:
-    """Maps of one clip at ``snr_db`` and clean, with the same draw of the noise; ``seed`` makes person and noise."""
+    """Maps of one clip at ``snr_db``, and free of noise; ``seed`` determines person and noise."""
     radar, wall = PRESETS[scene].radar, PRESETS[scene].wall
     people = one_person_many_ways(1, torch.Generator().manual_seed(seed))
     motion = ActivityGenerator().generate(activity, people=people, rate_hz=_MOTION_HZ)
@@ -54,7 +54,7 @@ def simulate_pair(scene: str, activity: int, seed: int, snr_db: float) -> tuple[
         simulator = RadarSimulator(radar, echo=echo, snr_db=ratio)
         torch.manual_seed(seed)
         with torch.no_grad(), warnings.catch_warnings():
-            # Kicks and falls are too fast for the through-wall preset; there they alias, as they would for a radar.
+            # Kicks and falls are too fast for the through-wall preset and alias, as they would for a real radar.
             warnings.simplefilter("ignore", TensorsimWarning)
             maps.append(RadarMaps(*(field[0] for field in simulator(points, rcs))))
     return maps[0], maps[1]
@@ -70,7 +70,7 @@ def views(maps: RadarMaps, prf_hz: float) -> dict[str, Tensor]:
 
 
 def on_scale(noisy: Tensor, clean: Tensor) -> tuple[Tensor, Tensor]:
-    """What the network is shown of a map (H, W), ``log(1 + noisy / floor)``, and the noise in floors."""
+    """Input of the network for a map (H, W), ``log(1 + noisy / floor)``, and the noise in units of the floor."""
     floor = map_floor(noisy)
     return torch.log1p(noisy / floor), (noisy - clean) / floor
 
@@ -78,7 +78,7 @@ def on_scale(noisy: Tensor, clean: Tensor) -> tuple[Tensor, Tensor]:
 def cut_patches(
     image: Tensor, noise: Tensor, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """``count`` patches (N, STORED, STORED) of an image and its noise, half from anywhere, half near an echo."""
+    """``count`` patches (N, STORED, STORED) of an image and its noise, half at random places, half near an echo."""
     height, width = image.shape
     beyond = [0, max(0, STORED - width), 0, max(0, STORED - height)]
     padded = [F.pad(x[None, None], beyond, mode="replicate")[0, 0] for x in (image, noise)]
@@ -108,7 +108,7 @@ def build_pairs(
     scenes: tuple[str, ...] = SCENES,
     quiet: bool = False,
 ) -> None:
-    """Fill a folder with patches of ``clips`` clips per scene, activity after activity; what is there stays."""
+    """Fill a folder with patches of ``clips`` clips per scene, activity after activity; existing files are kept."""
     from safetensors.torch import save_file
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ def build_pairs(
 
 
 def untrained(depth: int = 20, seed: int = 0) -> DnCNN:
-    """A DnCNN that begins by doing nothing: its last layer is zero. ``seed`` draws the other weights."""
+    """A DnCNN whose last layer is zero, so that it starts as the identity; ``seed`` is of the other weights."""
     torch.manual_seed(seed)
     net = DnCNN(depth)
     nn.init.zeros_(net.model[-1].get_parameter("weight"))
@@ -183,7 +183,7 @@ class DenoiserRecipe(Recipe):
         return found
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Half the mean square error of the residual, which is that of the map in floors."""
+        """Half the mean square error of the residual, in units of the floor."""
         error = (batch["image"] - net(batch["image"]).float() - batch["noise"]).square().mean()
         before = batch["noise"].square().mean()
         return {"loss": error / 2, "gain_db": -10 * (error.detach() / before).log10()}
@@ -199,7 +199,7 @@ class DenoiserRecipe(Recipe):
         return rise * (0.01 + 0.99 * cosine)
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """By how much the error of the patches of held-out clips falls."""
+        """Reduction of the error on patches of held-out clips."""
         parameter = next(net.parameters())
         error, before = 0.0, 0.0
         images, noises = self.held_out["image"][::4], self.held_out["noise"][::4]

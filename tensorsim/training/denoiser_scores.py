@@ -1,4 +1,4 @@
-"""What denoisers gain on whole maps of held-out motion."""
+"""Improvement by denoisers on whole maps of held-out motion."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,10 +1,10 @@
-"""Errors of pose networks on films, copied to other motion from the moments that look most alike.
+"""Errors of pose networks on films, transferred to other motion from the most similar moments.
 
-Networks do not err at random: an arm that hides in front of the body is put in the same wrong place for as long as it
-hides, a left leg is taken for the right one from some sides, and a sleeve misleads for a whole film. So nothing is
-modelled here. Of films whose true motion is known, what networks found is kept, and another motion gets, piece by
-piece, the errors of pieces that look like it. Which ones is the shortest path (Viterbi, 1967) through unlikeness and a
-price for leaving a film.
+Errors of networks are not random: an arm in front of the body has the same wrong position for as long as it is there,
+a left leg is mistaken for the right one from some directions, and clothes cause errors throughout a film. The errors
+are therefore copied and not modelled. Films whose true motion is known are stored with the networks' results; another
+motion gets, segment by segment, the errors of similar segments. They are chosen by dynamic programming (Viterbi, 1967)
+over the dissimilarity and a penalty for changing to another film.
 """
 
 import hashlib
@@ -22,24 +22,24 @@ from tensorsim.evaluation.clips import Clip, activity_clips
 from tensorsim.evaluation.films import FPS, Observed, filmed, project
 from tensorsim.vision.pose2d.topdown import MIRRORED
 
-#: Frames of a piece and from one to the next; frames of a piece that are compared.
+#: Frames of a segment, frames from one segment to the next, and the frames of a segment that are compared.
 _PIECE, _STEP, _COMPARED = 12, 6, (0, 4, 8, 11)
-#: Starts of pieces within a film lie so many frames apart.
+#: Frames between the starts of segments within a film.
 _EVERY = 2
-#: What a key point beyond the edge of the picture adds to unlikeness where the other is inside, in body heights, and
-#: what leaving a film adds to a path.
+#: Dissimilarity, in body heights, of a key point outside the picture to one inside, and the penalty for changing to
+#: another film.
 _EDGE, _LEAVE = 0.15, 0.15
-#: Share of the films that a motion may take errors from, drawn anew for each, so that two of them differ.
+#: Share of the films that a motion takes errors from, drawn anew for each motion, so that results vary.
 _SHARE = 0.3
 
 
 class Look(NamedTuple):
-    """How a motion looks in the picture.
+    """A motion as it appears in the picture.
 
     Attributes:
         pixels: (T, 17, 2) true COCO key points.
         inside: (T, 17) whether they are in the picture.
-        unit_px: (T,) what the body's standing height is at the distance of the hips.
+        unit_px: (T,) standing height of the body in pixels at the distance of the hips.
     """
 
     pixels: Tensor
@@ -48,7 +48,7 @@ class Look(NamedTuple):
 
     @classmethod
     def of(cls, joints: Tensor, height_m: float) -> "Look":
-        """Of joints (T, 14, 3) before the camera of ``tensorsim.evaluation.films``."""
+        """From joints (T, 14, 3) and the camera of ``tensorsim.evaluation.films``."""
         joints = joints.double()
         pixels, inside, view = project(joints)
         depth = view.project(0.5 * (joints[:, 8] + joints[:, 11]))[1]
@@ -61,11 +61,11 @@ class Look(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """What networks found of the one person of a film.
+    """Results of networks for the one person of a film.
 
     Attributes:
         shape, inside: see :class:`Look`.
-        error: (T, 17, 2) found less true key points, in body heights.
+        error: (T, 17, 2) found minus true key points, in body heights.
         scores: (T, 17).
         found: (T,) whether the person was followed.
     """
@@ -78,7 +78,7 @@ class Watched(NamedTuple):
 
     @classmethod
     def of(cls, clip: Clip, seen: Observed) -> "Watched":
-        """Of several tracks, the one nearest to the person in each frame; farther than half a body is not found."""
+        """From the track nearest to the person in each frame; one farther than half a body height does not count."""
         look = Look.of(clip.joints(FPS), clip.height_m)
         away = (seen.keypoints.double() - look.pixels).norm(dim=-1).median(-1).values
         away, track = away.where(seen.valid, torch.inf).min(0)
@@ -94,7 +94,7 @@ class Watched(NamedTuple):
         )
 
     def mirrored(self) -> "Watched":
-        """Seen in a mirror: left is right."""
+        """The mirror image: left and right exchanged."""
         other = list(MIRRORED)
         turn = self.shape.new_tensor([-1.0, 1.0])
         return Watched(
@@ -106,7 +106,7 @@ class Watched(NamedTuple):
         )
 
 
-def activity_told(path: Path) -> int | None:
+def activity_of_folder(path: Path) -> int | None:
     """Index of the activity whose number, S1 to S12, begins the name of the folder of a file; None without one."""
     name = re.match(r"S(\d+)(?!\d)", path.parent.name)
     return int(name[1]) - 1 if name is not None and 1 <= int(name[1]) <= len(ACTIVITIES) else None
@@ -122,16 +122,18 @@ def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
     if not paths:
         raise TensorsimError(f"{folder}: got no films, expected those of evaluate truth --settings c")
     for path in paths:
-        activity, number = activity_told(path), re.match(r"(\d+)-", path.name)
+        activity, number = activity_of_folder(path), re.match(r"(\d+)-", path.name)
         if activity is None or number is None:
-            raise TensorsimError(f"{path}: got a name that tells no clip, expected one of evaluate truth")
+            raise TensorsimError(
+                f"{path}: got a name without a clip, expected one of evaluate truth"
+            )
         name = ACTIVITIES[activity]
         clip = activity_clips((name,), 1, int(number[1]))[name][0]
         yield str(path.relative_to(folder)), clip, filmed(path, clip, nn.Identity(), nn.Identity()).found
 
 
 def watched_films(folder: Path) -> dict[str, Watched]:
-    """Those of :func:`films_of` in which there is somebody, and somebody was found."""
+    """The films of :func:`films_of` that show a person whom the networks found."""
     return {
         name: Watched.of(clip, seen)
         for name, clip, seen in films_of(folder)
@@ -140,23 +142,23 @@ def watched_films(folder: Path) -> dict[str, Watched]:
 
 
 def _features(shape: Tensor, inside: Tensor, starts: Tensor) -> Tensor:
-    """What is compared of pieces from these frames on, (N, features)."""
+    """Features (N, features) of the segments that start at these frames."""
     at = torch.tensor(_COMPARED) + starts[:, None]
     seen = shape.where(inside[..., None], 0.0)[at].flatten(2)
     return torch.cat([seen, _EDGE * inside[at].double()], -1).flatten(1)
 
 
 class FilmErrors:
-    """Gives motion the errors of networks on films.
+    """Adds the errors of networks on films to motion.
 
     Args:
-        films: see :func:`watched_films`; of at least 12 frames each. Each serves mirrored as well.
+        films: see :func:`watched_films`; at least 12 frames each. The mirror image of each is used too.
 
     Attributes:
-        digest: tells sets of films apart.
+        digest: identifies the set of films.
 
     Raises:
-        TensorsimError: no films, or a shorter one.
+        TensorsimError: no films, or one of fewer frames.
     """
 
     def __init__(self, films: dict[str, Watched]) -> None:
@@ -176,7 +178,7 @@ class FilmErrors:
         ]
 
     def __call__(self, joints: Tensor, height_m: float, generator: torch.Generator) -> Observed:
-        """What networks would find of joints (T, 14, 3) of one person at the frame rate of films, T at least 12."""
+        """Simulated results of networks for joints (T, 14, 3) of one person at the films' frame rate, T at least 12."""
         look = Look.of(joints, height_m)
         frames = len(look.unit_px)
         if frames < _PIECE:
@@ -203,19 +205,19 @@ class FilmErrors:
         )
 
     def _pieces(self, look: Look, starts: Tensor, generator: torch.Generator) -> list[tuple[Watched, int]]:
-        """For each piece the film, and where in it, whose errors it gets."""
+        """For each segment, the film and the frame in it that its errors are from."""
         order = torch.randperm(len(self.films), generator=generator)
         chosen = order[: max(1, round(_SHARE * len(order)))].tolist()
         film = torch.cat([torch.full_like(self._starts[c], c) for c in chosen])
         at = torch.cat([self._starts[c] for c in chosen])
         features = torch.cat([self._features[c] for c in chosen])
-        unlikeness = torch.cdist(_features(look.shape, look.inside, starts), features)
-        # A film goes on a step later; its first pieces follow nothing.
+        dissimilarity = torch.cdist(_features(look.shape, look.inside, starts), features)
+        # A film continues one step later; its first segments have no predecessor.
         step = _STEP // _EVERY
         before = (torch.arange(len(at)) - step).clamp_min(0)
         follows = at >= _STEP
-        cost, came_from = unlikeness[0], []
-        for here in unlikeness[1:]:
+        cost, came_from = dissimilarity[0], []
+        for here in dissimilarity[1:]:
             best, left = cost.min(0)
             stays = follows & (cost[before] <= best + _LEAVE)
             came_from.append(torch.where(stays, before, left))

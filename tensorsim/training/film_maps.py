@@ -1,4 +1,4 @@
-"""Poses from films in place of true motion: to test classifiers on, and imitated cheaply to train them with."""
+"""Poses estimated from films in place of true motion: real ones to test classifiers, simulated ones to train them."""
 
 import warnings
 from pathlib import Path
@@ -19,13 +19,13 @@ from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.recognition.recognizer import ActivityRecognizer
-from tensorsim.training.film_errors import FilmErrors, activity_told, films_of
+from tensorsim.training.film_errors import FilmErrors, activity_of_folder, films_of
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 
 
 class FilmLoss:
-    """What is left of a motion that a camera saw: key points with errors, lifted, placed and smoothed.
+    """Motion as the pipeline estimates it from a film: key points with errors, lifted, placed and smoothed.
 
     The camera is that of ``tensorsim.evaluation.films``; nothing is rendered.
 
@@ -39,9 +39,9 @@ class FilmLoss:
 
     @torch.no_grad()
     def __call__(self, joints: Tensor, height_m: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Joints (T, 14, 3) of one person to those that the pipeline finds, and whether (T,) it does.
+        """Joints (T, 14, 3) of one person to those that the pipeline estimates, and in which frames (T,) it does.
 
-        The rate is that of films, ``tensorsim.evaluation.films.FPS``.
+        The frame rate is ``tensorsim.evaluation.films.FPS``.
         """
         seen = self.errors(joints, height_m, generator)
         if not bool(seen.valid.any()):
@@ -71,14 +71,14 @@ class LabelledPose(NamedTuple):
 
 
 def labelled_poses(folder: Path) -> list[LabelledPose]:
-    """Every ``pose.npz`` below a folder; the name of the folder that it lies in begins with S1 to S12.
+    """Every ``pose.npz`` below a folder; the name of the folder that contains it begins with S1 to S12.
 
     Raises:
-        TensorsimError: none there, or a name without a class.
+        TensorsimError: there is none, or a name without a class.
     """
     found = []
     for path in sorted(folder.rglob("pose.npz")):
-        activity = activity_told(path)
+        activity = activity_of_folder(path)
         if activity is None:
             raise TensorsimError(f"{path}: its folder's name does not begin with S1 to S{len(ACTIVITIES)}")
         with np.load(path) as file:
@@ -90,7 +90,7 @@ def labelled_poses(folder: Path) -> list[LabelledPose]:
 
 
 def film_poses(folder: Path) -> list[LabelledPose]:
-    """The people of every film that ``tensorsim evaluate truth`` keeps for its setting c, as it lifts them.
+    """The people of every film that ``tensorsim evaluate truth`` stores for its setting c, lifted as it does.
 
     Raises:
         TensorsimError: see :func:`~tensorsim.training.film_errors.films_of`.
@@ -99,7 +99,7 @@ def film_poses(folder: Path) -> list[LabelledPose]:
     found = []
     for _, clip, seen in films_of(folder):
         joints, valid = pipelines.lifted(Setting("c"), clip, seen)
-        if len(joints) == 0:  # nobody: one body without an echo
+        if len(joints) == 0:  # nobody found: one body without an echo
             joints, valid = torch.ones(1, valid.shape[-1], 14, 3), valid.new_zeros(1, valid.shape[-1])
         found.append(LabelledPose(joints.double(), valid, FPS, activity_index(clip.row)))
     return found
@@ -109,7 +109,7 @@ def film_poses(folder: Path) -> list[LabelledPose]:
 def classify_poses(
     weights: Path, poses: list[LabelledPose], scene: str, snr_db: float, quiet: bool = False
 ) -> list[int]:
-    """What a network (SPNet or SPGNet, .safetensors) takes the films for in a scene, as indices of activities."""
+    """Activities (indices) that a network (SPNet or SPGNet, .safetensors) predicts for the films in a scene."""
     radar, wall = PRESETS[scene].radar, PRESETS[scene].wall
     echo = EchoSynthesizer(radar, wall, multipath=wall is not None)
     stage = PoseToDoppler(RadarSimulator(radar, echo=echo, snr_db=snr_db))

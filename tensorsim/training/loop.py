@@ -31,7 +31,7 @@ Batch = dict[str, Any]
 
 
 class Recipe:
-    """What a training run is made of; subclasses give the parts.
+    """The parts of a training run, which subclasses define.
 
     Attributes:
         net: the network to train.
@@ -53,7 +53,7 @@ class Recipe:
         raise NotImplementedError
 
     def collate(self, samples: list[dict[str, Any]]) -> Batch:
-        """Samples to a batch."""
+        """Collate samples into a batch."""
         return default_collate(samples)
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
@@ -69,13 +69,13 @@ class Recipe:
         raise NotImplementedError
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Figures on held-out data; the largest ``score`` tells the best weights."""
+        """Figures on held-out data; the weights with the largest ``score`` are kept as the best."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """How a recipe is run.
+    """Settings of a run.
 
     Attributes:
         out: folder of ``last.pt`` (to go on from), ``best.safetensors``, ``metrics.csv`` and TensorBoard's events.
@@ -122,7 +122,7 @@ class LoopConfig:
             raise TensorsimError(f"LoopConfig: {self.out} is a file, expected a folder")
 
     def fingerprint(self) -> dict[str, Any]:
-        """What a run that goes on must share with the run that began. The number of steps may change."""
+        """Settings that must not change when a run is resumed. The number of steps may."""
         return {name: getattr(self, name) for name in ("batch", "seed", "precision", "ema_decay")}
 
 
@@ -150,7 +150,7 @@ class _Shares:
 
 
 class _Log:
-    """``metrics.csv`` (step, name, value) and TensorBoard's events; lines after ``step`` of an older run go."""
+    """``metrics.csv`` (step, name, value) and TensorBoard events; removes lines of an older run after ``step``."""
 
     def __init__(self, out: Path, step: int) -> None:
         try:
@@ -270,7 +270,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
 
 
 def _batches(loader: DataLoader[Batch]) -> Iterator[Batch]:
-    """Batches; an error of a worker comes as it was raised there, without the traceback that torch puts around it."""
+    """Batches; an error in a worker is raised as it was there, without the traceback that torch adds."""
     try:
         yield from loader
     except TensorsimError as error:
@@ -278,7 +278,7 @@ def _batches(loader: DataLoader[Batch]) -> Iterator[Batch]:
 
 
 def _decay(decay: float, count: int) -> float:
-    # A short memory at first, or the average would long remember the random start.
+    # A short average at first; otherwise the random initial weights would remain in it for long.
     return min(decay, (1 + count) / (10 + count))
 
 
@@ -332,11 +332,11 @@ def _read(path: Path) -> dict[str, Any]:
     """What :func:`_save` wrote."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    # A cut or overwritten file fails in the archive, in the pickle or in the tensors, each with its own exception.
+    # A truncated file fails in the archive, in the pickle or in the tensors, each with its own exception.
     except (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        told = (str(error).splitlines() or [type(error).__name__])[0][:100]
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:100]
         raise TensorsimError(
-            f"{path}: damaged, training cannot go on from it ({told}); remove it to start anew"
+            f"{path}: damaged, training cannot resume from it ({reason}); remove it to start again"
         ) from error
     parts = {"step", "best", "loop", "recipe", "net", "averaged", "optimiser"}
     if not isinstance(state, dict) or not parts <= state.keys():
@@ -357,11 +357,11 @@ def _resume(
     for part, mine in (("loop", config.fingerprint()), ("recipe", recipe.settings)):
         differ = [key for key in {**state[part], **mine} if state[part].get(key) != mine.get(key)]
         if differ:
-            told = ", ".join(
+            reason = ", ".join(
                 f"{key}: {mine.get(key)!r} for {state[part].get(key)!r}" for key in sorted(differ)
             )
             raise TensorsimError(
-                f"{path}: it belongs to another run ({told}); choose another folder, or the same settings"
+                f"{path}: it belongs to another run ({reason}); choose another folder, or the same settings"
             )
     recipe.net.load_state_dict(state["net"])
     averaged.load_state_dict(state["averaged"])

@@ -1,4 +1,4 @@
-"""A store of Doppler-time pictures of generated people, at every signal-to-noise ratio at once.
+"""A store of Doppler-time pictures of generated people, for every signal-to-noise ratio.
 
 The map of an echo with noise is ``sum over bins of |S + s N|^2 = A + 2 s B + s^2 C``, S and N the spectra of echo and
 noise, s the noise amplitude, and
@@ -53,7 +53,7 @@ _MARGIN_BINS, _WALL_M = 5, 2.0
 
 @dataclass(frozen=True)
 class MapSettings:
-    """What a store holds.
+    """Contents of a store.
 
     Attributes:
         seed: of people, motion and noise; person k of a seed is always the same.
@@ -82,7 +82,7 @@ class MapSettings:
 
     @classmethod
     def read(cls, path: Path) -> "MapSettings":
-        """Those that a store states in its ``settings.json``.
+        """Read the settings of a store from its ``settings.json``.
 
         Raises:
             TensorsimError: a file that is damaged, or of a store of another kind.
@@ -94,7 +94,7 @@ class MapSettings:
 
     @classmethod
     def of_films(cls, seed: int, errors: FilmErrors) -> "MapSettings":
-        """Motion as the pipeline finds it in films where networks make these errors."""
+        """Settings for motion as the pipeline estimates it from films with these errors of the networks."""
         return cls(seed=seed, motion_hz=FPS, films=errors.digest)
 
 
@@ -126,7 +126,7 @@ def from_bytes(level: Tensor) -> Tensor:
 
 
 class Moves(NamedTuple):
-    """What one person does, as the radar is to see it.
+    """Motion of one person that the radar observes.
 
     Attributes:
         joints: (12, T, 14, 3) m, by activity.
@@ -140,7 +140,7 @@ class Moves(NamedTuple):
 
 
 class MotionMaker:
-    """Makes what the people of a store do.
+    """Generates the motion of the people of a store.
 
     Args:
         settings: of the store.
@@ -152,12 +152,12 @@ class MotionMaker:
 
     def __init__(self, settings: MapSettings, errors: FilmErrors | None = None) -> None:
         if settings.films != ("" if errors is None else errors.digest):
-            raise TensorsimError(f"MotionMaker: got errors of other films than those of {settings}")
+            raise TensorsimError(f"MotionMaker: got errors of different films, expected those of {settings}")
         self.settings = settings
         self.film = None if errors is None else FilmLoss(errors)
 
     def __call__(self, index: int) -> Moves:
-        """What person ``index`` does."""
+        """Motion of person ``index``."""
         generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + index)
         people = one_person_many_ways(len(ACTIVITIES), generator)
         motion = ActivityGenerator().generate(
@@ -174,7 +174,7 @@ class MotionMaker:
 
 
 class MapMaker:
-    """Makes the pictures of one scene.
+    """Computes the pictures of one scene.
 
     Args:
         scene: a name in ``tensorsim.radar.presets.PRESETS``; a wall comes with its multipath.
@@ -193,7 +193,7 @@ class MapMaker:
         self.scatterers = JointScatterers()
         self.resampler = PoseResampler(self.radar.prf_hz)
         pulses = round(settings.duration_s * self.radar.prf_hz)
-        # A frame per column is enough: what lies between is averaged in a pixel anyway.
+        # One frame per column is enough: a pixel averages over those between.
         usual = DopplerFrames(self.radar)
         hop = max(usual.hop, (pulses - 1 - usual.length) // max(1, settings.size - 1))
         self.frames = DopplerFrames(self.radar, overlap=1 - (hop - 0.5) / usual.length)
@@ -202,7 +202,7 @@ class MapMaker:
         self.first, self.last = int(shown[0]), int(shown[-1]) + 1
 
     def spectra(self, profiles: Tensor) -> Iterator[Tensor]:
-        """Profiles (M, R) to Doppler spectra (r, K, F), a few range bins at a time, only the rows that are shown."""
+        """Profiles (M, R) to Doppler spectra (r, K, F), a few range bins at a time; only rows in the picture."""
         window = self.frames.shifting_window.float()
         for series in self.frames.series(self.mti(profiles))[0].split(8):
             cut = series.unfold(-1, self.frames.length, self.frames.hop) * window
@@ -233,7 +233,7 @@ class MapMaker:
         return RangeProfile(self.radar, gate_m=(max(0.0, near), min(far, last)))
 
     def echo_pictures(self, joints: Tensor, valid: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """The pictures A and B of somebody, joints (T, 14, 3) and whether there (T,), in noise of the same time.
+        """The pictures A and B of a person, joints (T, 14, 3) and presence (T,), with noise of the same duration.
 
         The mean power of the echo is 1 per IF sample.
         """
@@ -258,7 +258,7 @@ class MapMaker:
 
     @torch.no_grad()
     def pictures(self, moves: Moves) -> dict[str, Tensor]:
-        """What a person does, as stored: bytes ``signal`` and ``cross`` (12, H, W) and ``noise`` (H, W).
+        """Pictures of one person as stored: bytes ``signal`` and ``cross`` (12, H, W) and ``noise`` (H, W).
 
         ``gain_db`` (12,) is the noise's peak against the signal's at a ratio of 0 dB.
         """
@@ -294,7 +294,7 @@ def build_maps(
     quiet: bool = False,
     errors: FilmErrors | None = None,
 ) -> None:
-    """Fill a store: people ``first`` to ``first + people`` in each scene; what is there already stays.
+    """Fill a store: people ``first`` to ``first + people`` in each scene; existing files are kept.
 
     ``errors`` are those of the films that the settings name.
 
@@ -308,7 +308,7 @@ def build_maps(
     if described.is_file():
         there = MapSettings.read(described)
         if there != settings:
-            raise TensorsimError(f"{folder}: it holds maps of {asdict(there)}, expected {asdict(settings)}")
+            raise TensorsimError(f"{folder}: got maps of {asdict(there)}, expected {asdict(settings)}")
     else:
         with complete_file(described) as scratch:
             scratch.write_text(json.dumps(asdict(settings), indent=2), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Labelled pictures of people: tar shards of jpg and json, and COCO annotation files, read in any order.
+"""Labelled pictures of people: tar shards of jpg and json, and COCO annotation files, with random access.
 
 A shard holds ``KEY.jpg`` and ``KEY.json`` with ``{"all_persons_labelled": bool, "persons": [{"bbox": [x, y, w,
 h], "keypoints": [[x, y, v] * 19] or null}]}``; a picture without a json shows no people. The 19 points are
@@ -27,9 +27,9 @@ Floats = npt.NDArray[np.float32]
 POINTS = (*COCO_KEYPOINTS, "neck", "head_top")
 #: Shards of COCO pictures with people.
 COCO_SHARDS = ("coco_small", "coco_more", "coco_extra")
-#: Of these, never trained on: those whose hash is below. coco_more and coco_extra hold none below 15.
+#: Pictures of these whose hash is below this are never used in training. coco_more and coco_extra have none below 15.
 COCO_HELD_OUT_PERCENT = 25
-#: Usual share of a box that its person covers.
+#: Typical share of a box that its person covers.
 AREA_OF_BOX = 0.53
 
 
@@ -41,11 +41,11 @@ class Sample:
         key: its name within its source.
         boxes: (n, 4) float32 ``xyxy`` pixels.
         keypoints: (n, 19, 3) float32: x, y and v of :data:`POINTS`; all zero for a person without points.
-        areas: (n,) float32, pixels that show each person, as annotated or else :data:`AREA_OF_BOX` of the box.
+        areas: (n,) float32, pixels covered by each person, as annotated or else :data:`AREA_OF_BOX` of the box.
         all_labelled: no further person is in the picture.
-        path: the file that holds the picture: itself a jpg, or a tar.
-        offset: where the picture begins in it.
-        size: its length in bytes; None is all the rest.
+        path: the file with the picture: a jpg, or a tar.
+        offset: of the picture in the file, in bytes.
+        size: length in bytes; None is up to the end.
     """
 
     key: str
@@ -77,14 +77,14 @@ class Sample:
 class Shards(Sequence[Sample]):
     """The samples of tar shards, in the order of the files and of their names inside them.
 
-    Each tar is read through once for its labels; pictures are read from it when asked for, so shards larger than
-    memory do, and a copy in another process opens files of its own.
+    Each tar is scanned once for its labels; pictures are read on access, so shards may be larger than memory, and a
+    copy in another process opens the files itself.
 
     Args:
         paths: tar files.
 
     Raises:
-        TensorsimError: a path that is not a tar of such samples.
+        TensorsimError: a file that is not a tar of such samples.
     """
 
     def __init__(self, paths: Iterable[str | os.PathLike[str]]) -> None:
@@ -110,7 +110,7 @@ def find_shards(folder: str | os.PathLike[str], name: str) -> list[Path]:
 
 
 def split(samples: Sequence[Sample], percent: int) -> tuple[list[Sample], list[Sample]]:
-    """Samples to train on, and the percent that are held out, chosen by a hash of their keys."""
+    """Training samples, and the given percentage of held-out samples, chosen by a hash of their keys."""
     parts: tuple[list[Sample], list[Sample]] = ([], [])
     for sample in samples:
         parts[int(hashlib.sha256(sample.key.encode()).hexdigest(), 16) % 100 < percent].append(sample)
@@ -118,7 +118,7 @@ def split(samples: Sequence[Sample], percent: int) -> tuple[list[Sample], list[S
 
 
 def read_coco_shards(folder: str | os.PathLike[str]) -> tuple[list[Sample], list[Sample]]:
-    """COCO pictures to train on, and the held-out ones, of a folder of shards.
+    """Training and held-out COCO pictures of a folder of shards.
 
     Raises:
         TensorsimError: shards are missing.
@@ -135,10 +135,10 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
         images: folder of the pictures.
 
     Returns:
-        Samples; ``all_labelled`` is false where a crowd is marked, which is not among the boxes.
+        Samples; ``all_labelled`` is False where a crowd is marked, which has no boxes.
 
     Raises:
-        TensorsimError: no such file or another content.
+        TensorsimError: no such file, or not a COCO annotation file.
     """
     path, folder = Path(annotations), Path(images)
     try:
@@ -172,7 +172,7 @@ def read_coco_folder(folder: Path) -> list[Sample]:
     """:func:`read_coco` of the one annotation file (``.json``) in a folder, with its pictures in ``images/``.
 
     Raises:
-        TensorsimError: no such file, or several; another content.
+        TensorsimError: no such file, several, or not a COCO annotation file.
     """
     files = sorted(folder.glob("*.json"))
     if len(files) != 1:
@@ -206,7 +206,7 @@ def _read_tar(path: Path) -> list[Sample]:
 
 
 def _labels(persons: list[dict[str, Any]]) -> tuple[Floats, Floats, Floats]:
-    """Boxes (n, 4) ``xyxy``, points (n, 19, 3) and areas (n,) of people as they are written down."""
+    """Boxes (n, 4) ``xyxy``, points (n, 19, 3) and areas (n,) of annotated people."""
     boxes = np.array([person["bbox"] for person in persons], np.float32).reshape(-1, 4)
     usual = AREA_OF_BOX * boxes[:, 2:].prod(1)
     boxes[:, 2:] += boxes[:, :2]
