@@ -169,7 +169,9 @@ class Glasgow:
         db = 20 * maps.clamp(min=1e-6).log10()
         db = db - db.median(dim=-1)[0].median(dim=-1)[0][:, None, None] + level_db.float().unsqueeze(-1)
         # Doppler 0 in the middle of the measured masks, a third of a row before row 128 of 256.
-        db = F.interpolate(db.flip(-2).roll(1, -2)[:, None], (128, 256), mode="bilinear", antialias=True)[:, 0]
+        db = F.interpolate(db.flip(-2).roll(1, -2)[:, None], (128, 256), mode="bilinear", antialias=True)[
+            :, 0
+        ]
         return self.cfar(db.clamp(min=0.0))
 
     def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:

@@ -76,7 +76,7 @@ class RadHar:
         self.effects = effects
         profile = RangeProfile(RADAR, window="hamming", gate_m=(0.8, 4.6))
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
-        self.scatterers = LimbScatterers(RADAR.tx_m, RADAR.rx_m, per_segment=2)
+        self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)
         # Next to a body that fills many range bins the smaller reference cells are those of noise.
         self.cfar = CfarDetector(
             (5, 0), (5, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
@@ -114,7 +114,7 @@ class RadHar:
         draw = Draw(count, generator)
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.beam:
-            rcs = in_beam(positions, rcs, RADAR.tx_m[2], draw(14.0, 32.0))
+            rcs = in_beam(positions, rcs, RADAR.tx_positions_m[0][2], draw(14.0, 32.0))
         if self.effects.dim_limbs:
             gain_db = draw(-8.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
             gain_db[:, 1] = 0.0  # the torso
