@@ -14,6 +14,7 @@ from tensorsim.evaluation.measured import glasgow, radhar, report, sense2gol
 from tensorsim.evaluation.measured.run import SETTINGS, few, lda_logits
 from tensorsim.evaluation.measured.sets import SETS
 from tensorsim.evaluation.measured.training import fit_pictures, predict, shift
+from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.recognition import PictureNet
 
 
@@ -210,3 +211,14 @@ def test_training_learns_and_repeats():
         logits.append(predict(net, shown))
     assert torch.equal(*logits)
     assert report.accuracy(logits[0], labels) > 0.95
+
+
+def test_sensors_have_the_axes_of_the_measured_sets():
+    scene = MEASURED_SENSORS["radhar-iwr1443"].radar
+    assert scene.range_resolution_m == pytest.approx(0.0436)
+    # Sixteen bins of 0.6147 m/s to either side of 0: lambda / (2 16 T).
+    wavelength = 299_792_458 / (scene.carrier_hz + scene.bandwidth_hz / 2)
+    assert wavelength * scene.prf_hz / (2 * 16) == pytest.approx(0.6147)
+    glasgow_radar = MEASURED_SENSORS["glasgow-ancortek"].radar
+    assert glasgow_radar.range_resolution_m == pytest.approx(0.375, rel=1e-3)
+    assert glasgow_radar.prf_hz == 2 * glasgow.RADAR.prf_hz == 1000

@@ -5,7 +5,7 @@ clip). The simulation repeats their chain: sweeps, high-pass over pulses, short-
 bin, sum of bins, decibels, CFAR.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tensorsim.config import RadarConfig
 from tensorsim.evaluation.measured.motions import (
     Draw,
     Unrest,
@@ -31,6 +30,7 @@ from tensorsim.motion.exercises import drink, fall_down, pick_up
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
 from tensorsim.motion.people import PeopleConfig
 from tensorsim.motion.scripts import sit_down, stand_up, walk
+from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
@@ -41,17 +41,7 @@ from tensorsim.radar.synthesis.echo import EchoSynthesizer
 CLASSES = ("walking", "sitting_down", "standing_up", "pick_up", "drinking", "falling")
 
 #: Every other sweep of the measured 1000 per second: nobody is beyond +-250 Hz (6.3 m/s), and half the work remains.
-RADAR = RadarConfig(
-    carrier_hz=5.8e9,
-    bandwidth_hz=400e6,
-    chirp_s=1e-3,
-    prf_hz=500.0,
-    sample_rate_hz=128e3,
-    tx_m=(-0.2, 0.0, 1.0),
-    rx_m=(0.2, 0.0, 1.0),
-    antenna_gain_dbi=17.0,
-    isolation_db=40.0,
-)
+RADAR = replace(MEASURED_SENSORS["glasgow-ancortek"].radar, prf_hz=500.0)
 #: Rows of the measured masks (3.9 Hz each) within +-250 Hz.
 ROWS = slice(64, 192)
 

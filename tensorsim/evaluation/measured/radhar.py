@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tensorsim.config import JOINTS, SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.config import JOINTS
 from tensorsim.evaluation.measured.motions import (
     Draw,
     Unrest,
@@ -26,6 +26,7 @@ from tensorsim.motion.exercises import box, jump, jumping_jack, squat
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
 from tensorsim.motion.people import PeopleConfig
 from tensorsim.motion.scripts import walk
+from tensorsim.radar.measured_sensors import MEASURED_SENSORS, RADHAR_CHIRPS
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.point_cloud import local_maxima
 from tensorsim.radar.processing.range_profile import RangeProfile
@@ -33,26 +34,8 @@ from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 
 CLASSES = ("boxing", "jack", "jump", "squats", "walk")
-FRAMES, FRAME_HZ, CHIRPS = 60, 30.0, 16
-SPEED_STEP_M_S, RANGE_STEP_M = 0.6147, 0.0436
-CARRIER_HZ = 77e9
-BANDWIDTH_HZ = SPEED_OF_LIGHT_M_S / (2 * RANGE_STEP_M)
-#: 16 chirps make Doppler bins of ``lambda PRF / (2 16)``.
-PRF_HZ = 2 * CHIRPS * SPEED_STEP_M_S * (CARRIER_HZ + BANDWIDTH_HZ / 2) / SPEED_OF_LIGHT_M_S
-
-RADAR = RadarConfig(
-    carrier_hz=CARRIER_HZ,
-    bandwidth_hz=BANDWIDTH_HZ,
-    chirp_s=51.2e-6,
-    prf_hz=PRF_HZ,
-    sample_rate_hz=5e6,
-    tx_m=(-0.01, 0.0, 1.0),
-    rx_m=(0.01, 0.0, 1.0),
-    antenna_gain_dbi=10.0,
-    isolation_db=30.0,
-)
-
-
+FRAMES, FRAME_HZ = 60, 30.0
+RADAR = MEASURED_SENSORS["radhar-iwr1443"].radar
 _WRISTS = [JOINTS.index("right_wrist"), JOINTS.index("left_wrist")]
 
 
@@ -82,7 +65,9 @@ class RadHar:
             (5, 0), (5, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
         )
         frames = torch.arange(FRAMES, dtype=torch.float64) / FRAME_HZ
-        self.at = (frames[:, None] + torch.arange(CHIRPS, dtype=torch.float64) / PRF_HZ).flatten()
+        self.at = (
+            frames[:, None] + torch.arange(RADHAR_CHIRPS, dtype=torch.float64) / RADAR.prf_hz
+        ).flatten()
 
     def motion(self, label: int, count: int, generator: torch.Generator) -> Tensor:
         """Joints (count, K, 14, 3) at ``KNOT_HZ``."""
@@ -130,8 +115,8 @@ class RadHar:
         noise = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float()) / 2**0.5
         level_db = draw(13.0, 34.0) if self.effects.levels else draw(20.0, 20.0)
         echo = echo * 10 ** (level_db / 20).float().unsqueeze(-1) + noise
-        frames = echo.unflatten(1, (FRAMES, CHIRPS)).transpose(2, 3)
-        window = torch.hann_window(CHIRPS, periodic=False)
+        frames = echo.unflatten(1, (FRAMES, RADHAR_CHIRPS)).transpose(2, 3)
+        window = torch.hann_window(RADHAR_CHIRPS, periodic=False)
         # Negative raw Doppler is approaching, and first.
         cube = torch.fft.fftshift(torch.fft.fft(frames * window), dim=-1)
         power = cube.abs().square()
@@ -155,7 +140,7 @@ def read(folder: Path) -> tuple[Tensor, Tensor]:
 def pictures(maps: Tensor) -> Tensor:
     """Presence maps (N, 16, 60) to pictures (N, 1, 16, 60) without the row of what stands still."""
     shown = maps.float()
-    shown[:, CHIRPS // 2] = 0.0
+    shown[:, RADHAR_CHIRPS // 2] = 0.0
     return shown.unsqueeze(1)
 
 

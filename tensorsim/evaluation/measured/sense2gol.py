@@ -25,11 +25,16 @@ from tensorsim.motion.exercises import creep, run, stride
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
 from tensorsim.motion.people import PeopleConfig
 from tensorsim.motion.scripts import walk
+from tensorsim.radar.measured_sensors import (
+    SENSE2GOL_BURST_S,
+    SENSE2GOL_BURST_SAMPLES,
+    SENSE2GOL_CARRIER_HZ,
+    SENSE2GOL_SAMPLE_RATE_HZ,
+)
 from tensorsim.radar.synthesis.continuous_wave import ContinuousWaveEcho
 
 CLASSES = ("walk", "run", "stride", "creep")
-CARRIER_HZ, SAMPLE_RATE_HZ = 24.125e9, 3000.0
-FRAMES, FRAME_SAMPLES, FRAME_S = 15, 128, 0.2
+FRAMES = 15
 ANTENNA_M = (0.0, 0.0, 1.0)
 #: Rows of the Doppler maps within +-750 Hz (4.7 m/s).
 ROWS = slice(32, 96)
@@ -56,9 +61,9 @@ class Effects:
 
 def doppler_maps(iq: Tensor) -> Tensor:
     """Decibels (N, 128, frames) of the bursts of I/Q (N, 2, 128 frames), Doppler ascending; towards is negative."""
-    signal = torch.complex(iq[:, 0], iq[:, 1]).unflatten(-1, (-1, FRAME_SAMPLES))
+    signal = torch.complex(iq[:, 0], iq[:, 1]).unflatten(-1, (-1, SENSE2GOL_BURST_SAMPLES))
     signal = signal - signal.mean(-1, keepdim=True)
-    window = torch.hamming_window(FRAME_SAMPLES, periodic=False)
+    window = torch.hamming_window(SENSE2GOL_BURST_SAMPLES, periodic=False)
     spectrum = torch.fft.fftshift(torch.fft.fft(signal * window), dim=-1)
     return 10 * (spectrum.abs().square() + 1).log10().transpose(1, 2)
 
@@ -68,11 +73,12 @@ class Sense2Gol:
 
     def __init__(self, effects: Effects) -> None:
         self.effects = effects
-        self.echo = ContinuousWaveEcho(CARRIER_HZ, ANTENNA_M, ANTENNA_M)
+        self.echo = ContinuousWaveEcho(SENSE2GOL_CARRIER_HZ, ANTENNA_M, ANTENNA_M)
         self.scatterers = LimbScatterers(ANTENNA_M, ANTENNA_M, per_segment=3)
-        frames = torch.arange(FRAMES, dtype=torch.float64) * FRAME_S
+        frames = torch.arange(FRAMES, dtype=torch.float64) * SENSE2GOL_BURST_S
         self.at = (
-            frames[:, None] + torch.arange(FRAME_SAMPLES, dtype=torch.float64) / SAMPLE_RATE_HZ
+            frames[:, None]
+            + torch.arange(SENSE2GOL_BURST_SAMPLES, dtype=torch.float64) / SENSE2GOL_SAMPLE_RATE_HZ
         ).flatten()
 
     def motion(self, label: int, count: int, generator: torch.Generator) -> Tensor:
@@ -81,7 +87,7 @@ class Sense2Gol:
         script, speed = STYLES[label]
         config = PeopleConfig(heading_rad=0.15, facing_radar_share=1.0)
         people = stage_people(count, draw, config, speed)
-        time = knots(FRAMES * FRAME_S).expand(count, -1)
+        time = knots(FRAMES * SENSE2GOL_BURST_S).expand(count, -1)
         start_m = draw(4.2, 6.8)
         pace = torch.ones_like(time)
         if self.effects.speeding_up:
@@ -117,7 +123,7 @@ class Sense2Gol:
             gain_db[:, 1] = 0.0  # the torso
             rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
         echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
-        far = echo[:, : 6 * FRAME_SAMPLES].abs().square().mean(-1, keepdim=True).sqrt()
+        far = echo[:, : 6 * SENSE2GOL_BURST_SAMPLES].abs().square().mean(-1, keepdim=True).sqrt()
         echo = echo / far * 10 ** (draw(36.0, 52.0) / 20).float()
         if self.effects.image:
             echo = echo + 10 ** (draw(-13.0, -9.0) / 20).float() * echo.conj()
