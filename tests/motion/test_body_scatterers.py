@@ -12,6 +12,7 @@ from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.body_scatterers import BodyScatterers, torso_columns
 from tensorsim.motion.rough_surface import cylinder_rcs, patch_rcs, skin_permittivity, skin_reflectivity
+from tensorsim.motion.shadowing import Shadowing
 from tests.benchmarks import eval_bodies
 from tests.motion.test_limb_scatterers import walk
 from tests.stage import StageTester, assert_same
@@ -181,6 +182,22 @@ def test_limbs_are_bright_broadside() -> None:
     )
     shank = 1 + 3
     assert float(raised[shank]) < 0.2 * float(straight[shank])
+
+
+def test_people_shadow_each_other() -> None:
+    """Behind somebody at the same height a torso loses 20 dB each way; whoever stands beside loses nothing."""
+    model = BodyScatterers((0.0, 0.0, 1.2), (0.0, 0.0, 1.2), 77e9)
+    front, behind, beside = (
+        standing(0.0, d) + torch.tensor([x, 0.0, 0.0]) for d, x in ((3, 0), (5, 0), (4, 2))
+    )
+    people = torch.cat((front, behind, beside))
+    fade = torch.ones(3, 1, dtype=torch.float64)
+    plain = model(people, fade)[1].reshape(3, -1)
+    shadowed = Shadowing(model, (0.0, 0.0, 1.2), (0.0, 0.0, 1.2))(people, fade)[1].reshape(3, -1)
+    torsos = (shadowed / plain.clamp_min(1e-30))[:, 31:].masked_fill(plain[:, 31:] < 1e-4, 1.0)
+    assert float(torsos[1].min()) < 2e-4
+    torch.testing.assert_close(shadowed[0], plain[0], rtol=1e-3, atol=0)
+    torch.testing.assert_close(shadowed[2], plain[2], rtol=1e-3, atol=0)
 
 
 def test_streaming_equals_the_whole() -> None:
