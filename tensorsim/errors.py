@@ -174,6 +174,12 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
     return rcs.expand(per_pulse)
 
 
+def check_count(value: int, least: int, most: int, name: str) -> None:
+    """Refuse what is no integer from ``least`` to ``most``."""
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise TensorsimError(f"{name}: got {value}, expected an integer from {least} to {most}")
+
+
 def check_positive(value: float, name: str) -> None:
     """Refuse a number that is not finite and above zero."""
     if not (value > 0.0 and value < float("inf")):

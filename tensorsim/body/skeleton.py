@@ -3,6 +3,7 @@
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from tensorsim.body.proportions import NOSE_FORWARD, NOSE_UP, SHANK, THIGH, TRUNK
@@ -125,7 +126,8 @@ def body_to_coco(joints: Tensor) -> Tensor:
         joints: (..., 14, 3) metres, order of ``tensorsim.JOINTS``, any frame with right-handed axes.
 
     Returns:
-        (..., 17, 3) in the order of ``tensorsim.COCO_KEYPOINTS``; body joints and nose are kept as they are.
+        (..., 17, 3) in the order of ``tensorsim.COCO_KEYPOINTS``; body joints and nose are kept as they are. Where nose
+        and neck coincide, eyes and ears are at the nose.
 
     Raises:
         TensorsimError: joints of another shape, or integers.
@@ -134,10 +136,10 @@ def body_to_coco(joints: Tensor) -> Tensor:
     nose, neck = joints[..., 0, :], joints[..., 1, :]
     reach = nose - neck
     height = reach.norm(dim=-1, keepdim=True) / math.hypot(NOSE_FORWARD, NOSE_UP)
-    reach = reach / reach.norm(dim=-1, keepdim=True)
+    reach = F.normalize(reach, dim=-1)
     across = joints[..., 2, :] - joints[..., 5, :]
     right = across - (across * reach).sum(dim=-1, keepdim=True) * reach
-    right = right / right.norm(dim=-1, keepdim=True)
+    right = F.normalize(right, dim=-1)
     beside = torch.linalg.cross(right, reach)  # `reach` turned by 90 degrees, backwards
     angle = math.atan2(NOSE_FORWARD, NOSE_UP)
     up = math.cos(angle) * reach + math.sin(angle) * beside

@@ -12,7 +12,15 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from tensorsim.enhance.perona_malik import PeronaMalik
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_not_empty
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_finite,
+    check_floating,
+    check_like_weights,
+    check_min_rank,
+    check_not_empty,
+)
 
 #: How a map is scaled to an image for the network, see :class:`MapDenoiser`.
 SCALES = ("peak", "floor")
@@ -42,11 +50,8 @@ class DnCNN(nn.Module):
 
     def __init__(self, depth: int = 20, channels: int = 64, batch_norm: bool = True) -> None:
         super().__init__()
-        if not 2 <= depth <= MAX_DEPTH or not 1 <= channels <= MAX_CHANNELS:
-            raise TensorsimError(
-                f"DnCNN: got depth {depth} and {channels} channels, expected a depth of 2 to {MAX_DEPTH} and 1 to "
-                f"{MAX_CHANNELS} channels"
-            )
+        check_count(depth, 2, MAX_DEPTH, "DnCNN depth")
+        check_count(channels, 1, MAX_CHANNELS, "DnCNN channels")
         self.depth = depth
         self.reach = depth
         self.channels = channels
@@ -78,6 +83,7 @@ class DnCNN(nn.Module):
         check_floating(images, "DnCNN")
         check_min_rank(images, 2, "DnCNN", "(..., H, W)")
         check_not_empty(images, "DnCNN")
+        check_like_weights(images, self.model[0].weight, "DnCNN")  # type: ignore[arg-type]
         check_finite(images, "DnCNN")
         noise: Tensor = self.model(images.reshape(-1, 1, images.shape[-2], images.shape[-1]))
         return noise.reshape(images.shape)

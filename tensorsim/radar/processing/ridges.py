@@ -6,7 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+)
 from tensorsim.ops import flatten_batch, unflatten_batch
 
 #: Bins of a Doppler axis, more than any map has; bounds counts of them.
@@ -98,8 +105,7 @@ class RidgeExtractor(nn.Module):
 
     def __init__(self, count: int = 3) -> None:
         super().__init__()
-        if not 1 <= count <= 6:
-            raise TensorsimError(f"count: got {count}, expected 1 to 6 ridges")
+        check_count(count, 1, 6, "count")
         self.count = count
         orders = torch.tensor(list(itertools.permutations(range(count))))
         self.register_buffer("orders", orders, persistent=False)
@@ -180,8 +186,7 @@ class PathRidgeExtractor(nn.Module):
     ) -> None:
         super().__init__()
         for name, value, least in (("count", count, 1), ("max_jump", max_jump, 1), ("band", band, 0)):
-            if not least <= value <= MAX_BINS:
-                raise TensorsimError(f"{name}: got {value}, expected {least} to {MAX_BINS}")
+            check_count(value, least, MAX_BINS, name)
         check_positive(penalty_db, "penalty_db")
         check_positive(floor_db, "floor_db")
         self.count, self.band = count, band

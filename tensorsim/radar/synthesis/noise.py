@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError, check_complex_map, check_positive
+from tensorsim.limits import check_range
 
 BOLTZMANN_J_PER_K = 1.380649e-23
 REFERENCE_TEMPERATURE_K = 290.0
@@ -111,6 +112,12 @@ class ReceiverNoise(nn.Module):
             raise TensorsimError(f"reference: got {reference!r}, expected 'echo', 'total' or 'absolute'")
         if snr_db is not None and not math.isfinite(snr_db):
             raise TensorsimError(f"snr_db: got {snr_db}, expected a finite number of dB or None for no noise")
+        for name, value in (
+            ("snr_db", 0.0 if snr_db is None else snr_db),
+            ("noise_figure_db", noise_figure_db),
+        ):
+            if math.isfinite(value):
+                check_range(value, "ratio of powers", name)
         if not (math.isfinite(empty_power) and empty_power >= 0):
             raise TensorsimError(f"empty_power: got {empty_power}, expected a finite power >= 0")
         if not math.isfinite(noise_figure_db):

@@ -184,7 +184,7 @@ def test_path_in_silence_stays_put():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"count": 0}, "count: got 0, expected 1 to"),
+        ({"count": 0}, "count: got 0, expected an integer from 1 to"),
         ({"max_jump": 0}, "max_jump: got 0"),
         ({"band": -1}, "band: got -1"),
         ({"penalty_db": 0.0}, "penalty_db: got 0.0"),
