@@ -62,8 +62,8 @@ def drink(time: Tensor, who: People) -> Act:
     pose = make_pose(
         time,
         who,
-        pitch=v(6.0) * up - v(8.0) * tip,
-        twist=v(8.0) * up,
+        pitch=v(10.0) * up - v(10.0) * tip,
+        twist=v(12.0) * up,
         nod=-v(18.0) * tip,
         flexion=(2 + v(48.0) * up + v(12.0) * tip, 2.0),
         abduction=(8 + v(15.0) * up, 8.0),

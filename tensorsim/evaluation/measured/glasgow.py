@@ -30,6 +30,7 @@ from tensorsim.motion.exercises import drink, fall_down, pick_up
 from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
 from tensorsim.motion.people import PeopleConfig
 from tensorsim.motion.scripts import sit_down, stand_up, walk
+from tensorsim.motion.timing import segment
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerTimeMap
@@ -57,6 +58,7 @@ class Effects:
     dim_limbs: bool = True
     levels: bool = True
     image: bool = True
+    shuffling: bool = True
 
 
 class Glasgow:
@@ -97,14 +99,19 @@ class Glasgow:
             script, first_s, start, rate = {
                 1: (sit_down, 0.8, (0.3, 2.6), (0.9, 2.0)),
                 2: (stand_up, 0.7, (0.2, 2.2), (0.95, 2.0)),
-                3: (pick_up, 0.0, (-0.1, 2.2), (0.75, 1.6)),
+                3: (pick_up, 0.0, (-0.1, 2.2), (0.9, 1.7)),
                 4: (drink, 0.0, (-0.2, 1.8), (0.8, 1.9)),
                 5: (fall_down, 0.0, (-0.1, 2.6), (0.6, 1.3)),
             }[label]
-            joints = act_out(script, (time - draw(*start)) * draw(*rate) + first_s, people)
+            began, tempo = draw(*start), draw(*rate)
+            joints = act_out(script, (time - began) * tempo + first_s, people)
+            if label in (1, 2) and self.effects.shuffling:
+                # Those who sit down end farther back than their feet, those who rise farther ahead.
+                way = draw(0.0, 0.25) * segment(time, began, began + 2 / tempo)
+                joints[..., 1] += (way if label == 1 else -way)[..., None]
             joints = place(joints, draw(-0.3, 0.3), range_m)
         if self.effects.unrest:
-            joints = add_unrest(joints, draw, Unrest((0.003, 0.025), (0.0, 0.07)))
+            joints = add_unrest(joints, draw, Unrest((0.003, 0.02), (0.0, 0.05)))
         return joints, duration
 
     def masks(self, joints: Tensor, duration: float, generator: torch.Generator) -> Tensor:
@@ -114,7 +121,7 @@ class Glasgow:
         at = torch.arange(pulses, dtype=torch.float64) / RADAR.prf_hz
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.dim_limbs:
-            gain_db = draw(-13.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
+            gain_db = draw(-9.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
             gain_db[:, 1] = 0.0  # the torso
             rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
         positions, rcs = at_instants(positions, at), linear(rcs, at)
@@ -123,7 +130,7 @@ class Glasgow:
         signal_db = draw(28.0, 48.0) if self.effects.levels else draw(38.0, 38.0)
         if self.effects.image:
             # Both senses of motion in each frame: the image of imperfect quadrature and of scattered paths.
-            image_db = draw(-45.0, -14.0)
+            image_db = draw(-45.0, -18.0)
             echo = echo + 10 ** (image_db / 20).float().unsqueeze(-1) * echo.conj()
         x = echo * 10 ** (signal_db / 20).float().unsqueeze(-1)
         x = x + self._receiver(draw, pulses)
