@@ -22,8 +22,10 @@ TORSO_ROUGHNESS, LIMB_ROUGHNESS = 0.2, 0.35
 #: Cross sections over those of the bare cylinders: shoulders, hips, hands and double reflections between the parts, set
 #: by the measured cross section of a man at 4.8 and 9.4 GHz.
 WHOLE_BODY = 1.4
-#: What is left of the cross section of limbs, fitted to measured walks at 24 and 77 GHz: see the class.
-LIMB_SHARES = {"upper_arm": 0.7, "forearm": 0.2, "thigh": 0.3, "shank": 0.25, "foot": 0.15}
+#: What is left of the cross section of limbs at 77 GHz, and by how much it is more at 24 GHz and below, fitted to
+#: measured walks: see the class.
+LIMB_SHARES = {"upper_arm": 0.67, "forearm": 0.2, "thigh": 0.285, "shank": 0.22, "foot": 0.12}
+LIMBS_AT_24_GHZ = 1.3
 
 
 def torso_columns(right: float, forward: float, columns: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -56,6 +58,12 @@ def _line_across(share: float) -> dict[str, float]:
     }
 
 
+def limb_gain(carrier_hz: float) -> float:
+    """Factor on the cross sections of limbs: 1 from 77 GHz on, ``LIMBS_AT_24_GHZ`` up to 24 GHz, in dB over log f."""
+    below = math.log(77e9 / carrier_hz) / math.log(77 / 24)
+    return LIMBS_AT_24_GHZ ** min(1.0, max(0.0, below))
+
+
 class BodyScatterers(nn.Module):
     """An extended torso and limbs, with cross sections that follow aspect and carrier.
 
@@ -71,12 +79,13 @@ class BodyScatterers(nn.Module):
     the former, :data:`WHOLE_BODY`.
 
     Limbs are fitted: cylinders of their size would put two to three times more power above 1.5 times the speed of the
-    torso than is measured, and :data:`LIMB_SHARES` bring that down (``python -m tests.benchmarks.eval_bodies``
-    prints both). What they stand for is limbs that hide each other, antennas that look at the chest, and more.
+    torso than is measured at 24 and 77 GHz. :data:`LIMB_SHARES` bring that to within a quarter, and the speed below
+    which 95 % of the power lies to within 6 % (``python -m tests.benchmarks.eval_bodies`` prints both). What they stand
+    for is limbs that hide each other, antennas that look at the chest, and more.
 
     Args:
         tx_m, rx_m: transmitter and receiver in metres (of an array: its middle).
-        carrier_hz: sets the reflectivity of skin.
+        carrier_hz: sets the reflectivity of skin and the share of the limbs.
         per_segment: points of a limb segment.
         height_m: body height, which sets the sizes of cross sections.
 
@@ -130,7 +139,7 @@ class BodyScatterers(nn.Module):
         along = (torch.arange(per_segment, dtype=torch.float64).reshape(-1, 1) + 0.5) / per_segment
         sizes = torch.tensor([s.semi_axes for s in limbs], dtype=torch.float64) * height_m
         share = torch.tensor([LIMB_SHARES[s.name.split("_", 1)[1]] for s in limbs], dtype=torch.float64)
-        share = (share * reflectivity / per_segment).unsqueeze(-1)
+        share = (share * limb_gain(carrier_hz) * reflectivity / per_segment).unsqueeze(-1)
         head = next(s for s in SEGMENTS if s.name == "head").semi_axes[0] * height_m
         self.head_rcs = math.pi * head**2 * reflectivity
 
