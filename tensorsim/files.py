@@ -3,17 +3,20 @@
 import json
 import math
 import os
+import pickletools
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from tensorsim.errors import TensorsimError
 
 #: The file that identifies the run that a results folder is from.
 SUMMARY = "summary.json"
+#: Entries of the memo of a pickle; Human3.6M and the largest published networks have some thousands.
+MAX_MEMO = 1_000_000
 
 
 @contextmanager
@@ -25,6 +28,22 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:  # such exceptions share no base class
         raise TensorsimError(f"{path}: got a file that cannot be read as {kind} ({error})") from error
+
+
+def check_pickle_memo(file: IO[bytes]) -> None:
+    """Refuse the pickle that begins here in a file if its memo is huge; the position in the file stays.
+
+    The memo is a list as long as its highest index, which one instruction of a few bytes can set to anything.
+
+    Raises:
+        TensorsimError: an index above :data:`MAX_MEMO`.
+        ValueError: no pickle.
+    """
+    start = file.tell()
+    for opcode, argument, _ in pickletools.genops(file):
+        if "PUT" in opcode.name and (argument or 0) > MAX_MEMO:
+            raise TensorsimError(f"a pickle with a memo of {argument} entries, expected at most {MAX_MEMO}")
+    file.seek(start)
 
 
 @contextmanager

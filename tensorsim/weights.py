@@ -15,13 +15,13 @@ from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import check_pickle_memo, complete_file
 
 PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
 
@@ -76,6 +76,10 @@ class _Placeholder:
 
 class _TensorUnpickler(pickle.Unpickler):
     """An unpickler that builds tensors and containers, and imports nothing."""
+
+    def __init__(self, file: IO[bytes], **options: Any) -> None:
+        check_pickle_memo(file)
+        super().__init__(file, **options)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _TENSOR_PARTS:

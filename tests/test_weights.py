@@ -266,6 +266,13 @@ def test_values_that_no_training_leaves_are_refused(tmp_path: Path, suffix: str)
             load_state_dict(path)
 
 
+def test_a_memo_without_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.pth"
+    path.write_bytes(b"\x80\x02}r\x00\x00\x00\x40.")  # LONG_BINPUT 2**30 would fill 16 GB with zeros
+    with pytest.raises(TensorsimError, match=r"w\.pth: a pickle with a memo of 1073741824 entries"):
+        load_state_dict(path)
+
+
 def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
     whole = save({"a": torch.zeros(1_000_000)}, tmp_path / "w.pth")
     bomb = tmp_path / "bomb.pth"

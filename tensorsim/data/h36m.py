@@ -8,7 +8,6 @@ afterwards, from numbers of plain types.
 import io
 import math
 import pickle
-import pickletools
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import torch
 from tensorsim.data.npz import Arrays
 from tensorsim.data.skeletons import Motion, motion_of
 from tensorsim.errors import TensorsimError
+from tensorsim.files import check_pickle_memo
 
 #: The joints of Human3.6M's 32 that the body needs, by index.
 H36M_JOINTS = {
@@ -28,8 +28,6 @@ H36M_FPS = 50.0
 
 #: Plain numbers; no objects, no structures, no text.
 _NUMBERS = ("f2", "f4", "f8")
-#: Entries of a pickle's memo; the published file has about 3000.
-_MAX_MEMO = 100_000
 
 
 class _Dtype:
@@ -108,16 +106,14 @@ def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) ->
     """
     data = arrays.pickled("positions_3d")
     try:
-        # A memo is a list as long as its highest index, which one instruction can set to anything.
-        if any(
-            "PUT" in opcode.name and (argument or 0) > _MAX_MEMO
-            for opcode, argument, _ in pickletools.genops(data)
-        ):
-            raise pickle.UnpicklingError("a memo without end")
-        subjects = _ArraysOnly(io.BytesIO(data), encoding="latin1").load().item()
+        file = io.BytesIO(data)
+        check_pickle_memo(file)
+        subjects = _ArraysOnly(file, encoding="latin1").load().item()
         clips = {
             f"{subject}/{action}": clip for subject in subjects for action, clip in subjects[subject].items()
         }
+    except TensorsimError:
+        raise
     except (AttributeError, EOFError, IndexError, TypeError, ValueError) as error:
         raise TensorsimError(f"{path}: got positions_3d that hold no dictionary ({error})") from error
     if key is None and len(clips) == 1:

@@ -278,8 +278,12 @@ def test_an_even_map_stays_as_it_is() -> None:
 
 
 def test_refuses_bad_settings() -> None:
-    for arguments in ((1, 64), (0, 64), (20, 0)):
-        with pytest.raises(TensorsimError, match=f"got depth {arguments[0]} and {arguments[1]} channels"):
+    for arguments, message in (
+        ((1, 64), "depth: got 1"),
+        ((0, 64), "depth: got 0"),
+        ((20, 0), "channels: got 0"),
+    ):
+        with pytest.raises(TensorsimError, match=f"DnCNN {message}, expected an integer from"):
             DnCNN(*arguments)
     with pytest.raises(TensorsimError, match="tile: got 0 columns"):
         MapDenoiser(small(), tile=0)

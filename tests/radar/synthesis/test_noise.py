@@ -34,7 +34,7 @@ class TestReceiverNoise(StageTester):
         return [
             ((x.real, None), "IF: got dtype"),
             ((x[0], None), "IF: got shape"),
-            ((x[:0], None), "IF: got shape .* without empty dimensions"),
+            ((x[:0], None), r"IF: got shape \[0, 8\].* without empty dimensions"),
             ((x, echo[:3]), "target_echo: got"),
             ((x, echo.real), "target_echo: got"),
         ]
