@@ -124,9 +124,7 @@ def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
     for path in paths:
         activity, number = activity_of_folder(path), re.match(r"(\d+)-", path.name)
         if activity is None or number is None:
-            raise TensorsimError(
-                f"{path}: got a name without a clip, expected one of evaluate truth"
-            )
+            raise TensorsimError(f"{path}: got a name without a clip, expected one of evaluate truth")
         name = ACTIVITIES[activity]
         clip = activity_clips((name,), 1, int(number[1]))[name][0]
         yield str(path.relative_to(folder)), clip, filmed(path, clip, nn.Identity(), nn.Identity()).found
