@@ -80,13 +80,14 @@ class Lifter(Protocol):
 class Smoother(Protocol):
     """Smooths joints along time, e.g. :class:`tensorsim.vision.KalmanSmoother`."""
 
-    def __call__(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+    def __call__(self, joints: Tensor, valid: Tensor, fps: float, noise_std_m: Tensor) -> Tensor:
         """Joints (..., T, J, 3) in metres at ``fps``, smoothed, of the same shape.
 
         Args:
             joints: anything where not valid.
             valid: (..., T, J) bool; the other joints are filled in.
             fps: frames per second.
+            noise_std_m: (..., T, J, 1) standard deviation of the joints in metres, from scores and pixel size.
         """
         ...
 

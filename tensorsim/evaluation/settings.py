@@ -107,9 +107,9 @@ class _TrueSmoothing(nn.Module):
         super().__init__()
         self.stage, self.joints = stage, joints
 
-    def forward(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+    def forward(self, joints: Tensor, valid: Tensor, fps: float, noise_std_m: Tensor) -> Tensor:
         truth = self.joints.to(joints)
-        return truth + self.stage(joints - truth, valid, fps)
+        return truth + self.stage(joints - truth, valid, fps, noise_std_m)
 
 
 class Pipelines:

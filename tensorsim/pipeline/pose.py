@@ -17,6 +17,7 @@ from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.smoothing.along_time import brief_gaps
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
+from tensorsim.vision.smoothing.noise import keypoint_noise
 from tensorsim.vision.tracking.tracker import GNNTracker
 
 
@@ -279,7 +280,8 @@ class VideoToPose(nn.Module):
         # the pose that was found stands in for it, as long as the person is in the scene.
         in_scene = told.unsqueeze(-1).expand_as(seen)
         coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
-        joints = self.smoother(joints, in_scene & ~coasting, fps)
+        noise = keypoint_noise(body_scores, lifted.scale)
+        joints = self.smoother(joints, in_scene & ~coasting, fps, noise)
         # Nobody is where no frame of a track shows a joint.
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & told.any(dim=-1, keepdim=True))
 
