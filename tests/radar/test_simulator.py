@@ -45,6 +45,10 @@ class TestRadarSimulator(SceneCase):
         p, rcs = self.inputs((), torch.float32)
         return [*super().bad_inputs(), ((p[:26], rcs), "got 26 pulses, expected at least 27")]
 
+    @pytest.mark.slow  # the graph of all paths is large; those of the stages are exported in their own tests
+    def test_exports(self):
+        super().test_exports()
+
     def test_gradients_against_finite_differences(self):
         """With noise of one seed: a magnitude map without a noise floor has kinks, where it is next to zero."""
         module = RadarSimulator(SMALL, WallConfig((0.0, 3.0, 1.5)), multipath=True, snr_db=10.0).double()

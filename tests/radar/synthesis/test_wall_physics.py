@@ -40,6 +40,10 @@ class TestObliqueEcho(ObliqueCase):
 class TestAiryEcho(ObliqueCase):
     options = {"incidence": "airy"}  # noqa: RUF012
 
+    @pytest.mark.slow
+    def test_exports(self):
+        super().test_exports()
+
 
 @pytest.mark.parametrize(("degrees", "excess"), [(0, 0.348), (45, 0.393)])
 def test_excess_range_of_the_refracted_path(degrees, excess):
