@@ -90,7 +90,10 @@ class BodyScatterers(nn.Module):
         height_m: body height, which sets the sizes of cross sections.
 
     Example:
-        >>> BodyScatterers(radar.tx_m, radar.rx_m, radar.carrier_hz)(positions, fade)  # 59 points a person
+        >>> positions, fade = torch.randn(3, 100, 14, 3), torch.ones(3, 100)  # 3 people, 100 pulses
+        >>> points, rcs = BodyScatterers((-0.1, 0.0, 1.5), (0.1, 0.0, 1.5), carrier_hz=77e9)(positions, fade)
+        >>> points.shape, rcs.shape
+        (torch.Size([100, 177, 3]), torch.Size([100, 177]))
 
     Raises:
         TensorsimError: an antenna without three finite numbers, ``per_segment`` below 1, a carrier or height that is
