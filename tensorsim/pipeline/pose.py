@@ -266,24 +266,24 @@ class VideoToPose(nn.Module):
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
-        # Joints below the threshold have no say in the match: the network guesses what it cannot see.
-        trusted = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
-        body_scores = body_scores * trusted
-        # A foot alone at the edge of the picture does not tell a pose: such frames of a track coast.
-        told = tracks.valid & (trusted.sum(dim=-1) >= self.fewest_joints)
-        told = torch.where(told.any(dim=-1, keepdim=True), told, tracks.valid)
+        # Joints below the threshold have no weight in the match: the network guesses what it cannot see.
+        reliable = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
+        body_scores = body_scores * reliable
+        # A foot alone at the edge of the picture does not determine a pose: the smoother predicts such frames.
+        usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
+        usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
         lifted = self.lifter(body, body_scores)
-        joints, seen = self.metric_pose(body, body_scores, lifted, told, height, width, fps)
-        told = told & seen.any(dim=-1)  # less the frames that it does not believe
-        joints = self.bone_fit(joints, seen & told.unsqueeze(-1), fps)
-        # A joint that hides for a moment coasts. One that hides for longer would coast away: there the joint of
-        # the pose that was found stands in for it, as long as the person is in the scene.
-        in_scene = told.unsqueeze(-1).expand_as(seen)
-        coasting = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
+        joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
+        usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
+        joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
+        # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there
+        # the joint of the matched pose replaces it, as long as the person is in the scene.
+        in_scene = usable.unsqueeze(-1).expand_as(seen)
+        predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         noise = keypoint_noise(body_scores, lifted.scale)
-        joints = self.smoother(joints, in_scene & ~coasting, fps, noise)
+        joints = self.smoother(joints, in_scene & ~predicted, fps, noise)
         # Nobody is where no frame of a track shows a joint.
-        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & told.any(dim=-1, keepdim=True))
+        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & usable.any(dim=-1, keepdim=True))
 
 
 class _AsPlaced(nn.Module):
