@@ -49,7 +49,18 @@ ROWS = slice(64, 192)
 
 @dataclass(frozen=True)
 class Effects:
-    """What the simulation has beside bodies that move, each to be left out for an ablation."""
+    """What the simulation has beside bodies that move, each to be left out for an ablation.
+
+    Attributes:
+        to_and_fro: walkers turn round; else they go straight on.
+        unrest: sway of the body and small movements of the limbs.
+        residue: noise next to zero Doppler, in every frame.
+        lines: tones of the hardware at fixed Doppler.
+        dim_limbs: other ratios of limbs to trunk than those of ellipsoids, drawn for each clip.
+        levels: signal and floor drawn for each clip; else always the same.
+        image: a weak mirror image in Doppler.
+        shuffling: people end farther back after sitting down, farther ahead after rising.
+    """
 
     to_and_fro: bool = True
     unrest: bool = True
@@ -62,7 +73,7 @@ class Effects:
 
 
 class Glasgow:
-    """Simulated and measured masks; rows ascend from approaching to receding, as in the files."""
+    """Simulated masks; rows ascend from approaching to receding, as in the files."""
 
     def __init__(self, effects: Effects) -> None:
         self.effects = effects

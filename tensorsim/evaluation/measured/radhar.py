@@ -41,7 +41,17 @@ _WRISTS = [JOINTS.index("right_wrist"), JOINTS.index("left_wrist")]
 
 @dataclass(frozen=True)
 class Effects:
-    """What the simulation has beside bodies that move, each to be left out for an ablation."""
+    """What the simulation has beside bodies that move, each to be left out for an ablation.
+
+    Attributes:
+        to_and_fro: walkers turn round; else they go straight on.
+        unrest: sway of the body and small movements of the limbs.
+        dim_limbs: other ratios of limbs to trunk than those of ellipsoids, drawn for each clip.
+        peaks_only: detections with a stronger neighbour in range or Doppler are left out.
+        levels: signal drawn for each clip; else always the same.
+        beam: a beam that is narrow in elevation.
+        hands: a scatterer at each wrist.
+    """
 
     to_and_fro: bool = True
     unrest: bool = True

@@ -49,7 +49,16 @@ STYLES = (
 
 @dataclass(frozen=True)
 class Effects:
-    """What the simulation has beside bodies that move, each to be left out for an ablation."""
+    """What the simulation has beside bodies that move, each to be left out for an ablation.
+
+    Attributes:
+        speeding_up: people start from rest and stop before the radar; else their speed is constant.
+        unrest: sway of the body and small movements of the limbs.
+        dim_limbs: other ratios of limbs to trunk than those of ellipsoids, drawn for each clip.
+        image: the mirror image of unequal I and Q.
+        saturation: steps and limits of the 12-bit converter.
+        beam: a beam that is narrow in elevation.
+    """
 
     speeding_up: bool = True
     unrest: bool = True
