@@ -158,7 +158,7 @@ def test_refuses_what_is_too_short_or_not_there(tmp_path: Path) -> None:
         watched_films(tmp_path)
     (tmp_path / "S13_Flying").mkdir()
     (tmp_path / "S13_Flying" / "0-0.npz").touch()
-    with pytest.raises(TensorsimError, match="a name that identifies no clip"):
+    with pytest.raises(TensorsimError, match="a name without a clip"):
         watched_films(tmp_path)
     with pytest.raises(TensorsimError, match="got films from 0 frames on, expected 12 or more"):
         FilmErrors({})
