@@ -1,7 +1,7 @@
 """What a simulation writes into its folder: maps, poses, pictures, the overlay film and the summary."""
 
-import json
 import math
+import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -337,5 +337,6 @@ def label_of(
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write ``summary.json``."""
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    """Write ``summary.json``: strict JSON, with the names of the files of this run and an id of the run."""
+    files = sorted({file.name for file in folder.iterdir()} | {"summary.json"})
+    write_json(folder / "summary.json", summary | {"run": uuid.uuid4().hex, "files": files})
