@@ -15,11 +15,13 @@ from tensorsim import plot
 from tensorsim.config import SimulationConfig
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import write_video
+from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.streaming import maps_of_pose, progress_bar
 from tensorsim.types import Pose, RadarMaps
+from tensorsim.vision.tracking.selection import select_people
 
 if TYPE_CHECKING:
     from tensorsim.sources import Source
@@ -251,12 +253,17 @@ def write_overlay(
 
 
 def simulate(
-    source: "Source", stage: PoseToDoppler, folder: Path, seed: int, device: torch.device, quiet: bool = False
+    source: "Source",
+    stage: PoseToDoppler,
+    folder: Path,
+    config: SimulationConfig,
+    device: torch.device,
+    quiet: bool = False,
 ) -> tuple[Pose, RadarMaps]:
-    """Find the people of a source and simulate their maps; writes the overlay film."""
-    pose = source.pose(quiet)
+    """Find the people of a source, choose those of the configuration and simulate their maps; writes the overlay film."""
+    pose = select_people(source.pose(quiet), config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
-    torch.manual_seed(seed)
+    torch.manual_seed(config.seed)
     maps = maps_of_pose(stage, pose, source.fps, device, quiet)
     write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
     return pose, maps

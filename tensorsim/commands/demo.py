@@ -98,7 +98,7 @@ class Demo(NetworkOptions, RadarOptions):
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people, device)
-                pose, maps = results.simulate(source, maps_stage, folder, config.seed, device, self.quiet)
+                pose, maps = results.simulate(source, maps_stage, folder, config, device, self.quiet)
                 torch.manual_seed(config.seed)
                 true_maps = maps_of_pose(
                     true_stage,

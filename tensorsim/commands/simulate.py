@@ -11,6 +11,7 @@ import tyro
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer, warn_of_label
 from tensorsim.errors import TensorsimError, collected_warnings
+from tensorsim.limits import check_range
 
 if TYPE_CHECKING:
     import torch
@@ -111,7 +112,7 @@ class Simulate(NetworkOptions, RadarOptions):
             config = at_display_rate(config, length_s)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps = results.simulate(source, stage, folder, config.seed, device, self.quiet)
+                pose, maps = results.simulate(source, stage, folder, config, device, self.quiet)
                 duration_s = pose.valid.shape[2] / source.fps
                 label = results.label_of(recognizer, maps, duration_s, self.least_probability)
                 warn_of_label(recognizer, config, int(pose.valid.any(-1).sum()))
@@ -156,10 +157,20 @@ class Simulate(NetworkOptions, RadarOptions):
             ):
                 unit = "pixels" if name == "image-size" else "metres"
                 raise TensorsimError(f"--{name}: got {values}, expected positive numbers of {unit}")
-        if self.camera_fov is not None and not 0 < self.camera_fov < 180:
-            raise TensorsimError(f"--camera-fov: got {self.camera_fov}, expected degrees between 0 and 180")
-        if not math.isfinite(self.heading):
-            raise TensorsimError(f"--heading: got {self.heading}, expected a finite number of degrees")
+        for name, quantity in (
+            ("person_height", "body height"),
+            ("initial_distance", "distance"),
+            ("image_size", "image side"),
+            ("camera_fov", "field of view"),
+            ("heading", "angle"),
+            ("fps", "frame rate"),
+            ("start", "time"),
+            ("end", "time"),
+            ("stride", "stride"),
+        ):
+            given = getattr(self, name)
+            for value in given if isinstance(given, tuple) else [given] * (given is not None):
+                check_range(value, quantity, f"--{name.replace('_', '-')}")
         if self.position == "paper" and self.initial_distance is None and self.config is None:
             raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
 

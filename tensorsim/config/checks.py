@@ -5,6 +5,7 @@ from numbers import Real
 from typing import Any, get_args
 
 from tensorsim.errors import TensorsimError
+from tensorsim.limits import check_range
 
 Vector = tuple[float, float, float]
 
@@ -29,6 +30,7 @@ def require_dielectric(owner: str, relative_permittivity: float, loss_tangent: f
     ):
         if not (is_finite(value) and value >= least):
             raise TensorsimError(f"{owner}.{name}: got {value}, expected a finite number >= {least}")
+        check_range(value, name.replace("_", " "), f"{owner}.{name}")
 
 
 def as_positions(value: Any) -> Any:

@@ -89,6 +89,7 @@ class PoseConfig:
         neighbours: poses of the library that are averaged per frame; 1 is the paper's nearest match.
         temporal: weight of the change between frames in the choice of poses; 0 matches each frame alone.
         fewest_joints: joints of the 14 that a frame needs to count.
+        people: who is simulated: ``"all"``, ``"moving"``, ``"nearest"`` or a person's number from 1.
 
     Raises:
         TensorsimError: numbers out of range or an unknown choice.
@@ -106,10 +107,15 @@ class PoseConfig:
     neighbours: int = 32
     temporal: float = 1.0
     fewest_joints: int = 5
+    people: str = "all"
 
     def __post_init__(self) -> None:
         require_choices(self, position=Position)
         require_counts(self, "neighbours", "fewest_joints")
+        if self.people not in ("all", "moving", "nearest") and not self.people.isdecimal():
+            raise TensorsimError(
+                f"PoseConfig.people: got {self.people!r}, expected 'all', 'moving', 'nearest' or a number from 1"
+            )
         require_positive("PoseConfig", keypoint_threshold=self.keypoint_threshold)
         for name in ("person_height_m", "person_weight_kg", "initial_distance_m"):
             values = getattr(self, name)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 from tensorsim.config.checks import Vector, as_positions, is_finite, listed, require_positive, require_vector
 from tensorsim.errors import TensorsimError
+from tensorsim.limits import check_range
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 
@@ -43,6 +44,14 @@ class RadarConfig:
             prf_hz=self.prf_hz,
             sample_rate_hz=self.sample_rate_hz,
         )
+        for name, quantity in (
+            ("carrier_hz", "carrier frequency"),
+            ("bandwidth_hz", "bandwidth"),
+            ("chirp_s", "chirp duration"),
+            ("prf_hz", "pulse repetition frequency"),
+            ("sample_rate_hz", "sample rate"),
+        ):
+            check_range(getattr(self, name), quantity, f"RadarConfig.{name}")
         for name in ("tx_m", "rx_m"):
             object.__setattr__(self, name, as_positions(getattr(self, name)))
         for tx in self.tx_positions_m:
@@ -54,6 +63,7 @@ class RadarConfig:
                 raise TensorsimError(
                     f"RadarConfig.{name}: got {getattr(self, name)!r}, expected a finite number of dB"
                 )
+            check_range(getattr(self, name), "gain", f"RadarConfig.{name}")
         if self.samples_per_chirp < 2:
             raise TensorsimError(
                 f"RadarConfig: {self.sample_rate_hz} Hz over a chirp of {self.chirp_s} s gives "

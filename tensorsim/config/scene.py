@@ -7,6 +7,7 @@ from tensorsim.config.checks import is_finite, require_choices, require_positive
 from tensorsim.config.radar import RadarConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
 from tensorsim.errors import TensorsimError
+from tensorsim.limits import check_range
 
 WallPaths = Literal["series", "paper"]
 Incidence = Literal["normal", "oblique", "airy"]
@@ -89,6 +90,8 @@ class SceneConfig:
             raise TensorsimError(f"SceneConfig.bounces: got {self.bounces}, expected at least 0")
         if self.snr_db is not None and not is_finite(self.snr_db):
             raise TensorsimError(f"SceneConfig.snr_db: got {self.snr_db!r}, expected a finite number of dB")
+        if self.snr_db is not None:
+            check_range(self.snr_db, "ratio of powers", "SceneConfig.snr_db")
         require_positive("SceneConfig", transmit_power_w=self.transmit_power_w)
 
     @property
