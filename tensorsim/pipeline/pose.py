@@ -18,6 +18,7 @@ from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.smoothing.along_time import brief_gaps
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
+from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
 from tensorsim.vision.tracking.tracker import GNNTracker
 
 
@@ -87,6 +88,10 @@ class VideoToPose(nn.Module):
         self.detection_interval = detection_interval
         self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
+        #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
+        self.top_speed_m_s = 12.0
+        #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
+        self.least_score = 0.5
         self.frames_per_batch = frames_per_batch
 
     @classmethod
@@ -261,6 +266,21 @@ class VideoToPose(nn.Module):
             scores.append(s)
         return torch.cat(keypoints), torch.cat(scores)
 
+    def is_person(self, scores: Tensor, valid: Tensor) -> Tensor:
+        """Whether the pose network sees a person in at least a quarter of the frames of a track.
+
+        Args:
+            scores: (B, P, T, 17) of the key points.
+            valid: (B, P, T) bool.
+
+        Returns:
+            (B, P) bool.
+        """
+        seen = (scores >= self.keypoint_threshold).to(scores.dtype)
+        mean = (scores * seen).sum(dim=-1) / seen.sum(dim=-1).clamp(min=1.0)
+        good = valid & (mean >= self.least_score)
+        return 4 * good.sum(dim=-1) >= valid.sum(dim=-1).clamp(min=1)
+
     def lift(
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
@@ -272,6 +292,7 @@ class VideoToPose(nn.Module):
         # A foot alone at the edge of the picture does not determine a pose: the smoother predicts such frames.
         usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
         usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
+        usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
         lifted = self.lifter(body, body_scores)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
@@ -281,7 +302,8 @@ class VideoToPose(nn.Module):
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         noise = keypoint_noise(body_scores, lifted.scale)
-        joints = self.smoother(joints, in_scene & ~predicted, fps, noise)
+        measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
+        joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
         # Nobody is where no frame of a track shows a joint.
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & usable.any(dim=-1, keepdim=True))
 

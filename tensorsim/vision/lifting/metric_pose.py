@@ -94,10 +94,11 @@ class MetricPose(nn.Module):
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
     joints relative to the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm. Each joint lies on
-    its line of sight at its own depth. Frames with fewer than ten visible joints do not give a reliable size: they
-    take that of the others, and one whose joints would make a body of less than 0.65 of it is discarded (a leg at
-    the edge of the picture, taken for a whole person). The floor is a low running quantile of the height of the lower
-    ankle, so that it stays through a jump and an outlier does not move it.
+    its line of sight at its own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not
+    know (people who lie), do not give a reliable size: they take that of the others, and one of few joints that would
+    make a body of less than 0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The
+    floor is a low running quantile of the height of the lower ankle, so that it stays through a jump and an outlier
+    does not move it.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
     joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
@@ -157,6 +158,9 @@ class MetricPose(nn.Module):
         self.floor_window_s = floor_window_s
         self.calibrated = calibrated
         self.whole_body_joints = 10  # visible joints from which the size of a body is reliable
+        self.poor_fit = (
+            0.25  # squared error of the lifted pose over the spread of the joints; good ones have 0.01
+        )
         self.least_size = 0.65  # of the size in reliable frames: below, a part was taken for a whole body
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
@@ -213,14 +217,17 @@ class MetricPose(nn.Module):
             focal = torch.full_like(scale, self._focal_px(image_width))
             if self.distance_gives_focal:
                 focal = self._focal_from(distance, height, scale, offset, valid, fps)
-            # The size of a body that is half out of the picture is not reliable: those frames follow the others.
-            whole = valid & (seen.sum(dim=-1) >= self.whole_body_joints)
+            # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
+            # reliable: those frames follow the others.
+            many = seen.sum(dim=-1) >= self.whole_body_joints
+            whole = valid & many & (lifted.distance < self.poor_fit)
+            whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid & many)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
             hips_range = camera_range(focal, height, scale) - height * offset
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
             body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
-            valid = valid & (whole | (scale > self.least_size * body_px))
+            valid = valid & (many | (scale > self.least_size * body_px))
             seen = seen & valid[..., None]
             # Hidden joints are where the lifted pose has them, at the size of the reliable frames.
             middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)

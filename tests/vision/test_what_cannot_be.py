@@ -1,0 +1,48 @@
+"""What the pose network does not see as a person is nobody; what no body can do does not come out."""
+
+import torch
+from torch import nn
+
+from tensorsim.pipeline import VideoToPose
+from tensorsim.types import Tracks
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.pose_library import load_pose_library
+from tests.film import STANDING
+
+FPS, FRAMES = 30.0, 24
+
+
+def lifted(scores: torch.Tensor, sideways_px: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Joints (T, 14, 3) and validity (T,) of a standing body, its wrists moved by (T,) pixels."""
+    body = torch.tensor(STANDING) * 200.0 + torch.tensor([320.0, 150.0])
+    keypoints = body.expand(1, 1, FRAMES, 17, 2).clone()
+    keypoints[0, 0, :, 9:11, 0] += sideways_px[:, None]
+    there = torch.ones(1, 1, FRAMES, dtype=torch.bool)
+    tracks = Tracks(torch.zeros(1, 1, FRAMES, 4), there, there)
+    stage = VideoToPose(nn.Identity(), nn.Identity(), lifter=NearestPoseLifter(load_pose_library()[::40]))
+    pose = stage.lift(tracks, keypoints, scores.expand(1, 1, FRAMES, 17), 480, 640, FPS)
+    return pose.joints[0, 0], pose.valid[0, 0]
+
+
+def test_furniture_is_nobody() -> None:
+    still = torch.zeros(FRAMES)
+    scores = torch.full(
+        (17,), 0.4
+    )  # as HRNet's are on stools and tripods: some above the threshold, none high
+    scores[:8] = 0.1
+    _, valid = lifted(scores, still)
+    assert not bool(valid.any())
+    scores[8:] = 0.7  # somebody whose upper half is hidden
+    joints, valid = lifted(scores, still)
+    assert bool(valid.all())
+    assert bool(joints.isfinite().all())
+
+
+def test_no_joint_is_faster_than_a_body_can_move() -> None:
+    jump = torch.zeros(FRAMES)
+    jump[12:14] = 250.0
+    joints, _ = lifted(torch.ones(17), jump)
+    assert float(joints.diff(dim=0).norm(dim=-1).max()) * FPS < 12.0 * 1.001
+    assert float((joints[12:14, (4, 7)] - joints[8, (4, 7)]).norm(dim=-1).max()) < 0.3, (
+        "taken out, not followed"
+    )
