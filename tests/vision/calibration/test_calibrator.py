@@ -18,7 +18,7 @@ from tensorsim.evaluation.camera import (
 )
 from tensorsim.vision.calibration.calibrator import CameraCalibrator
 from tensorsim.vision.calibration.camera_fit import camera_axes, place_upright
-from tensorsim.vision.calibration.upright import is_upright
+from tensorsim.vision.calibration.upright import is_upright, walking_share
 from tests.film import STANDING
 from tests.stage import StageTester
 
@@ -88,6 +88,22 @@ def test_nobody_tells_nothing() -> None:
         assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0), rel=1e-3)
     found = calibrator(args[0][:0], args[1][:0], args[2][:0], *args[3:])
     assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0))
+
+
+def test_who_fights_in_place_does_not_walk() -> None:
+    """Feet that move in place say nothing of the focal length."""
+    time = torch.arange(60, dtype=torch.float64) / FPS
+    body = standing(400.0, 200.0).expand(60, 17, 2).clone()
+    body[:, 15, 0] += 25 * (2 * math.pi * time).sin()
+    body[:, 16, 0] -= 25 * (2 * math.pi * time).sin()
+    there = torch.ones(1, 60, dtype=torch.bool)
+    assert not bool(walking_share(body[None], there, FPS).any())
+    gone = body + torch.stack([100 * time, 0 * time], dim=-1)[:, None]
+    assert float(walking_share(gone[None], there, FPS)[0, 30]) == 1.0
+    found = CameraCalibrator(most_frames=15)(
+        body[None], torch.ones(1, 60, 17, dtype=torch.float64), there, HEIGHT, WIDTH, FPS
+    )
+    assert math.degrees(float(found.horizontal_fov_rad)) == pytest.approx(60.0, abs=6.0)
 
 
 def test_a_roll_is_found() -> None:
