@@ -260,7 +260,7 @@ def simulate(
     device: torch.device,
     quiet: bool = False,
 ) -> tuple[Pose, RadarMaps]:
-    """Find the people of a source, choose those of the configuration and simulate their maps; writes the overlay film."""
+    """Find the people of a source, choose, and simulate their maps; writes the overlay film."""
     pose = select_people(source.pose(quiet), config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
     torch.manual_seed(config.seed)

@@ -58,7 +58,7 @@ class RadarOptions(PanelOptions):
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, free-space, through-wall) or a YAML file with fields of
     RadarConfig; a wall that it comes with replaces the scene's, a floor adds its reflections."""
     people: Annotated[str | None, tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
-    """Who is in the scene of the radar: everybody, those who move, the nearest person, or one by number. Default: all."""
+    """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
     body: Literal["joints", "limbs", "version1", "surface"] | None = None
     """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
     cross section follows the aspect, the 13 points of the original's first version, or points over torso and limbs
