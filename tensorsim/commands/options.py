@@ -55,8 +55,9 @@ class RadarOptions(PanelOptions):
     """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath. Default: free-space."""
     radar: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
-    infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, free-space, through-wall) or a YAML file with fields of
-    RadarConfig; a wall that it comes with replaces the scene's, a floor adds its reflections."""
+    infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall) or
+    a YAML file with fields of RadarConfig; a wall that it comes with replaces the scene's, a floor adds its
+    reflections."""
     people: Annotated[str | None, tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
     """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
     body: Literal["joints", "limbs", "version1", "surface"] | None = None

@@ -22,6 +22,7 @@ from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, Scene
 from tensorsim.config.documents import from_document, suggestion, to_document
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
+from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 
 #: The parts of a scene that a file describes beside the radar.
 _SECTIONS: dict[str, type] = {"wall": WallConfig, "floor": FloorConfig}
@@ -126,7 +127,7 @@ PRESETS: dict[str, SceneConfig] = {
 #: Half a wavelength in the middle of the AWR1843's band.
 _HALF_79_GHZ = SPEED_OF_LIGHT_M_S / 79e9 / 2
 
-PRESETS |= {
+PRESETS |= MEASURED_SENSORS | {
     # D: four receivers half a wavelength apart, the two outer transmitters two wavelengths: a virtual row of eight.
     "ti-awr1843-array": SceneConfig(
         replace(
