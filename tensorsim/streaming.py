@@ -126,12 +126,13 @@ def maps_of_pose(
     pulses = stage.resampler.pulses(joints.shape[2], fps)
     coefficients = stage.resampler.coefficients(joints, fps)
 
-    with progress_bar("radar", pulses, quiet) as bar:
+    # The simulator passes over the motion twice: for the level of the noise, and for the maps.
+    with progress_bar("radar", 2 * pulses, quiet) as bar:
         bar.unit = "pulse"
 
         def source(start: int, stop: int) -> tuple[Tensor, Tensor]:
             points, rcs = stage.scene(coefficients, valid, fps, start, stop)
-            bar.update(max(0, stop - bar.n))
+            bar.update(stop - start)
             return points[0], rcs[0]
 
         maps = stage.simulator.stream(source, pulses)
