@@ -113,8 +113,8 @@ class RadarMaps(NamedTuple):
 class Simulation(NamedTuple):
     """Everything :class:`tensorsim.VideoToDoppler` makes of clips: the fields of Pose, then of RadarMaps.
 
-    ``valid`` is false everywhere in a clip in which nobody was found: its maps show the empty scene. Eager code warns of
-    it as well; TorchScript cannot.
+    ``valid`` is false everywhere in a clip in which nobody was found: its maps show the empty scene. Eager code warns
+    of it as well; TorchScript cannot.
     """
 
     boxes: Tensor
