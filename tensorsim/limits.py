@@ -35,7 +35,7 @@ RANGES: dict[str, Range] = {
     "angle": Range(-36_000.0, 36_000.0, "degrees"),
     # radar
     "carrier frequency": Range(1e8, 1e12, "Hz"),
-    "bandwidth": Range(1e4, 1e11, "Hz"),
+    "bandwidth": Range(1.0, 1e11, "Hz"),
     "chirp duration": Range(1e-7, 0.1, "s"),
     "pulse repetition frequency": Range(1.0, 1e6, "Hz"),
     "sample rate": Range(1e3, 1e10, "Hz"),

@@ -29,6 +29,7 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "SPGNet": lambda network: network(wave(1, 1, 32, 32)),
     "SPNet": lambda network: network(wave(1, 1, 64, 64)),
     "DnCNN": lambda network: network.noise(wave(24, 40)).flatten()[::96],  # type: ignore[operator]
+    "PictureNet": lambda network: network(wave(1, network.channels, network.rows, 64)),
     "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
     "RTMDet": detector_logits,  # type: ignore[dict-item]
 }
@@ -39,6 +40,9 @@ EXPECTED: dict[str, tuple[list[float], float]] = {
     "b4c9d14cc7cd82d5": ([-0.26914, 34.51579, 9.87718, -35.4698, -28.01119, -28.01397], 21.309),  # SPNet
     "7a15296264b6a721": ([0.74892, 1.13028, 0.24339, 0.36871, 1.25796, 0.71812], 0.76663),  # DnCNN
     "bb5e978e9c128605": ([-6.66106, -3.67088, -3.76238, -3.3301, -3.37612, -3.54607], 31.623),  # RTMDet
+    "5e71e3d3afbb393b": ([-1.27, -0.61743, 0.135903, -0.764562, -3.11734, -1.17418], 1.5107),  # PictureNet
+    "635c86394040e891": ([-3.99982, 2.47428, -0.224426, -2.47148], 2.6589),  # PictureNet
+    "873b467d3aef57f0": ([-0.62995, 1.20185, -1.79243, 0.190756, -0.119144], 1.0104),  # PictureNet
     "ac94cf65a655eeea": (  # HRNet
         [-0.00128937, -0.00141716, -0.00127411, -0.00194263, -0.00210953, -0.00169086],
         0.001421,

@@ -154,7 +154,7 @@ def test_goes_on_and_refuses(folder: Path, tmp_path: Path) -> None:
     ("options", "message"),
     [
         ({"clips": 9}, "--clips: got 9, expected at least 10"),
-        ({"depth": 1}, "got depth 1"),
+        ({"depth": 1}, "depth: got 1"),
         ({"init": Path("none.safetensors")}, "none.safetensors: no such file"),
         ({"maps_seed": -1}, "--maps-seed: got -1"),
     ],
