@@ -17,6 +17,9 @@ from tensorsim.types import Detections, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.tracking.tracker import GNNTracker
 
+#: By which logits may rise when weights are stored in half precision.
+HALF_PRECISION = 0.01
+
 
 def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> dict[str, float]:
     """Figures of a detector on pictures in which everybody is labelled.
@@ -146,7 +149,7 @@ def calibrate(detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: f
     allowed = int(alarms_per_picture * len(empty))
     if allowed >= len(highest):
         return 0.0
-    shift = -float(torch.logit(highest[allowed].double()))
+    shift = -float(torch.logit(highest[allowed].double())) - HALF_PRECISION
     with torch.no_grad():
         for name, parameter in detector.bbox_head.rtm_cls.named_parameters():
             if name.endswith("bias"):

@@ -261,7 +261,7 @@ def test_calibrated_scores_mean_the_same_number_of_alarms(tmp_path: Path, recipe
     assert measure(detector, empty + peopled)["alarms_per_picture"] <= 0.6
     # The next one would be one too many.
     highest = torch.cat([scores for _, scores in after]).sort(descending=True).values
-    assert float(highest[3]) == pytest.approx(0.5, abs=1e-4)
+    assert 0.495 < float(highest[3]) < 0.5
     with pytest.raises(TensorsimError, match="pictures with people"):
         calibrate(detector, peopled)
 
