@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer, warn_of_label
@@ -12,7 +12,8 @@ from tensorsim.errors import TensorsimError, collected_warnings
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from tensorsim.config import SimulationConfig
+    from tensorsim.config import CameraConfig, SimulationConfig
+    from tensorsim.motion.activities import GeneratedMotion
     from tensorsim.render.renderer import RenderedVideo
     from tensorsim.types import Pose
 
@@ -53,7 +54,6 @@ class Demo(NetworkOptions, RadarOptions):
         detector, pose_network = default_networks(self.detector, self.pose)
         config = self._film_configuration(detector, pose_network)
 
-        import numpy as np
         import torch
 
         from tensorsim import results
@@ -61,11 +61,7 @@ class Demo(NetworkOptions, RadarOptions):
         from tensorsim.data.video import VideoReader, write_video
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
-        from tensorsim.geometry.framing import camera_on
-        from tensorsim.motion.activities import ActivityGenerator
-        from tensorsim.motion.people import PeopleConfig
         from tensorsim.pipeline import PoseToDoppler, VideoToPose
-        from tensorsim.render.renderer import PersonRenderer
         from tensorsim.sources import drawn_by, film_source
         from tensorsim.streaming import maps_of_pose
 
@@ -77,22 +73,9 @@ class Demo(NetworkOptions, RadarOptions):
             # The true motion is known at many moments: it needs no smoothing.
             true_stage = PoseToDoppler.from_config(config.replace(smoothing=SmoothingConfig())).to(device)
             frames = round(self.duration * FILM_FPS)
-            motion = ActivityGenerator(
-                PeopleConfig(start_range_m=(NEAR_M, FAR_M), keep_range_m=(NEAR_M, FAR_M))
-            )
-            truth = motion.generate(
-                activity,
-                seed=config.seed,
-                duration_s=frames / FILM_FPS,
-                rate_hz=FILM_FPS * MOMENTS_PER_FRAME,
-            )
-            height_m = float(truth.people.height_m[0])
-            camera = camera_on(truth.joints, torch.ones_like(truth.valid), HEIGHT, WIDTH, position_m=CAMERA_M)
             if not self.quiet:
                 print(f"rendering {frames} frames of {ACTIVITIES[activity]} ...", file=sys.stderr)
-            film = PersonRenderer(camera, HEIGHT, WIDTH)(
-                truth.joints[:, ::MOMENTS_PER_FRAME], config.seed, valid=truth.valid[:, ::MOMENTS_PER_FRAME]
-            )
+            truth, film, camera, height_m = film_person(activity, frames, config.seed)
             config = config.replace(pose__person_height_m=(height_m,), pose__camera=camera)
             people = VideoToPose.from_config(config, *networks).to(device)
             with complete_or_nothing(self.out) as folder:
@@ -117,15 +100,7 @@ class Demo(NetworkOptions, RadarOptions):
                 results.write_pose(folder, pose, FILM_FPS, pictures)
                 if self.sound:
                     results.write_doppler_sound(folder, maps_stage, pose, FILM_FPS, device)
-                np.savez(
-                    folder / "pose_truth.npz",
-                    joints_m=film.joints.numpy(),
-                    keypoints_px=film.keypoints.numpy(),
-                    visibility=film.visibility.numpy(),
-                    boxes_px=film.boxes.numpy(),
-                    valid=truth.valid[:, ::MOMENTS_PER_FRAME].numpy(),
-                    fps=FILM_FPS,
-                )
+                write_pose_truth(folder, film, truth.valid)
                 likeness = results.similarity(maps, true_maps)
                 empty = maps._replace(**{name: torch.zeros_like(getattr(maps, name)) for name in likeness})
                 empty_likeness = results.similarity(empty, true_maps)
@@ -159,6 +134,57 @@ class Demo(NetworkOptions, RadarOptions):
         if not self.flip_test:
             config = config.replace(pose__flip_test=False)
         return config.replace(tracking__detector=str(detector), pose__network=str(pose_network))
+
+
+class Filmed(NamedTuple):
+    """A rendered person whose motion is known.
+
+    Attributes:
+        truth: the motion, :data:`MOMENTS_PER_FRAME` times per frame.
+        film: the frames and what is true in each.
+        camera: that filmed it.
+        height_m: of the person.
+    """
+
+    truth: "GeneratedMotion"
+    film: "RenderedVideo"
+    camera: "CameraConfig"
+    height_m: float
+
+
+def film_person(activity: int, frames: int, seed: int) -> Filmed:
+    """Render a person who does an activity, in so many frames."""
+    import torch
+
+    from tensorsim.geometry.framing import camera_on
+    from tensorsim.motion.activities import ActivityGenerator
+    from tensorsim.motion.people import PeopleConfig
+    from tensorsim.render.renderer import PersonRenderer
+
+    people = PeopleConfig(start_range_m=(NEAR_M, FAR_M), keep_range_m=(NEAR_M, FAR_M))
+    rate_hz = FILM_FPS * MOMENTS_PER_FRAME
+    truth = ActivityGenerator(people).generate(
+        activity, seed=seed, duration_s=frames / FILM_FPS, rate_hz=rate_hz
+    )
+    camera = camera_on(truth.joints, torch.ones_like(truth.valid), HEIGHT, WIDTH, position_m=CAMERA_M)
+    joints, valid = truth.joints[:, ::MOMENTS_PER_FRAME], truth.valid[:, ::MOMENTS_PER_FRAME]
+    film = PersonRenderer(camera, HEIGHT, WIDTH)(joints, seed, valid=valid)
+    return Filmed(truth, film, camera, float(truth.people.height_m[0]))
+
+
+def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor") -> None:
+    """Write ``pose_truth.npz``: what is true in each frame; ``valid`` (P, T) at the rate of the motion."""
+    import numpy as np
+
+    np.savez(
+        folder / "pose_truth.npz",
+        joints_m=film.joints.numpy(),
+        keypoints_px=film.keypoints.numpy(),
+        visibility=film.visibility.numpy(),
+        boxes_px=film.boxes.numpy(),
+        valid=valid[:, ::MOMENTS_PER_FRAME].numpy(),
+        fps=FILM_FPS,
+    )
 
 
 def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":

@@ -116,6 +116,14 @@ class PoseToDoppler(nn.Module):
         points, rcs = self.scene(coefficients, valid, fps, 0, pulses)
         return self.denoise(self.simulator(points, rcs))
 
+    @torch.jit.export
+    def doppler_time(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """Only the Doppler-time map (B, F, K) of :meth:`forward`, for data sets; with one seed the same."""
+        coefficients = self.resampler.coefficients(joints, fps)
+        points, rcs = self.scene(coefficients, valid, fps, 0, self.resampler.pulses(joints.shape[2], fps))
+        doppler_time = self.simulator.doppler_time(points, rcs)
+        return self.denoiser(doppler_time) if self.denoises else doppler_time
+
     def scene(
         self, coefficients: Tensor, valid: Tensor, fps: float, start: int, stop: int
     ) -> tuple[Tensor, Tensor]:

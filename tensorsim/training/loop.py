@@ -175,6 +175,7 @@ class _Log:
             self.events.add_scalar(name, value, step)
 
 
+# One function, although a long one: the steps of a run share nearly all of its state.
 def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     """Train, from the start or from the last checkpoint in ``config.out``.
 

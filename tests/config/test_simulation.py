@@ -226,4 +226,7 @@ def test_bodies_and_small_motions_are_those_of_the_scene() -> None:
     coefficients = stage.resampler.coefficients(still, 30.0)
     whole, part = (stage.scene(coefficients, valid, 30.0, start, 60)[0] for start in (0, 40))
     torch.testing.assert_close(whole[:, 40:], part)
-    assert_same(torch.jit.script(stage)(still, valid, 30.0), alive, atol=1e-5)
+    scripted = torch.jit.script(stage)
+    assert_same(scripted(still, valid, 30.0), alive, atol=1e-5)
+    for module in (stage, scripted):
+        assert_same([module.doppler_time(still, valid, 30.0)], [alive.doppler_time], atol=1e-5)
