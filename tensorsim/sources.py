@@ -61,13 +61,15 @@ def kind_of(path: Path) -> str:
     return {".bvh": "motion", ".npz": "motion", ".json": "keypoints"}.get(path.suffix.lower(), "video")
 
 
-def film_source(reader: VideoReader, stage: VideoToPose, device: torch.device) -> Source:
-    """People of a film, found by the networks of ``stage``."""
+def film_source(
+    reader: VideoReader, stage: VideoToPose, device: torch.device, calibrate: bool = False
+) -> Source:
+    """People of a film, found by the networks of ``stage``; the camera estimated from them, if asked for."""
     return Source(
         "video",
         reader.fps,
         reader.frame_count,
-        lambda quiet: pose_of_film(stage, reader, device, quiet),
+        lambda quiet: pose_of_film(stage, reader, device, quiet, calibrate),
         lambda: reader.chunks(8),
         stage.keypoint_threshold,
         {},

@@ -111,6 +111,19 @@ def test_simulate_writes_everything(
     assert sum(chunk.shape[0] for chunk in overlay.chunks(8)) == 25
 
 
+def test_the_camera_is_estimated_if_asked_for(
+    walk: Path, tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    cli.main(["simulate", str(walk), "--out", str(out), "--calibrate", *stand_ins])
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["config"]["pose"]["calibrate"] is True
+    assert summary["people"][0]["mean_approach_m_s"] < -0.6, "walks away"
+    with pytest.raises(SystemExit):
+        cli.main(["simulate", str(walk), "--out", str(out), "--calibrate", "--camera-fov", "50", *stand_ins])
+    assert "--calibrate: got --camera-fov" in capsys.readouterr().err
+
+
 def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
     """The file's radar replaces the scene's, its wall too; the scene's wall stays where the file has none."""
     scene = RadarOptions(scene="through-wall", radar="cw-24ghz").configuration().scene

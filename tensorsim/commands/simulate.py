@@ -36,6 +36,7 @@ _MEANT_FOR = {
     "pose": ("video",),
     "flip_test": ("video",),
     "person_height": ("video", "keypoints"),
+    "calibrate": ("video",),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
     "library": ("video", "keypoints"),
@@ -65,6 +66,8 @@ class Simulate(NetworkOptions, RadarOptions):
     radar)."""
     camera_fov: float | None = None
     """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: 60."""
+    calibrate: bool = False
+    """Estimate tilt, height and field of view of the camera from the people of the film."""
     position: Literal["camera", "paper"] | None = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
     library: Path | None = None
@@ -142,6 +145,8 @@ class Simulate(NetworkOptions, RadarOptions):
         ):
             if value is not None:
                 config = config.replace(**{field: value})
+        if self.calibrate:
+            config = config.replace(pose__calibrate=True)
         return config if self.flip_test else config.replace(pose__flip_test=False)
 
     def check(self, out: Path) -> None:
@@ -171,6 +176,10 @@ class Simulate(NetworkOptions, RadarOptions):
             given = getattr(self, name)
             for value in given if isinstance(given, tuple) else [given] * (given is not None):
                 check_range(value, quantity, f"--{name.replace('_', '-')}")
+        if self.calibrate and (self.camera_fov is not None or self.initial_distance is not None):
+            raise TensorsimError(
+                "--calibrate: got --camera-fov or --initial-distance beside it, expected one way to the camera"
+            )
         if self.position == "paper" and self.initial_distance is None and self.config is None:
             raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
 
@@ -207,4 +216,4 @@ class Simulate(NetworkOptions, RadarOptions):
         )
         networks = load_networks(detector, pose, config.pose.flip_test)
         stage = VideoToPose.from_config(config, *networks).to(device)
-        return sources.film_source(reader, stage, device), config
+        return sources.film_source(reader, stage, device, config.pose.calibrate), config

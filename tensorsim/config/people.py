@@ -84,6 +84,8 @@ class PoseConfig:
         initial_distance_m: distances of the people when they appear, which calibrate the focal length (panel:
             4.00, 0.50 m); None takes the camera's focal length.
         camera: pinhole camera.
+        calibrate: estimate tilt, height and field of view of the camera from the people of a film, in place of
+            ``camera``; see :class:`tensorsim.vision.CameraCalibrator`.
         position: ``"camera"`` (pinhole camera) or ``"paper"`` (increments of pixels times metres per pixel).
         library: file of the pose library; None is the shipped one.
         neighbours: poses of the library that are averaged per frame; 1 is the paper's nearest match.
@@ -102,6 +104,7 @@ class PoseConfig:
     person_weight_kg: tuple[float, ...] = PANEL_WEIGHTS_KG
     initial_distance_m: tuple[float, ...] | None = None
     camera: CameraConfig = field(default_factory=CameraConfig)
+    calibrate: bool = False
     position: Position = "camera"
     library: str | None = None
     neighbours: int = 32
