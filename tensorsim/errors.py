@@ -108,6 +108,14 @@ def check_size(x: Tensor, dim: int, size: int, name: str, layout: str) -> None:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
 
 
+def check_points(x: Tensor, rank: int, count: int, coordinates: int, name: str, layout: str) -> None:
+    """Refuse anything but real (..., count, coordinates) of at least this rank."""
+    check_floating(x, name)
+    check_min_rank(x, rank, name, layout)
+    check_size(x, -2, count, name, layout)
+    check_size(x, -1, coordinates, name, layout)
+
+
 def check_not_empty(x: Tensor, name: str) -> None:
     """Refuse a tensor without elements."""
     if x.numel() == 0:

@@ -8,15 +8,7 @@ from torch import Tensor
 
 from tensorsim.body.proportions import NOSE_FORWARD, NOSE_UP, SHANK, THIGH, TRUNK
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
-from tensorsim.errors import (
-    TensorsimError,
-    check_finite,
-    check_floating,
-    check_min_rank,
-    check_positive,
-    check_size,
-    check_tensor,
-)
+from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, check_tensor
 
 #: Arms and legs by the indices of their joints, upper segment first.
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
@@ -78,10 +70,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
         TensorsimError: other shapes, NaN, or a threshold that is not positive.
     """
     layout = "(..., 17, 2) COCO key points in pixels"
-    check_floating(keypoints, "keypoints")
-    check_min_rank(keypoints, 2, "keypoints", layout)
-    check_size(keypoints, -2, 17, "keypoints", layout)
-    check_size(keypoints, -1, 2, "keypoints", layout)
+    check_points(keypoints, 2, 17, 2, "keypoints", layout)
     if scores.shape != keypoints.shape[:-1]:
         raise TensorsimError(f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}")
     check_finite(keypoints, "keypoints")

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import JOINTS
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive, check_size
+from tensorsim.errors import TensorsimError, check_floating, check_points, check_positive
 from tensorsim.motion.random_process import RandomProcess
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
@@ -96,10 +96,7 @@ class VitalSigns(nn.Module):
     def forward(self, joints: Tensor, start: int = 0) -> Tensor:
         """Joints of frames ``start`` onwards, breathing; frame k is at ``k / rate_hz``."""
         layout = "(..., P, T, 14, 3)"
-        check_floating(joints, "joints")
-        check_min_rank(joints, 4, "joints", layout)
-        check_size(joints, -1, 3, "joints", layout)
-        check_size(joints, -2, 14, "joints", layout)
+        check_points(joints, 4, 14, 3, "joints", layout)
         persons, frames = joints.shape[-4], joints.shape[-3]
         time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / self.rate_hz
         who = torch.arange(persons, device=joints.device) % self.people

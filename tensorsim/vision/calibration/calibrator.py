@@ -7,14 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
-from tensorsim.errors import (
-    TensorsimError,
-    check_finite,
-    check_floating,
-    check_min_rank,
-    check_positive,
-    check_size,
-)
+from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
     LEAN,
@@ -140,10 +133,7 @@ class CameraCalibrator(nn.Module):
     ) -> CameraEstimate:
         """Key points, scores, valid, image size, frame rate -> the cameras of the clips."""
         layout = "(..., P, T, 17, 2) key points in pixels"
-        check_floating(keypoints, "keypoints")
-        check_min_rank(keypoints, 4, "keypoints", layout)
-        check_size(keypoints, -2, 17, "keypoints", layout)
-        check_size(keypoints, -1, 2, "keypoints", layout)
+        check_points(keypoints, 4, 17, 2, "keypoints", layout)
         if list(scores.shape) != list(keypoints.shape[:-1]):
             raise TensorsimError(
                 f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}"

@@ -21,15 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.proportions import ANKLE_HEIGHT, FLESH
-from tensorsim.errors import (
-    TensorsimError,
-    check_finite,
-    check_floating,
-    check_min_rank,
-    check_positive,
-    check_size,
-    is_exporting,
-)
+from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, is_exporting
 from tensorsim.vision.lifting.bone_branches import choose_branches
 from tensorsim.vision.lifting.bone_cost import (
     FREE_JOINTS,
@@ -129,10 +121,7 @@ class BoneFit(nn.Module):
     def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
         """Joints, which of them are seen and frame rate -> joints."""
         layout = "(..., P, T, 14, 3) joints in metres"
-        check_floating(joints, "joints")
-        check_min_rank(joints, 4, "joints", layout)
-        check_size(joints, -2, 14, "joints", layout)
-        check_size(joints, -1, 3, "joints", layout)
+        check_points(joints, 4, 14, 3, "joints", layout)
         if seen.dtype != torch.bool or seen.shape != joints.shape[:-1]:
             raise TensorsimError(
                 f"seen: got {seen.dtype} of {list(seen.shape)}, expected bool of {list(joints.shape[:-1])}"

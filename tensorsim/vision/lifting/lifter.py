@@ -10,15 +10,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import (
-    TensorsimError,
-    check_finite,
-    check_floating,
-    check_min_rank,
-    check_positive,
-    check_size,
-    is_exporting,
-)
+from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, is_exporting
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.pose_library import load_pose_library, standardise_poses
 from tensorsim.vision.lifting.pose_search import PoseSearch, normalise_weights
@@ -144,10 +136,7 @@ class NearestPoseLifter(nn.Module):
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
         """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
         layout = "(..., T, 14, 2) joints in pixels"
-        check_floating(keypoints, "keypoints")
-        check_min_rank(keypoints, 3, "keypoints", layout)
-        check_size(keypoints, -2, 14, "keypoints", layout)
-        check_size(keypoints, -1, 2, "keypoints", layout)
+        check_points(keypoints, 3, 14, 2, "keypoints", layout)
         if weights.shape != keypoints.shape[:-1]:
             raise TensorsimError(
                 f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"

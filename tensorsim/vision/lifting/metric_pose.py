@@ -8,14 +8,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
-from tensorsim.errors import (
-    TensorsimError,
-    check_finite,
-    check_floating,
-    check_min_rank,
-    check_positive,
-    check_size,
-)
+from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive
 from tensorsim.geometry.camera import back_project, camera_to_world
 from tensorsim.types import Lifted
 from tensorsim.vision.smoothing.along_time import (
@@ -294,10 +287,7 @@ def _check(
 ) -> None:
     """Refuse inputs that do not fit together."""
     layout = "(..., P, T, 14, 2) joints in pixels"
-    check_floating(keypoints, "keypoints")
-    check_min_rank(keypoints, 4, "keypoints", layout)
-    check_size(keypoints, -2, 14, "keypoints", layout)
-    check_size(keypoints, -1, 2, "keypoints", layout)
+    check_points(keypoints, 4, 14, 2, "keypoints", layout)
     shape = keypoints.shape
     for name, size, expected in (
         ("scores", scores.shape, shape[:-1]),
