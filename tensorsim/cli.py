@@ -25,6 +25,7 @@ from tensorsim.commands.simulate import Simulate
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
 
@@ -68,6 +69,7 @@ COMMANDS: dict[str, Any] = {
             "pose": TrainPose,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
+            "everyday": TrainEveryday,
         },
     ),
     "library": ("Pools of poses for nearest-match lifting.", {"build": BuildLibrary}),
