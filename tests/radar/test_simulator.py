@@ -344,9 +344,3 @@ def test_warns_of_what_the_range_axis_cannot_show():
         check_unambiguous(far, torch.ones(64, 2), RadarConfig.free_space())
     check_unambiguous(far, torch.zeros(64, 2), RadarConfig.free_space())  # nobody is there
     check_unambiguous(far, torch.ones(64, 2), THROUGH)  # 30 m
-
-
-def test_refuses_an_array_of_antennas():
-    radar = RadarConfig(rx_m=((0.0, 0.0, 1.5), (0.002, 0.0, 1.5)))
-    with pytest.raises(TensorsimError, match="several antennas"):
-        RadarSimulator(radar)
