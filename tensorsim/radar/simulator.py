@@ -96,7 +96,8 @@ class RadarSimulator(nn.Module):
 
     Raises:
         TensorsimError: see the stages; a clip shorter than ``min_pulses``; motion that the PRF cannot follow
-            (eager only, like its warning; see :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
+            (eager only, like the warnings of targets beyond the range axis or a fixed gate; see
+            :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
     """
 
     def __init__(
@@ -119,7 +120,13 @@ class RadarSimulator(nn.Module):
             options["mti"] = mti
         scene, processing = configured(radar, wall, processing, options)
         ready: dict[str, nn.Module | None] = {"echo": echo, "doppler": doppler, "ridges": ridges}
-        refuse_conflicts(ready, options, wall, antenna, learnable)
+        ready["mti"] = mti if isinstance(mti, nn.Module) else None
+        given = {
+            *options,
+            *(["antenna"] if antenna is not None else []),
+            *(["learnable"] if learnable else []),
+        }
+        refuse_conflicts(ready, scene, processing, given)
         scene.check_engine(processing.engine)
         radar = scene.radar
         if radar.has_array and processing.integration == "coherent":
@@ -129,8 +136,8 @@ class RadarSimulator(nn.Module):
             )
         self.echo = echo or echo_of(scene, processing.pulse_chunk, antenna, learnable)
         gate_m = processing.range_gate_m
-        fixed = None if isinstance(gate_m, float | int) else gate_m
-        self.range_profile = RangeProfile(radar, processing.range_window, fixed)
+        self.fixed_gate_m = None if isinstance(gate_m, float | int) else gate_m
+        self.range_profile = RangeProfile(radar, processing.range_window, self.fixed_gate_m)
         self.recorder = Recorder(scene, processing, self.echo, self.range_profile, seed)
         self.channels, self.has_array = self.recorder.channels, radar.has_array
         self.gate: nn.Module | None = None
@@ -223,7 +230,7 @@ class RadarSimulator(nn.Module):
         rcs = check_scene(positions, rcs)
         self._check_pulses(positions.shape[-3])
         if not torch.jit.is_scripting() and not is_exporting():
-            check_unambiguous(positions, rcs, self.radar)
+            check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m)
         return flatten_batch(positions, 3), flatten_batch(rcs, 2)
 
     def _span(self, positions: Tensor) -> int:
@@ -249,7 +256,7 @@ class RadarSimulator(nn.Module):
                 "whole clip"
             )
         self._check_pulses(pulses)
-        speeds = SpeedCheck(self.radar)
+        speeds = SpeedCheck(self.radar, self.fixed_gate_m)
         levels = Levels(torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
         for start, positions, rcs in self._pieces(source, pulses):
             speeds.add(positions, rcs)
