@@ -89,7 +89,8 @@ def periodic_pchip(knots: Tensor, values: Tensor, phase: Tensor) -> Tensor:
 def control_points(relative_speed: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
     """Control points by joint: phases (..., K) and degrees (..., K), for a right limb at phase 0.
 
-    Those of the source but for the knee's largest flexion, see the module. Three ranges of speed: below 0.5, below 1.3, and above.
+    Those of the source but for the largest flexion of the knee, see the module. Three ranges of speed: below 0.5, below
+    1.3, and above.
     """
     rv = relative_speed
     u, w = (rv - 1.3) / 1.7, (rv - 0.5) / 0.8
