@@ -201,9 +201,9 @@ class EchoSynthesizer(nn.Module):
         return torch.cat((step, step[..., -1:, :, :]), -3)
 
     @torch.jit.export
-    def pulse_times(self, start: int, positions: Tensor) -> Tensor:
-        """Times (M,) in seconds, float64, of the pulses of ``positions`` (..., M, S, 3), number ``start`` the first."""
-        pulse = torch.arange(positions.shape[-3], dtype=torch.float64, device=positions.device)
+    def pulse_times(self, start: int, count: int) -> Tensor:
+        """Times (count,) in seconds, float64, of pulses ``start`` onwards."""
+        pulse = torch.arange(count, dtype=torch.float64, device=self.fine.device)
         return (start + pulse) / self.prf_hz
 
     @torch.jit.export
