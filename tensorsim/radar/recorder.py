@@ -96,7 +96,9 @@ class Recorder(nn.Module):
     ) -> tuple[Tensor, Levels]:
         """Profiles free of noise, stored with time running fastest, and energies (B,), of pulses ``first`` onwards.
 
-        ``ahead`` (B, m, S, 3): see :mod:`~tensorsim.radar.synthesis.engines`. With a front end the profiles are empty: what it records depends on the levels of the whole clip.
+        ``ahead`` (B, m, S, 3): see :mod:`~tensorsim.radar.synthesis.engines`.
+
+        With a front end the profiles are empty: what it records depends on the levels of the whole clip.
         """
         signal = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
         arriving = torch.zeros_like(signal)

@@ -2,9 +2,9 @@
 
     engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2, start, ahead) -> profiles (B, m, V R), energy (B,)
 
-``start`` is the number of the first of m pulses, by which the room's clutter vibrates; ``ahead`` (B, m, S, 3) the way of
-the scatterers until the next pulse for transmitters in turn, else None. The channels of V antennas
-stand one after the other along the range bins. ``energy`` is that of the reference signal of the receiver noise, over
+``start`` is the number of the first of m pulses, by which the room's clutter vibrates; ``ahead`` (B, m, S, 3) the way
+of the scatterers until the next pulse for transmitters in turn, else None. The channels of V antennas stand one after
+the other along the range bins. ``energy`` is that of the reference signal of the receiver noise, over
 m pulses and the N samples of their IF, mean over the channels. Arguments are not checked; the simulator has checked
 them.
 """
