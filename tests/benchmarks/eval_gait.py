@@ -1,9 +1,9 @@
 """Gait parameters in noise, measured beside simulated: ``python -m tests.benchmarks.eval_gait [--walks N]``.
 
 :class:`~tensorsim.radar.GaitEstimator` reads torso speed, limbs over torso and strides per second from 24 GHz
-continuous-wave signals to which white noise is added at 0 to 40 dB below their mean power: the recordings of a walk and a
-run, and generated walks towards the radar with the scatterers of ``--body surface`` and ``joints``. The last rows are of
-bursts (``kmkim_cw24_iq``), too few per second for steps: torso speed and the speed of 95 % of the power over it.
+continuous-wave signals to which white noise is added at 0 to 40 dB below their mean power: recordings of a walk and a
+run, and generated walks towards the radar with the scatterers of ``--body surface`` and ``joints``. Last come
+bursts (``kmkim_cw24_iq``), too few per second for steps: the speed of 95 % of the power over that of the torso.
 """
 
 import argparse
