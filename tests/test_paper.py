@@ -68,5 +68,6 @@ FORMULAS = (
 def test_formulas_are_mathematics_in_the_reference(path: str) -> None:
     """A display formula, in rows of the table."""
     text = found(path).__doc__
-    assert text.count("$$") >= 2 and text.count("$$") % 2 == 0
+    assert text.count("$$") >= 2
+    assert text.count("$$") % 2 == 0
     assert path in {row.function for row in ROWS}
