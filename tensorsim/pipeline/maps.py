@@ -108,7 +108,7 @@ class PoseToDoppler(nn.Module):
         denoiser = None if processing.denoiser is None else MapDenoiser.from_pretrained(processing.denoiser)
         people = len(config.pose.person_weight_kg)
         return cls(
-            RadarSimulator(scene, processing=processing),
+            RadarSimulator(scene, processing=processing, seed=config.seed),
             PoseResampler(prf_hz, method=smoothing.resampling),
             pulse_smoother,
             bodies[scene.body](),

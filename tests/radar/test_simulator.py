@@ -348,12 +348,6 @@ def test_warns_of_what_the_range_axis_cannot_show():
     check_unambiguous(far, torch.ones(64, 2), THROUGH)  # 30 m
 
 
-def test_refuses_an_array_of_antennas():
-    radar = RadarConfig(rx_m=((0.0, 0.0, 1.5), (0.002, 0.0, 1.5)))
-    with pytest.raises(TensorsimError, match="several antennas"):
-        RadarSimulator(radar)
-
-
 @pytest.mark.parametrize(("near_m", "far_m"), [(0.0, 0.0), (0.5, 0.0), (0.0, -0.5)])
 def test_warning_when_somebody_leaves_a_fixed_gate(near_m, far_m):
     p, rcs = mover(3.5, 128), torch.ones(4)
