@@ -16,14 +16,16 @@ from tensorsim.radar.processing.range_profile import gate_bins
 
 
 def doppler_time_map(profiles: Tensor, window: Tensor, hop: int, fft_length: int) -> Tensor:
-    """Doppler-time map ``sqrt(sum over range bins of |STFT of that bin|^2)``.
+    r"""Doppler-time map: short-time Fourier transform of each range bin, summed over range in power.
+
+    $$ D[f, k] = \sqrt{\sum_r \left| \sum_{m=0}^{L-1} w[m] \, x_r^*[m + k h] \, e^{-j 2 \pi f m / F} \right|^2} $$
 
     Profiles are conjugated, so that positive Doppler is approaching. Frames lie wholly inside the signal.
 
     Args:
         profiles: (..., M, R) complex, M pulses of R range bins.
         window: (L,) real, over the pulses of a frame, L <= M.
-        hop: pulses from frame to frame.
+        hop: $h$, pulses from frame to frame.
         fft_length: F >= L, length of the zero-padded transform.
 
     Returns:
