@@ -25,6 +25,7 @@ from tensorsim.commands.simulate import Simulate
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
 
@@ -66,6 +67,7 @@ COMMANDS: dict[str, Any] = {
         {
             "detector": TrainDetector,
             "pose": TrainPose,
+            "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
         },

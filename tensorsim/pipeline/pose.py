@@ -15,6 +15,7 @@ from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
@@ -76,7 +77,10 @@ class VideoToPose(nn.Module):
         self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
-        self.lifter = check_part(NearestPoseLifter() if lifter is None else lifter, "lifter")
+        # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
+        self.temporal = lifter if isinstance(lifter, TemporalLifter) else None
+        matching = NearestPoseLifter() if lifter is None else lifter
+        self.lifter = None if self.temporal is not None else check_part(matching, "lifter")
         self.metric_pose = (
             metric_pose
             if metric_pose is not None
@@ -153,14 +157,20 @@ class VideoToPose(nn.Module):
         Raises:
             TensorsimError: a lifter or metric pose of another class, which may know no camera.
         """
-        if not isinstance(self.lifter, NearestPoseLifter) or not isinstance(self.metric_pose, MetricPose):
+        lifter = self.lifter if self.temporal is None else self.temporal
+        if not isinstance(lifter, (NearestPoseLifter, TemporalLifter)) or not isinstance(
+            self.metric_pose, MetricPose
+        ):
             raise TensorsimError(
-                f"seen_by: got {type(self.lifter).__name__} and {type(self.metric_pose).__name__}, expected "
-                "NearestPoseLifter and MetricPose"
+                f"seen_by: got {type(lifter).__name__} and {type(self.metric_pose).__name__}, expected "
+                "NearestPoseLifter or TemporalLifter, and MetricPose"
             )
         other = copy.copy(self)
         other._modules = dict(self._modules)
-        other.lifter = self.lifter.tilted(camera.pitch_rad)
+        if isinstance(lifter, TemporalLifter):
+            other.temporal = lifter.seen_by(camera)
+        else:
+            other.lifter = lifter.tilted(camera.pitch_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
@@ -293,7 +303,13 @@ class VideoToPose(nn.Module):
         usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
         usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
         usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
-        lifted = self.lifter(body, body_scores)
+        if self.temporal is not None:
+            found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
+            lifted = self.temporal.in_picture(found, body_scores, height, width)
+            body, noise = lifted.keypoints, found.deviation
+        else:
+            lifted = self.lifter(body, body_scores)
+            noise = keypoint_noise(body_scores, lifted.scale)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
@@ -301,7 +317,6 @@ class VideoToPose(nn.Module):
         # the joint of the matched pose replaces it, as long as the person is in the scene.
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
-        noise = keypoint_noise(body_scores, lifted.scale)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
         # Nobody is where no frame of a track shows a joint.
