@@ -10,6 +10,7 @@ import tyro
 
 from tensorsim import process
 from tensorsim.commands.check import Check
+from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_camera import EvaluateCamera
 from tensorsim.commands.evaluate_classifier import EvaluateClassifier
@@ -40,6 +41,8 @@ examples:
   tensorsim demo --activity kicking --out demo/
   tensorsim evaluate truth --out truth/ --clips 2
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
+  tensorsim dataset example > recipe.yaml
+  tensorsim dataset build recipe.yaml --out data/ --workers 2
   tensorsim check
 
 Networks come with tensorsim; others can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE.
@@ -71,6 +74,10 @@ COMMANDS: dict[str, Any] = {
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
         },
+    ),
+    "dataset": (
+        "Labelled data sets of radar maps from a recipe.",
+        {"build": DatasetBuild, "example": DatasetExample, "sample": DatasetSample},
     ),
     "library": ("Pools of poses for nearest-match lifting.", {"build": BuildLibrary}),
     "models": (

@@ -28,7 +28,7 @@ class ProcessingConfig:
         engine: ``"time"`` synthesises the signal and transforms it; ``"range-bins"`` computes the range bins in
             closed form.
         near_bins: with ``engine="range-bins"``, bins on each side of a path that are computed; None is all.
-        range_gate_m: (nearest, farthest) metres of the bins that are used, or the half width in metres of a gate
+        range_gate_m: (nearest, farthest) metres of the bins that are used, or the width in metres of a gate
             that follows the people; None uses all bins.
         pulse_chunk: pulses that are worked on at a time; bounds memory.
 

@@ -119,7 +119,7 @@ def temporal(lifter: TemporalLifter) -> MakeLifter:
     """The network of a lifter."""
 
     def make(camera: CameraConfig, heights: tuple[float, ...]) -> nn.Module:
-        return TemporalLifter(lifter.network, camera, heights).eval()
+        return lifter.seen_by(camera, heights)
 
     return make
 
@@ -135,9 +135,7 @@ def lifted(make: MakeLifter, seen: Seen) -> tuple[Tensor, Tensor]:
         metric_pose=MetricPose(seen.camera, seen.heights),
     ).eval()
     tracks = Tracks(seen.boxes[None], seen.valid[None], seen.valid[None])
-    pose = stage.lift(
-        tracks, seen.keypoints[None], seen.scores[None], seen.extent[1], seen.extent[0], FPS
-    )
+    pose = stage.lift(tracks, seen.keypoints[None], seen.scores[None], seen.extent[1], seen.extent[0], FPS)
     return pose.joints[0], pose.valid[0]
 
 
@@ -155,9 +153,7 @@ def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
         found, valid = lifted(make, seen)
         found, true = found.double(), seen.joints.double()
         place = true.new_tensor(seen.camera.position_m)
-        sight = nn.functional.normalize(
-            (mid_hips(true) - place) * true.new_tensor([1.0, 1.0, 0.0]), dim=-1
-        )
+        sight = nn.functional.normalize((mid_hips(true) - place) * true.new_tensor([1.0, 1.0, 0.0]), dim=-1)
         error = (found - mid_hips(found)[..., None, :]) - (true - mid_hips(true)[..., None, :])
         depth = (error * sight[..., None, :]).sum(dim=-1).abs().mean(dim=-1)
         away = (mid_hips(true) - place).norm(dim=-1)

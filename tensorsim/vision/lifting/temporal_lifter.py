@@ -106,11 +106,13 @@ class TemporalLifter(nn.Module):
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
         self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
 
-    def seen_by(self, camera: CameraConfig) -> "TemporalLifter":
-        """The same, with the same network, for another camera."""
-        return TemporalLifter(
-            self.network, camera, tuple(self.heights.tolist()), self.keypoint_threshold, self.frames_per_block
-        ).to(self.heights.device)
+    def seen_by(
+        self, camera: CameraConfig, person_height_m: tuple[float, ...] | None = None
+    ) -> "TemporalLifter":
+        """The same, with the same network, for another camera and, unless None, other people."""
+        heights = tuple(self.heights.tolist()) if person_height_m is None else person_height_m
+        other = TemporalLifter(self.network, camera, heights, self.keypoint_threshold, self.frames_per_block)
+        return other.to(self.heights.device).train(self.training)
 
     def forward(
         self,
