@@ -26,6 +26,7 @@ from tensorsim.commands.simulate import Simulate
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
 
@@ -69,6 +70,7 @@ COMMANDS: dict[str, Any] = {
         {
             "detector": TrainDetector,
             "pose": TrainPose,
+            "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
         },
