@@ -5,7 +5,7 @@ import math
 import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
@@ -13,10 +13,13 @@ from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.errors import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
+    import torch
+
     from tensorsim.config import SimulationConfig
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.recognition import ActivityRecognizer
     from tensorsim.results import Pictures
+    from tensorsim.types import Pose, RadarMaps
 
 #: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
 FULL_RATE_PULSES = 1 << 17
@@ -154,6 +157,29 @@ class RadarOptions(PanelOptions):
             None if somebody else plot.person_peaks(simulator),
         )
 
+    def write_results(self, folder: Path, run: "Run", truth: "RadarMaps | None" = None) -> dict[str, Any]:
+        """Label the maps of a run and write them, the poses, their pictures and the sound.
+
+        Args:
+            folder: where to.
+            run: what was simulated.
+            truth: maps of the true motion, where it is known; drawn beside the others.
+
+        Returns:
+            What ``summary.json`` says of the label.
+        """
+        from tensorsim import results
+
+        pose, maps, stage = run.pose, run.maps, run.stage
+        label = results.label_of(run.recognizer, maps, pose.valid.shape[2] / run.fps, self.least_probability)
+        warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()))
+        pictures = self.pictures(stage, label["label"], run.film, run.somebody)
+        results.write_maps(folder, maps, results.axes_of(stage, maps), truth, pictures)
+        results.write_pose(folder, pose, run.fps, pictures)
+        if self.sound:
+            results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
+        return label
+
     def configuration(self) -> "SimulationConfig":
         """The configuration of the run: that of ``--config``, with the other options in place of its fields.
 
@@ -201,6 +227,31 @@ class RadarOptions(PanelOptions):
             )
         wall = chosen.wall if chosen.wall is not None else config.scene.wall
         return config.replace(scene__radar=chosen.radar, scene__wall=wall, scene__floor=chosen.floor)
+
+
+class Run(NamedTuple):
+    """What was simulated, and how.
+
+    Attributes:
+        config: of the run.
+        stage: made the maps.
+        recognizer: of the maps; None gives no label.
+        pose, maps: what came out, on the CPU; the maps without batch dimensions.
+        fps: frames per second of the poses.
+        film: what the people come from, for the titles.
+        somebody: whether a person is in the scene.
+        device: that ``stage`` is on.
+    """
+
+    config: "SimulationConfig"
+    stage: "PoseToDoppler"
+    recognizer: "ActivityRecognizer | None"
+    pose: "Pose"
+    maps: "RadarMaps"
+    fps: float
+    film: str
+    somebody: bool
+    device: "torch.device"
 
 
 def at_display_rate(config: "SimulationConfig", length_s: float) -> "SimulationConfig":

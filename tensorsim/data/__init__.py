@@ -1,4 +1,4 @@
-"""Films and motion files in, rendered people, films and sound out; labelled data sets out and in."""
+"""Reading of films, keypoints and motion capture; writing of films and sound; rendered people; labelled data sets."""
 
 from tensorsim.data.clip import Clip, read_video
 from tensorsim.data.coco import Keypoints2D, load_coco_keypoints

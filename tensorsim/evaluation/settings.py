@@ -64,8 +64,7 @@ def true_lifting(clip: Clip) -> Lifted:
     joints = clip.joints(FPS)
     view = project(joints)[2]
     pixels, reach = view.project(joints)
-    hips = 0.5 * (reach[..., 8] + reach[..., 11])
-    depth = (reach - hips[..., None]) / clip.height_m
+    depth = (reach - mid_hips(reach[..., None])) / clip.height_m
     scale = view.scale * clip.height_m / reach.mean(dim=-1)
     frames = len(joints)
     return Lifted(

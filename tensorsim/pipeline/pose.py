@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import coco_to_body
-from tensorsim.config import CameraConfig, SimulationConfig
-from tensorsim.errors import TensorsimError, check_positive, check_rank, check_size
+from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
+from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
 from tensorsim.pipeline.networks import pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
@@ -33,6 +33,7 @@ class VideoToPose(nn.Module):
         pose: crops -> heat maps, e.g. :class:`tensorsim.vision.HRNet`, which is asked about the mirror image as well;
             or a module (frames, boxes, valid) -> (key points, scores), e.g. :class:`tensorsim.vision.TopDownPose`.
         person_height_m: body heights in metres by person (order of appearance); the last one serves the rest.
+            Default 1.80 and 1.70.
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
         camera: where the camera stands and its focal length.
         keypoint_threshold: score from which a keypoint counts as seen.
@@ -40,19 +41,21 @@ class VideoToPose(nn.Module):
         fewest_joints: of the 14, in a frame that says anything of the pose.
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
-        tracker, lifter, metric_pose, smoother: replacements of the default stages.
+        tracker, lifter, metric_pose, smoother: replacements of the default stages. A ``metric_pose`` has heights,
+            distances and camera of its own.
         bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
             keypoints that are exact; None leaves it out.
 
     Raises:
-        TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1.
+        TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1; a ``metric_pose`` beside heights,
+            distances or a camera; parts that are not such stages.
     """
 
     def __init__(
         self,
         detector: nn.Module,
         pose: nn.Module,
-        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        person_height_m: tuple[float, ...] | None = None,
         initial_distance_m: tuple[float, ...] | None = None,
         camera: CameraConfig | None = None,
         keypoint_threshold: float = 0.3,
@@ -76,12 +79,20 @@ class VideoToPose(nn.Module):
         self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
-        self.lifter = check_part(NearestPoseLifter() if lifter is None else lifter, "lifter")
-        self.metric_pose = (
-            metric_pose
-            if metric_pose is not None
-            else MetricPose(camera, person_height_m, initial_distance_m, keypoint_threshold)
-        )
+        if lifter is None:
+            lifter = NearestPoseLifter(pitch_rad=0.0 if camera is None else camera.pitch_rad)
+        self.lifter = check_part(lifter, "lifter")
+        if metric_pose is None:
+            heights = PoseConfig().person_height_m if person_height_m is None else person_height_m
+            metric_pose = MetricPose(camera, heights, initial_distance_m, keypoint_threshold)
+        else:
+            ignored = {
+                "person_height_m": person_height_m,
+                "initial_distance_m": initial_distance_m,
+                "camera": camera,
+            }
+            check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
+        self.metric_pose = metric_pose
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.keypoint_threshold = keypoint_threshold

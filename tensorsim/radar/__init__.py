@@ -11,6 +11,7 @@ from tensorsim.radar.presets import (
     radar_scene,
     save_radar_yaml,
 )
+from tensorsim.radar.processing.ambiguity import gate_around
 from tensorsim.radar.processing.array import AngleMapper, AngleMaps, align_transmitters
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo, doppler_time_map
@@ -71,6 +72,7 @@ __all__ = [
     "TabulatedAntenna",
     "align_transmitters",
     "doppler_time_map",
+    "gate_around",
     "intermediate_frequency",
     "load_radar_yaml",
     "load_scene_yaml",

@@ -92,7 +92,8 @@ class RadarSimulator(nn.Module):
 
     Raises:
         TensorsimError: see the stages; a clip shorter than ``min_pulses``; motion that the PRF cannot follow
-            (eager only, like its warning; see :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
+            (eager only, like the warnings of targets beyond the range axis or a fixed gate; see
+            :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
     """
 
     def __init__(
@@ -114,7 +115,13 @@ class RadarSimulator(nn.Module):
             options["mti"] = mti
         scene, processing = configured(radar, wall, processing, options)
         ready: dict[str, nn.Module | None] = {"echo": echo, "doppler": doppler, "ridges": ridges}
-        refuse_conflicts(ready, options, wall, antenna, learnable)
+        ready["mti"] = mti if isinstance(mti, nn.Module) else None
+        given = {
+            *options,
+            *(["antenna"] if antenna is not None else []),
+            *(["learnable"] if learnable else []),
+        }
+        refuse_conflicts(ready, scene, processing, given)
         radar = scene.radar
         if radar.has_array:
             raise TensorsimError(
@@ -131,12 +138,14 @@ class RadarSimulator(nn.Module):
             transmit_power_w=scene.transmit_power_w,
         )
         gate_m = processing.range_gate_m
-        fixed = None if isinstance(gate_m, float | int) else gate_m
-        self.range_profile = RangeProfile(radar, processing.range_window, fixed)
+        self.fixed_gate_m = None if isinstance(gate_m, float | int) else gate_m
+        self.range_profile = RangeProfile(radar, processing.range_window, self.fixed_gate_m)
         total = scene.noise_reference == "total"
         self.engine: nn.Module = TimeEngine(self.echo, self.range_profile, total)
         if processing.engine == "range-bins":
-            bins = RangeBinSynthesizer(self.echo, self.range_profile, processing.near_bins)
+            bins = RangeBinSynthesizer(
+                self.echo, self.range_profile, processing.near_bins, processing.energy_stride
+            )
             self.engine = RangeBinEngine(bins, total)
         self.profile_noise = ProfileNoise(self.range_profile.window)
         self.gate: nn.Module | None = None
@@ -209,7 +218,7 @@ class RadarSimulator(nn.Module):
         rcs = check_scene(positions, rcs)
         self._check_pulses(positions.shape[-3])
         if not torch.jit.is_scripting() and not is_exporting():
-            check_unambiguous(positions, rcs, self.radar)
+            check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m)
         return flatten_batch(positions, 3), flatten_batch(rcs, 2)
 
     def _span(self, positions: Tensor) -> int:
@@ -235,7 +244,7 @@ class RadarSimulator(nn.Module):
                 "whole clip"
             )
         self._check_pulses(pulses)
-        speeds = SpeedCheck(self.radar)
+        speeds = SpeedCheck(self.radar, self.fixed_gate_m)
         signal = torch.zeros(1, dtype=torch.float64)
         for positions, rcs in self._pieces(source, pulses):
             speeds.add(positions, rcs)

@@ -88,6 +88,19 @@ class MovingTargetIndicator(nn.Module):
             raise TensorsimError(f"method: got {method!r}, expected one of {METHODS}")
         if method == "n-pulse" and pulses < 2:
             raise TensorsimError(f"pulses: got {pulses}, expected at least 2")
+        unused = [
+            name
+            for name, differs, used_by in (
+                ("pulses", pulses != 3, "n-pulse"),
+                ("cutoff_m_s", cutoff_m_s != 0.2, "high-pass"),
+                ("order", order != 4, "high-pass"),
+            )
+            if differs and method != used_by
+        ]
+        if unused:
+            raise TensorsimError(
+                f"{', '.join(unused)}: got a value, which the method {method!r} does not use"
+            )
         self.method = method
         self.lost_pulses = {"two-pulse": 1, "n-pulse": pulses - 1}.get(method, 0)
         self.delay_pulses = self.lost_pulses / 2
