@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from tensorsim.config import SimulationConfig
+from tensorsim.config.scene import Body
 from tensorsim.data.sets import outputs
 from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.outputs import OutputConfig, Stored
