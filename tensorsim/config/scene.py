@@ -1,10 +1,11 @@
-"""What the radar looks at: the radar itself, wall, floor, propagation paths, scatterers of the body, noise."""
+"""What the radar looks at: the radar itself, wall, floor, propagation paths, scatterers of the body, receiver."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
 from tensorsim.config.checks import is_finite, require_choices, require_positive
 from tensorsim.config.radar import RadarConfig
+from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.limits import check_range
@@ -39,6 +40,9 @@ class SceneConfig:
             (``"surface"``, :class:`tensorsim.motion.BodyScatterers`).
         sway: people sway while they stand, see :class:`tensorsim.motion.PosturalSway`.
         vital_signs: people breathe and their hearts beat, see :class:`tensorsim.motion.VitalSigns`.
+        clutter: furniture and walls of a room; None is an empty one.
+        interference: another radar that is heard; None is none.
+        receiver: imperfections of the receiver.
         snr_db: signal-to-noise ratio per IF sample in dB (panel: SNR, 50 dB); None is free of noise.
         noise_reference: signal power that ``snr_db`` refers to, see :class:`tensorsim.radar.ReceiverNoise`.
         noise_figure_db: noise figure of the receiver for ``noise_reference="absolute"``.
@@ -64,15 +68,25 @@ class SceneConfig:
     body: Body = "joints"
     sway: bool = False
     vital_signs: bool = False
+    clutter: ClutterConfig | None = None
+    interference: InterferenceConfig | None = None
+    receiver: ReceiverConfig = field(default_factory=ReceiverConfig)
     snr_db: float | None = 50.0
     noise_reference: NoiseReference = "echo"
     noise_figure_db: float = 10.0
     transmit_power_w: float = 0.01
 
     def __post_init__(self) -> None:
-        for name, kind in (("radar", RadarConfig), ("wall", WallConfig), ("floor", FloorConfig)):
+        for name, kind in (
+            ("radar", RadarConfig),
+            ("wall", WallConfig),
+            ("floor", FloorConfig),
+            ("clutter", ClutterConfig),
+            ("interference", InterferenceConfig),
+            ("receiver", ReceiverConfig),
+        ):
             part = getattr(self, name)
-            if not (isinstance(part, kind) or (part is None and name != "radar")):
+            if not (isinstance(part, kind) or (part is None and name not in ("radar", "receiver"))):
                 raise TensorsimError(f"SceneConfig.{name}: got {part!r}, expected a {kind.__name__}")
         require_choices(
             self,
@@ -104,3 +118,19 @@ class SceneConfig:
         if self.multipath is None:
             return self.wall is not None and self.paths is None
         return self.multipath
+
+    @property
+    def sampled_effects(self) -> tuple[str, ...]:
+        """Names of the effects that act on samples of the intermediate frequency."""
+        return self.receiver.effects + ("interference",) * (self.interference is not None)
+
+    def check_engine(self, engine: str) -> None:
+        """Refuse the engine ``"range-bins"``, which computes no samples, for effects that act on them.
+
+        Raises:
+            TensorsimError: such a combination.
+        """
+        if engine != "time" and self.sampled_effects:
+            raise TensorsimError(
+                f"engine: got {engine!r} with {', '.join(self.sampled_effects)}, which act on samples; expected 'time'"
+            )

@@ -7,6 +7,7 @@ from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
@@ -30,6 +31,7 @@ __all__ = [
     "NearestPoseLifter",
     "OnnxHeatmaps",
     "RTMDet",
+    "TemporalLifter",
     "TopDownPose",
     "VideoPose3D",
     "coco_to_body",

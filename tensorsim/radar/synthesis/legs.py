@@ -66,13 +66,15 @@ def mirror_image(position: Tensor, face_y: float) -> Tensor:
 def mirror_delays(
     positions: Tensor, tx_m: Tensor, rx_m: Tensor, face_y: float, speed_m_s: float = SPEED_OF_LIGHT_M_S
 ) -> Tensor:
-    """Mirror method: delays (..., 3) of the echoes of a target in front of a wall that the wall reflects.
+    r"""Mirror method: delays (..., 3) of the echoes of a target in front of a wall that the wall reflects.
 
-    With the images Tx' and Rx' of the antennas in the wall face (see :func:`mirror_image`)::
+    With the images $T'$ and $R'$ of the antennas $T$ and $R$ in the wall face (see :func:`mirror_image`):
 
-        tau_a = (|P - Tx'| + |P - Rx|) / c     reflected on the way to the target; amplitude times G
-        tau_b = (|P - Tx| + |P - Rx'|) / c     reflected on the way back;          amplitude times G
-        tau_c = (|P - Tx'| + |P - Rx'|) / c    reflected on both;                  amplitude times G^2
+    $$ \tau_a = \frac{|P - T'| + |P - R|}{c}, \quad \tau_b = \frac{|P - T| + |P - R'|}{c}, \quad
+    \tau_c = \frac{|P - T'| + |P - R'|}{c} $$
+
+    Path a is reflected on the way to the target, b on the way back, c on both. The amplitudes of a and b have the
+    factor $\Gamma$ of the wall face, that of c has $\Gamma^2$.
 
     Args:
         positions: (..., 3) metres, in front of the face.

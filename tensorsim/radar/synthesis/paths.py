@@ -64,16 +64,17 @@ def radar_equation_amplitude(
     tx_gain: float = 1.0,
     rx_gain: float = 1.0,
 ) -> Tensor:
-    """Bistatic radar equation: amplitude of the echo of a scatterer for unit transmit power.
+    r"""Bistatic radar equation: amplitude of the echo of a scatterer for unit transmit power.
 
-    ``a = sqrt(Gt Gr lambda^2 sigma / ((4 pi)^3 R1^2 R2^2))`` (Richards, *Fundamentals of Radar Signal Processing*,
-    ch. 2).
+    $$ a = \sqrt{\frac{G_t G_r \lambda^2 \sigma}{(4 \pi)^3 R_1^2 R_2^2}} $$
+
+    (Richards, *Fundamentals of Radar Signal Processing*, ch. 2).
 
     Args:
-        rcs_m2: (...) radar cross section sigma.
-        tx_range_m, rx_range_m: (...) lengths R1 and R2 of the two legs of the path.
-        wavelength_m: lambda, ``c / fc``.
-        tx_gain, rx_gain: Gt and Gr, linear power gains.
+        rcs_m2: (...) radar cross section $\sigma$.
+        tx_range_m, rx_range_m: (...) lengths $R_1$ and $R_2$ of the two legs of the path.
+        wavelength_m: $\lambda = c / f_c$.
+        tx_gain, rx_gain: $G_t$ and $G_r$, linear power gains.
 
     Returns:
         (...) real. Differentiable; the gradient by an RCS of 0 is 0.
