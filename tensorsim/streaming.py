@@ -9,6 +9,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, camera_config
+from tensorsim.vision.smoothing.even_time import to_even_time
 
 
 def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
@@ -33,7 +34,8 @@ def pose_of_film(
         calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
 
     Returns:
-        The Pose of one clip (B = 1) on the CPU; equal to ``stage(video, fps)`` of the whole film.
+        The Pose of one clip (B = 1) on the CPU, at ``reader.fps`` frames per second; equal to ``stage(video, fps)`` of
+        the whole film, or ``stage(video, fps, times_s=...)`` where its frames are at uneven times.
 
     Raises:
         TensorsimError: the film has fewer than 2 frames.
@@ -42,6 +44,9 @@ def pose_of_film(
     tracks = stage.follow(detections, observed)
     keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet)
     size = reader.height, reader.width
+    if reader.uneven_times_s is not None:
+        times_s = reader.uneven_times_s[None]
+        tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, reader.fps)
     if calibrate:
         stage, _ = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
     pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)

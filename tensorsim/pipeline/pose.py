@@ -16,6 +16,7 @@ from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.smoothing.along_time import brief_gaps
+from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
@@ -175,16 +176,20 @@ class VideoToPose(nn.Module):
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
-    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Pose:
+    def forward(
+        self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
+    ) -> Pose:
         """Estimate the people of whole clips.
 
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
             lengths: (B,) frames of each clip when the shorter ones are padded; None takes all T.
+            times_s: (B, T) seconds, increasing, of frames that are not evenly spaced: the people are interpolated to
+                ``fps`` frames per second, see :func:`~tensorsim.vision.smoothing.even_time.to_even_time`. None: even.
 
         Raises:
-            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive.
+            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive, times that do not increase.
         """
         check_rank(video, 5, "video", "(B, T, 3, H, W)")
         check_size(video, 2, 3, "video", "(B, T, 3, H, W)")
@@ -207,6 +212,8 @@ class VideoToPose(nn.Module):
         keypoints, scores = self.estimate(frames, boxes, valid)
         keypoints = keypoints.reshape(b, t, people, 17, 2).transpose(1, 2)
         scores = scores.reshape(b, t, people, 17).transpose(1, 2)
+        if times_s is not None:
+            tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, fps)
         return self.lift(tracks, keypoints, scores, height, width, fps)
 
     def frames_present(self, clips: int, frames: int, lengths: Tensor | None, device: torch.device) -> Tensor:
