@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import tyro
 
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
+from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
 from tensorsim.errors import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ FULL_RATE_PULSES = 1 << 17
 DISPLAY_RATE_HZ = 256.0
 
 #: The field of the configuration that an option sets.
-FIELDS = {
+FIELDS: dict[str, str] = {
     "body": "scene__body",
     "integration": "processing__integration",
     "wall_paths": "scene__wall_paths",
@@ -36,7 +37,8 @@ FIELDS = {
     "classifier": "classifier",
     "seed": "seed",
     "people": "pose__people",
-} | PANEL_FIELDS
+}
+FIELDS |= PANEL_FIELDS | RECEIVER_FIELDS
 
 
 def check_seed(seed: int, option: str = "--seed") -> None:
@@ -46,7 +48,7 @@ def check_seed(seed: int, option: str = "--seed") -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RadarOptions(PanelOptions):
+class RadarOptions(PanelOptions, ReceiverOptions):
     """How people's joints become maps. Options without a value keep that of the configuration."""
 
     config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None
@@ -86,7 +88,8 @@ class RadarOptions(PanelOptions):
     snr: float | None = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
     denoiser: str | None = None
-    """DnCNN weights (.pth or .safetensors, or a name such as dncnn-radar-maps) to clean the shown maps."""
+    """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
+    .safetensors or a name of `tensorsim models list`). Default: none."""
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
@@ -198,6 +201,7 @@ class RadarOptions(PanelOptions):
         for switch in ("leakage", "wall_echo", "sway", "vital_signs"):
             if getattr(self, switch):
                 config = config.replace(**{f"scene__{switch}": True})
+        config = self.with_receiver(config)
         for option, field in FIELDS.items():
             value = getattr(self, option)
             if value is not None:
@@ -220,11 +224,6 @@ class RadarOptions(PanelOptions):
             chosen = radar_scene(self.radar)
         except TensorsimError as error:
             raise TensorsimError(f"--radar: {error}") from None
-        if chosen.radar.has_array:
-            raise TensorsimError(
-                f"--radar: {self.radar} has several antennas, expected one transmitter and one receiver: the maps "
-                "of this command have no antenna dimension"
-            )
         wall = chosen.wall if chosen.wall is not None else config.scene.wall
         return config.replace(scene__radar=chosen.radar, scene__wall=wall, scene__floor=chosen.floor)
 

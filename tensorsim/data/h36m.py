@@ -98,24 +98,33 @@ class _ArraysOnly(pickle.Unpickler):
         raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}, expected arrays only")
 
 
-def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) -> Motion:
-    """The clip ``key`` ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+def clips_of_h36m(path: Path, arrays: Arrays) -> dict[str, Any]:
+    """The arrays of VideoPose3D's ``data_3d_h36m.npz`` by subject and action ("S1/Walking").
 
     Raises:
-        TensorsimError: a pickle that holds anything but dictionaries of arrays, no such clip.
+        TensorsimError: a pickle that holds anything but dictionaries of arrays.
     """
     data = arrays.pickled("positions_3d")
     try:
         file = io.BytesIO(data)
         check_pickle_memo(file)
         subjects = _ArraysOnly(file, encoding="latin1").load().item()
-        clips = {
+        return {
             f"{subject}/{action}": clip for subject in subjects for action, clip in subjects[subject].items()
         }
     except TensorsimError:
         raise
     except (AttributeError, EOFError, IndexError, TypeError, ValueError) as error:
         raise TensorsimError(f"{path}: got positions_3d that hold no dictionary ({error})") from error
+
+
+def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) -> Motion:
+    """The clip ``key`` ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+
+    Raises:
+        TensorsimError: a pickle that holds anything but dictionaries of arrays, no such clip.
+    """
+    clips = clips_of_h36m(path, arrays)
     if key is None and len(clips) == 1:
         key = next(iter(clips))
     if key not in clips:

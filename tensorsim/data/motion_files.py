@@ -11,7 +11,7 @@ import torch.nn.functional as F
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.data.bvh import read_bvh
-from tensorsim.data.h36m import read_h36m
+from tensorsim.data.h36m import clips_of_h36m, read_h36m
 from tensorsim.data.npz import motions_in, open_npz, preferred, read_npz
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError, check_positive, check_tensor
@@ -35,6 +35,21 @@ def motion_keys(path: str | os.PathLike[str]) -> list[str | None]:
             return [None]
         motions = motions_in(arrays)
         return [None] if preferred(motions) is not None else [*motions] or [None]
+
+
+def h36m_keys(path: str | os.PathLike[str]) -> list[str]:
+    """The clips ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+
+    Raises:
+        TensorsimError: no such file, or another one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise TensorsimError(f"{path}: no such file, expected data_3d_h36m.npz")
+    with open_npz(path) as arrays:
+        if "positions_3d" not in arrays.files:
+            raise TensorsimError(f"{path}: got no positions_3d, expected Human3.6M of VideoPose3D")
+        return list(clips_of_h36m(path, arrays))
 
 
 def load_motion(

@@ -185,6 +185,7 @@ class DopplerTimeMap(DopplerFrames):
             )
         self.integration = integration
         self.samples = radar.samples_per_chirp
+        self.gated = gate_m is not None
         self.first_bin, self.last_bin = 0, self.samples - 1
         if gate_m is not None:
             self.first_bin, self.last_bin = gate_bins(gate_m, radar.range_resolution_m, self.samples)
@@ -197,7 +198,9 @@ class DopplerTimeMap(DopplerFrames):
                 f"profiles: got shape {list(profiles.shape)}, expected more than the {self.first_bin} range bins "
                 f"before the gate"
             )
-        series = self.series(profiles[..., self.first_bin : self.last_bin + 1])  # (B, R, M)
+        if self.gated:
+            profiles = profiles[..., self.first_bin : self.last_bin + 1]
+        series = self.series(profiles)  # (B, R, M)
         if self.integration == "paper":
             series = series.abs().sum(1, keepdim=True)
         elif self.integration == "coherent":
