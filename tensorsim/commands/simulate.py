@@ -39,6 +39,7 @@ _MEANT_FOR = {
     "calibrate": ("video",),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
+    "lifter": ("video", "keypoints"),
     "library": ("video", "keypoints"),
     "image_size": ("keypoints",),
     "clip": ("motion",),
@@ -70,8 +71,11 @@ class Simulate(NetworkOptions, RadarOptions):
     """Estimate tilt, height and field of view of the camera from the people of the film."""
     position: Literal["camera", "paper"] | None = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
+    lifter: Literal["temporal", "nearest"] | None = None
+    """How key points become 3D: by a network that sees a window of time, or from the nearest poses of a library.
+    Default: nearest."""
     library: Path | None = None
-    """Pool of poses for the lifting to 3D, as `tensorsim library build` writes it. Default: the shipped one."""
+    """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -137,6 +141,7 @@ class Simulate(NetworkOptions, RadarOptions):
             ("pose__initial_distance_m", self.initial_distance),
             ("pose__camera__horizontal_fov_rad", camera_fov),
             ("pose__position", self.position),
+            ("pose__lifter", self.lifter if self.library is None or self.lifter is not None else "nearest"),
             ("pose__library", None if self.library is None else str(self.library)),
         ):
             if value is not None:

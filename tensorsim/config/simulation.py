@@ -99,6 +99,7 @@ class SimulationConfig:
             processing__integration="paper",
             tracking__measurement_noise=0.01,
             pose__position="paper",
+            pose__lifter="nearest",
             pose__neighbours=1,
             pose__temporal=0.0,
             pose__initial_distance_m=base.pose.initial_distance_m or PANEL_DISTANCES_M,

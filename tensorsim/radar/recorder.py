@@ -58,7 +58,7 @@ class Recorder(nn.Module):
             clutter = RoomClutter(scene.clutter.reflectors, jitter_m=scene.clutter.jitter_m, seed=seed)
         self.engine: nn.Module = TimeEngine(echo, profile, total, clutter)
         if processing.engine == "range-bins":
-            bins = RangeBinSynthesizer(echo, profile, processing.near_bins)
+            bins = RangeBinSynthesizer(echo, profile, processing.near_bins, processing.energy_stride)
             self.engine = RangeBinEngine(bins, total, clutter)
         self.front_end: nn.Module | None = None
         if scene.sampled_effects:

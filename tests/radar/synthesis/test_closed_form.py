@@ -186,6 +186,18 @@ def test_energy_is_that_of_the_samples(paths):
             assert reference.relative(energy, expected[total]) < error
 
 
+def test_energy_of_every_nth_pulse_stands_for_those_up_to_the_next():
+    p, rcs = tensors(swinging(20, 3, 8192.0), np.linspace(0.1, 1, 3))
+    exact, sparse = synthesizer(FREE), synthesizer(FREE)
+    sparse.energy_stride = 6
+    tones = exact.tones(p, rcs.expand(20, 3))
+    every = exact.energy(*tones, False)[[0] * 6 + [6] * 6 + [12] * 6 + [18] * 2]
+    assert torch.equal(sparse.energy(*tones, False), every)
+    assert torch.equal(torch.jit.script(sparse).energy(*tones, False), every)
+    with pytest.raises(TensorsimError, match="energy_stride: got 0"):
+        RangeBinSynthesizer(exact.echo, exact.profile, energy_stride=0)
+
+
 def test_refuses_bad_settings():
     with pytest.raises(TensorsimError, match="near_bins: got 0"):
         synthesizer(FREE, near_bins=0)
