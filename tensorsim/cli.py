@@ -21,9 +21,11 @@ from tensorsim.commands.evaluate_lifter import EvaluateLifter
 from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
+from tensorsim.commands.experiment import RunExperiment
 from tensorsim.commands.library import BuildLibrary
 from tensorsim.commands.models import FetchModels, ListModels, VerifyModels
 from tensorsim.commands.simulate import Simulate
+from tensorsim.commands.train_acf import TrainAcf
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
@@ -41,6 +43,7 @@ examples:
   tensorsim simulate walk.bvh --out out/ --initial-distance 4
   tensorsim demo --activity kicking --out demo/
   tensorsim evaluate truth --out truth/ --clips 2
+  tensorsim experiment networks --out networks/ --quick
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
   tensorsim dataset example > recipe.yaml
   tensorsim dataset build recipe.yaml --out data/ --workers 2
@@ -75,12 +78,14 @@ COMMANDS: dict[str, Any] = {
             "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
+            "acf": TrainAcf,
         },
     ),
     "dataset": (
         "Labelled data sets of radar maps from a recipe.",
         {"build": DatasetBuild, "example": DatasetExample, "sample": DatasetSample},
     ),
+    "experiment": RunExperiment,
     "library": ("Pools of poses for nearest-match lifting.", {"build": BuildLibrary}),
     "models": (
         "Weights by name: shipped ones and published ones.",

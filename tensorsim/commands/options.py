@@ -88,7 +88,8 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     snr: float | None = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
     denoiser: str | None = None
-    """DnCNN weights (.pth or .safetensors, or a name such as dncnn-radar-maps) to clean the shown maps."""
+    """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
+    .safetensors or a name of `tensorsim models list`). Default: none."""
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""

@@ -30,6 +30,7 @@ class SceneConfig:
         leakage: direct signal from transmitter to receiver (panel: isolation).
         wall_echo: static specular reflection of the wall.
         wall_paths: bounces inside the wall, complete to first order (``"series"``) or as in the paper.
+        wall_attenuation: False lets echoes through the wall keep their power; their delay stays.
         incidence: ``"normal"``, ``"oblique"`` (refraction, Fresnel) or ``"airy"`` (closed slab per frequency).
         polarization: ``"te"`` or ``"tm"`` at the wall.
         bounces: largest number of pairs of bounces inside the wall on each leg.
@@ -59,6 +60,7 @@ class SceneConfig:
     leakage: bool = False
     wall_echo: bool = False
     wall_paths: WallPaths = "series"
+    wall_attenuation: bool = True
     incidence: Incidence = "normal"
     polarization: Polarization = "te"
     bounces: int = 1
@@ -100,6 +102,8 @@ class SceneConfig:
             raise TensorsimError(
                 f"SceneConfig.paths: got names of paths and {', '.join(switched)}, expected one or the other"
             )
+        if not self.wall_attenuation and self.wall is None:
+            raise TensorsimError("SceneConfig.wall_attenuation: got False without a wall, expected a wall")
         if self.bounces < 0:
             raise TensorsimError(f"SceneConfig.bounces: got {self.bounces}, expected at least 0")
         if self.snr_db is not None and not is_finite(self.snr_db):

@@ -58,11 +58,12 @@ class Recorder(nn.Module):
             clutter = RoomClutter(scene.clutter.reflectors, jitter_m=scene.clutter.jitter_m, seed=seed)
         self.engine: nn.Module = TimeEngine(echo, profile, total, clutter)
         if processing.engine == "range-bins":
-            bins = RangeBinSynthesizer(echo, profile, processing.near_bins)
+            bins = RangeBinSynthesizer(echo, profile, processing.near_bins, processing.energy_stride)
             self.engine = RangeBinEngine(bins, total, clutter)
         self.front_end: nn.Module | None = None
         if scene.sampled_effects:
             self.front_end = FrontEnd(scene, self.noise, seed)
+        self.echo = echo
         self.profile, self.profile_noise = profile, ProfileNoise(profile.window)
         self.samples, self.pulse_chunk = echo.samples, processing.pulse_chunk
         self.channels = len(radar.tx_positions_m) * len(radar.rx_positions_m)
@@ -71,12 +72,14 @@ class Recorder(nn.Module):
     def echoes(self, positions: Tensor, rcs: Tensor, span: int) -> tuple[list[Tensor], Levels]:
         """Profiles free of noise, ``span`` pulses in each (none with a front end), and the levels of the clips."""
         pulses = positions.shape[1]
+        ahead = self.echo.displacements(positions)
         pieces: list[Tensor] = []
         nothing = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
         levels = Levels(nothing, nothing)
         for start in range(0, pulses, span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            profiles, energies = self.survey(points, sections, start)
+            way = None if ahead is None else ahead[:, start : start + span]
+            profiles, energies = self.survey(points, sections, start, way)
             if self.front_end is None:
                 pieces.append(profiles)
             levels = self.add(levels, energies, pulses)
@@ -88,8 +91,12 @@ class Recorder(nn.Module):
         signal = levels.signal + energies.signal.to(levels.signal) / samples
         return Levels(signal, levels.arriving + energies.arriving.to(levels.arriving) / samples)
 
-    def survey(self, positions: Tensor, rcs: Tensor, first: int) -> tuple[Tensor, Levels]:
+    def survey(
+        self, positions: Tensor, rcs: Tensor, first: int, ahead: Tensor | None
+    ) -> tuple[Tensor, Levels]:
         """Profiles free of noise, stored with time running fastest, and energies (B,), of pulses ``first`` onwards.
+
+        ``ahead`` (B, m, S, 3): see :mod:`~tensorsim.radar.synthesis.engines`.
 
         With a front end the profiles are empty: what it records depends on the levels of the whole clip.
         """
@@ -99,20 +106,27 @@ class Recorder(nn.Module):
         step = self.step(positions)
         for start in range(0, positions.shape[1], step):
             points, sections = positions[:, start : start + step], rcs[:, start : start + step]
+            way = None if ahead is None else ahead[:, start : start + step]
             if self.front_end is not None:
-                samples, reference = self.engine.samples(points, sections, first + start)
+                samples, reference = self.engine.samples(points, sections, first + start, way)
                 heard = energy(self.front_end.arriving(samples, first + start))
                 arriving = arriving + heard.reshape([heard.shape[0], -1]).mean(-1)
                 chunks.append(samples.new_zeros([samples.shape[0], 0, 0]))
             else:
-                profiles, reference = self.engine(points, sections, first + start)
+                profiles, reference = self.engine(points, sections, first + start, way)
                 chunks.append(profiles.transpose(1, 2))
             # Without noise the ratio is infinite, and no gradient goes through it.
             signal = signal + (reference if self.needs_levels else reference.detach())
         return torch.cat(chunks, -1).transpose(1, 2), Levels(signal, arriving)
 
     def received(
-        self, positions: Tensor, rcs: Tensor, first: int, levels: Levels, echoes: list[Tensor]
+        self,
+        positions: Tensor,
+        rcs: Tensor,
+        first: int,
+        ahead: Tensor | None,
+        levels: Levels,
+        echoes: list[Tensor],
     ) -> tuple[Tensor, Tensor]:
         """Profiles of pulses ``first`` onwards with all that the receiver adds, and the energy (B,) of its noise.
 
@@ -124,12 +138,13 @@ class Recorder(nn.Module):
             step = self.step(positions)
             for start in range(0, positions.shape[1], step):
                 points, sections = positions[:, start : start + step], rcs[:, start : start + step]
-                samples, _ = self.engine.samples(points, sections, first + start)
+                way = None if ahead is None else ahead[:, start : start + step]
+                samples, _ = self.engine.samples(points, sections, first + start, way)
                 samples, drawn = self.front_end(samples, levels, first + start)
                 chunks.append(channels_as_bins(self.profile(samples)).transpose(1, 2))
                 energies = energies + drawn
             return torch.cat(chunks, -1).transpose(1, 2), energies
-        clean = echoes.pop(0) if len(echoes) > 0 else self.survey(positions, rcs, first)[0]
+        clean = echoes.pop(0) if len(echoes) > 0 else self.survey(positions, rcs, first, ahead)[0]
         if self.noise.noiseless:
             return clean, torch.zeros_like(levels.signal)
         # Every antenna has noise of its own.

@@ -167,10 +167,11 @@ class RadarSimulator(nn.Module):
         range_time: list[Tensor] = []
         range_time_mti: list[Tensor] = []
         doppler_times: list[Tensor] = []
-        span = self._span(positions)
+        ahead, span = self.echo.displacements(positions), self._span(positions)
         for start in range(0, pulses, span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            fresh, noise_energy = self.recorder.received(points, sections, start, levels, echoes)
+            way = None if ahead is None else ahead[:, start : start + span]
+            fresh, noise_energy = self.recorder.received(points, sections, start, way, levels, echoes)
             piece = self._piece(fresh, points, sections, pending)
             range_time.append(self._shown(piece.profiles))
             range_time_mti.append(self._shown(piece.moving))
@@ -178,7 +179,9 @@ class RadarSimulator(nn.Module):
             pending, noise = piece.pending, noise + noise_energy
         doppler_time = torch.cat(doppler_times, -1)
         ridges = self.ridges(doppler_time)
-        snr_db = decibels(levels.signal, noise / (pulses * self.echo.samples)).to(doppler_time.dtype)
+        # Without noise the ratio is infinite, and no gradient goes through it.
+        signal = levels.signal.detach() if self.recorder.noise.noiseless else levels.signal
+        snr_db = decibels(signal, noise / (pulses * self.echo.samples)).to(doppler_time.dtype)
         return RadarMaps(
             unflatten_batch(block_rms(torch.cat(range_time, -1), self.range_time_block), lead),
             unflatten_batch(block_rms(torch.cat(range_time_mti, -1), self.range_time_block), lead),
@@ -196,10 +199,11 @@ class RadarSimulator(nn.Module):
         echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
         pending = self._nothing_pending(positions)
         parts: list[Tensor] = []
-        span = self._span(positions)
+        ahead, span = self.echo.displacements(positions), self._span(positions)
         for start in range(0, positions.shape[1], span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            fresh, _ = self.recorder.received(points, sections, start, levels, echoes)
+            way = None if ahead is None else ahead[:, start : start + span]
+            fresh, _ = self.recorder.received(points, sections, start, way, levels, echoes)
             piece = self._piece(fresh, points, sections, pending)
             parts.append(piece.doppler_time)
             pending = piece.pending
@@ -216,10 +220,11 @@ class RadarSimulator(nn.Module):
         positions, rcs = self._scene(positions, rcs)
         echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
         parts: list[Tensor] = []
-        span = self._span(positions)
+        ahead, span = self.echo.displacements(positions), self._span(positions)
         for start in range(0, positions.shape[1], span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            parts.append(self.recorder.received(points, sections, start, levels, echoes)[0])
+            way = None if ahead is None else ahead[:, start : start + span]
+            parts.append(self.recorder.received(points, sections, start, way, levels, echoes)[0])
         profiles = torch.cat(parts, 1)
         if self.has_array:
             profiles = profiles.unflatten(-1, [self.channels, -1]).transpose(1, 2)
@@ -258,10 +263,11 @@ class RadarSimulator(nn.Module):
         self._check_pulses(pulses)
         speeds = SpeedCheck(self.radar, self.fixed_gate_m)
         levels = Levels(torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
-        for start, positions, rcs in self._pieces(source, pulses):
+        for start, positions, rcs, ahead in self._pieces(source, pulses):
             speeds.add(positions, rcs)
             if self.recorder.needs_levels:
-                levels = self.recorder.add(levels, self.recorder.survey(positions, rcs, start)[1], pulses)
+                energies = self.recorder.survey(positions, rcs, start, ahead)[1]
+                levels = self.recorder.add(levels, energies, pulses)
         speeds.judge()
 
         seen = pulses - self.mti.lost_pulses
@@ -272,10 +278,10 @@ class RadarSimulator(nn.Module):
         peak_bins, peak_magnitudes = Columns(doppler_time.total), Columns(doppler_time.total)
         pending: list[Pending] = []
         noise = torch.zeros_like(levels.signal)
-        for start, positions, rcs in self._pieces(source, pulses):
+        for start, positions, rcs, ahead in self._pieces(source, pulses):
             before = pending[0] if pending else self._nothing_pending(positions)
             there = Levels(levels.signal.to(positions.device), levels.arriving.to(positions.device))
-            fresh, noise_energy = self.recorder.received(positions, rcs, start, there, [])
+            fresh, noise_energy = self.recorder.received(positions, rcs, start, ahead, there, [])
             piece = self._piece(fresh, positions, rcs, before)
             pending, noise = [piece.pending], noise + noise_energy.to(noise)
             range_time.push(self._shown(piece.profiles)[0])
@@ -295,21 +301,26 @@ class RadarSimulator(nn.Module):
             decibels(levels.signal, noise / (pulses * self.echo.samples))[0].to(whole),
         )
 
-    def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Pieces of a source, checked: number of the first pulse, positions (1, m, S, 3) and RCS (1, m, S).
+    def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
+        """Pieces of a source, checked: number of the first pulse, positions (1, m, S, 3), RCS (1, m, S), way ahead.
 
-        All but the last are a multiple of ``pulse_chunk`` long.
+        All but the last are a multiple of ``pulse_chunk`` long. The way until the next pulse (1, m, S, 3) is for
+        transmitters in turn, else None; for it the source is asked for one pulse more.
         """
         span = max(self.piece_chunks * self.recorder.pulse_chunk, self.mti.lost_pulses + 1)
         for start in range(0, pulses, span):
-            stop = min(start + span, pulses)
+            own = min(span, pulses - start)
+            stop = min(start + own + (self.echo.paths.transmitters > 1), pulses)
             positions, rcs = source(start, stop)
             if positions.dim() != 3 or positions.shape[0] != stop - start:
                 raise TensorsimError(
                     f"source({start}, {stop}): got positions of shape {list(positions.shape)}, expected "
                     f"({stop - start}, scatterers, 3)"
                 )
-            yield start, positions.unsqueeze(0), check_scene(positions, rcs).unsqueeze(0)
+            rcs = check_scene(positions, rcs)
+            ahead = self.echo.displacements(positions)
+            ahead = None if ahead is None else ahead[None, :own]
+            yield start, positions[None, :own], rcs[None, :own], ahead
 
     def _check_pulses(self, pulses: int) -> None:
         if pulses < self.min_pulses:

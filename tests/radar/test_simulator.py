@@ -13,6 +13,7 @@ from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around,
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.range_profile import FollowingGate
 from tensorsim.radar.processing.ridges import RidgeExtractor
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
@@ -275,6 +276,17 @@ def test_following_gate_follows():
     assert abs(center[-1] - center[0]) > 0.3  # else nothing was followed
     nobody = simulator(p, torch.zeros(6, dtype=torch.float64))
     assert float(nobody.range_time_mti.abs().max()) == 0
+
+
+def test_pulses_without_anybody_are_not_gated():
+    """The gate is closed where somebody is; before that, and after, all bins stay."""
+    gate = FollowingGate(SMALL, 0.375 * torch.arange(12), 0.8)
+    profiles = torch.ones(3, 12, dtype=torch.complex64)
+    positions = torch.tensor([0.0, 2.0, 1.5]).expand(3, 2, 3)
+    rcs = torch.tensor([[0.0, 0.0], [1.0, 0.5], [0.0, 0.0]])
+    kept = gate(profiles, positions, rcs).real
+    assert kept[0].tolist() == kept[2].tolist() == [1.0] * 12
+    assert torch.nonzero(kept[1])[:, 0].tolist() == [5, 6]  # 1.88 and 2.25 m
 
 
 def test_block_rms():

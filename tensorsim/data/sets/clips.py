@@ -1,6 +1,5 @@
 """What a source of a data set offers: labelled clips of people."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -38,7 +37,7 @@ class ClipSource(Protocol):
     """Labelled clips, and the people in them."""
 
     #: Names of the classes in their order.
-    labels: Sequence[str]
+    labels: tuple[str, ...]
     #: Whether networks have to find people in films, which :meth:`prepare` does.
     finds_people: bool
 

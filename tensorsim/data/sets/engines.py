@@ -1,6 +1,7 @@
 """Ways to run the work: in this process, in several, or on the nodes of a Ray cluster."""
 
 import json
+import logging
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -119,13 +120,12 @@ class RayCluster:
             return
         started = not ray.is_initialized()
         if started:
-            local = {"num_cpus": self.workers} if self.address is None else {}
             ray.init(
                 address=self.address,
+                num_cpus=self.workers if self.address is None else None,
                 include_dashboard=False,
                 log_to_driver=False,
-                logging_level="ERROR",
-                **local,
+                logging_level=logging.ERROR,
             )
         try:
             ray.data.DataContext.get_current().enable_progress_bars = False

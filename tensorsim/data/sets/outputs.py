@@ -89,6 +89,11 @@ class OutputConfig:
             require_positive("OutputConfig", rate_hz=self.rate_hz)
 
     @property
+    def has_range(self) -> bool:
+        """Whether an output has a range axis."""
+        return bool(set(self.kinds) & {"range_time", "range_time_mti", *SIGNALS, *OF_ARRAY})
+
+    @property
     def needs_array(self) -> bool:
         """Whether there are outputs of an array."""
         return bool(set(self.kinds) & set(OF_ARRAY))

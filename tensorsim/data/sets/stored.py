@@ -78,7 +78,7 @@ class StoredArrays:
             file.seek(offset)
             content = file.read(size)
         with reading(path, "a shard"):
-            return np.load(io.BytesIO(content), allow_pickle=False)  # type: ignore[no-any-return]
+            return np.load(io.BytesIO(content), allow_pickle=False)
 
     def _picture(self, row: dict[str, Any], name: str) -> npt.NDArray[Any]:
         import cv2

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from tensorsim.config import SimulationConfig
+from tensorsim.config.scene import Body
 from tensorsim.data.sets import outputs
 from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.outputs import OutputConfig, Stored
@@ -18,6 +19,10 @@ from tensorsim.data.sets.variations import Variation, seed_of
 from tensorsim.errors import collected_warnings
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.recognition.map_image import MapToImage
+
+
+#: How far a body reaches beyond its joints, range bins beside it, and what bounces inside a wall add to the range.
+_BODY_M, _MARGIN_BINS, _WALL_M = 0.2, 5, 2.0
 
 
 class Synthesized(NamedTuple):
@@ -52,6 +57,22 @@ def view_config(recipe: DatasetRecipe, view: RadarView, variation: Variation) ->
     return config.replace(scene=scene, seed=variation.seed % 2**32)
 
 
+def people_gate(config: SimulationConfig, scene: Scene) -> tuple[float, float] | float | None:
+    """(nearest, farthest) range of the bins that people of a scene reach, within the gate of a configuration."""
+    gate, radar = config.processing.range_gate_m, config.scene.radar
+    if isinstance(gate, float | int) or not bool(scene.valid.any()):
+        return gate
+    points = scene.joints[scene.valid].double()
+    tx, rx = (points.new_tensor(antenna) for antenna in (radar.tx_positions_m[0], radar.rx_positions_m[0]))
+    ranges = ((points - tx).norm(dim=-1) + (points - rx).norm(dim=-1)) / 2
+    margin = _BODY_M + _MARGIN_BINS * radar.range_resolution_m
+    behind = _WALL_M if config.scene.wall is not None else 0.0
+    near, far = float(ranges.min()) - margin, float(ranges.max()) + margin + behind
+    low, high = (0.0, math.inf) if gate is None else gate
+    last = (radar.samples_per_chirp // 2 - 1) * radar.range_resolution_m
+    return max(low, min(near, last - margin)), min(high, far, last)
+
+
 @torch.no_grad()
 def synthesize(recipe: DatasetRecipe, scene: Scene, variation: Variation) -> Synthesized:
     """The arrays of a sample. The same recipe, scene and variation give the same bytes on one thread.
@@ -74,6 +95,8 @@ def synthesize(recipe: DatasetRecipe, scene: Scene, variation: Variation) -> Syn
 def _outputs(recipe: DatasetRecipe, view: RadarView, scene: Scene, variation: Variation) -> dict[str, Stored]:
     """All outputs of one radar; joints in its axes."""
     config = view_config(recipe, view, variation)
+    if recipe.gate_people and not recipe.outputs.has_range:
+        config = config.replace(processing__range_gate_m=people_gate(config, scene))
     found = {"joints": outputs.stored_joints(scene.joints, scene.valid)}
     if recipe.outputs.needs_array:
         return found | array_outputs(config, recipe.outputs, scene)

@@ -121,8 +121,10 @@ class PointDetector(nn.Module):
     Example:
         >>> scene = ts.radar.PRESETS["ti-awr1843-array"]
         >>> simulator = ts.radar.RadarSimulator(scene)
-        >>> moving = simulator.mti(simulator.profiles(positions, rcs))
-        >>> points = ts.radar.PointDetector(scene.radar)(moving)
+        >>> positions = torch.tensor([1.0, 3.0, 1.0]) - torch.arange(900)[:, None, None] * torch.tensor([0, 2e-4, 0])
+        >>> channels = simulator.mti(simulator.profiles(positions, torch.ones(1)))  # (8, 899, 256)
+        >>> ts.radar.PointDetector(scene.radar)(channels).speed_m_s.shape  # frames, points
+        torch.Size([1, 64])
     """
 
     def __init__(

@@ -57,6 +57,7 @@ class EchoSynthesizer(nn.Module):
         paths: names of the path groups to include, of ``tensorsim.radar.synthesis.paths.PATH_NAMES``; replaces
             ``direct``, ``multipath``, ``leakage``, ``wall_echo`` and ``floor``.
         learnable: which of ``tensorsim.radar.synthesis.paths.LEARNABLE`` are parameters of ``.paths``, by that name.
+        wall_attenuation: False lets echoes through the wall keep their power and their delay.
 
     Shapes:
         positions (..., M, S, 3) metres in the world frame, rcs (..., S) m^2 per clip, (..., M, S) per pulse
@@ -97,6 +98,7 @@ class EchoSynthesizer(nn.Module):
         antenna: nn.Module | None = None,
         paths: tuple[str, ...] | None = None,
         learnable: tuple[str, ...] = (),
+        wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
         if pulse_chunk < 1:
@@ -104,8 +106,9 @@ class EchoSynthesizer(nn.Module):
         names = chosen_paths(multipath, leakage, wall_echo, direct, floor is not None, paths)
         wall = place_wall(wall, radar)
         self.paths = PropagationPaths(
-            radar, wall, names, wall_paths, incidence, polarization, bounces, floor, antenna, learnable
-        )
+            radar, wall, names, wall_paths, incidence, polarization, bounces, floor, antenna, learnable,
+            wall_attenuation,
+        )  # fmt: skip
         self.carrier_hz = float(radar.carrier_hz)
         self.slope_hz_per_s = float(radar.slope_hz_per_s)
         self.sample_rate_hz = float(radar.sample_rate_hz)
@@ -201,9 +204,9 @@ class EchoSynthesizer(nn.Module):
         return torch.cat((step, step[..., -1:, :, :]), -3)
 
     @torch.jit.export
-    def pulse_times(self, start: int, positions: Tensor) -> Tensor:
-        """Times (M,) in seconds, float64, of the pulses of ``positions`` (..., M, S, 3), number ``start`` the first."""
-        pulse = torch.arange(positions.shape[-3], dtype=torch.float64, device=positions.device)
+    def pulse_times(self, start: int, count: int) -> Tensor:
+        """Times (count,) in seconds, float64, of pulses ``start`` onwards."""
+        pulse = torch.arange(count, dtype=torch.float64, device=self.fine.device)
         return (start + pulse) / self.prf_hz
 
     @torch.jit.export

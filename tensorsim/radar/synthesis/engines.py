@@ -1,9 +1,10 @@
 """Two engines that compute noise-free range profiles of scatterers, with one interface.
 
-    engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2, start) -> profiles (B, m, V R), energy (B,)
+    engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2, start, ahead) -> profiles (B, m, V R), energy (B,)
 
-``start`` is the number of the first of m pulses, by which the room's clutter vibrates. The channels of V antennas
-stand one after the other along the range bins. ``energy`` is that of the reference signal of the receiver noise, over
+``start`` is the number of the first of m pulses, by which the room's clutter vibrates; ``ahead`` (B, m, S, 3) the way
+of the scatterers until the next pulse for transmitters in turn, else None. The channels of V antennas stand one after
+the other along the range bins. ``energy`` is that of the reference signal of the receiver noise, over
 m pulses and the N samples of their IF, mean over the channels. Arguments are not checked; the simulator has checked
 them.
 """
@@ -41,21 +42,27 @@ class TimeEngine(nn.Module):
         self.clutter: nn.Module | None = clutter
 
     @torch.jit.export
-    def samples(self, positions: Tensor, rcs: Tensor, start: int) -> tuple[Tensor, Tensor]:
+    def samples(
+        self, positions: Tensor, rcs: Tensor, start: int, ahead: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """IF (B, m, N), or (B, V, m, N) of several antennas, and the energy (B,)."""
-        echo = self.echo.target_echo(positions, rcs, self.echo.displacements(positions))
+        echo = self.echo.target_echo(positions, rcs, ahead)
         samples = echo
         if len(self.echo.paths.static_names) > 0:
             samples = samples + self.echo.static_echo()
         if self.clutter is not None:
-            room, cross_sections = self.clutter(self.echo.pulse_times(start, positions))
-            samples = samples + self.echo.target_echo(room, cross_sections, self.echo.displacements(room))
+            room, cross_sections = self.clutter(self.echo.pulse_times(start, positions.shape[1] + 1))
+            moved = self.echo.displacements(room)
+            moved = None if moved is None else moved[:-1]
+            samples = samples + self.echo.target_echo(room[:-1], cross_sections[:-1], moved)
         reference = energy(samples if self.total else echo)
         return samples, reference if reference.dim() == 1 else reference.mean(-1)
 
-    def forward(self, positions: Tensor, rcs: Tensor, start: int) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, positions: Tensor, rcs: Tensor, start: int, ahead: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """See the module."""
-        samples, reference = self.samples(positions, rcs, start)
+        samples, reference = self.samples(positions, rcs, start, ahead)
         return channels_as_bins(self.profile(samples)), reference
 
 
@@ -67,14 +74,16 @@ class RangeBinEngine(nn.Module):
         self.bins, self.total = bins, total
         self.clutter: nn.Module | None = clutter
 
-    def forward(self, positions: Tensor, rcs: Tensor, start: int) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, positions: Tensor, rcs: Tensor, start: int, ahead: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """See the module."""
         beat, strength = self.bins.tones(positions, rcs)
         profiles = self.bins.bins(beat, strength)
         if len(self.bins.echo.paths.static_names) > 0:
             profiles = profiles + self.bins.static_bins()
         if self.clutter is not None:
-            room, cross_sections = self.clutter(self.bins.echo.pulse_times(start, positions))
+            room, cross_sections = self.clutter(self.bins.echo.pulse_times(start, positions.shape[1]))
             tones = self.bins.tones(room, cross_sections)
             profiles = profiles + self.bins.bins(tones[0], tones[1])
             if self.total:

@@ -131,6 +131,7 @@ class TracedLegs(nn.Module):
     thickness_m: Tensor
     orders: int
     paper: bool
+    attenuates: bool
     with_bounces: bool
     with_images: bool
     with_floor: bool
@@ -184,7 +185,12 @@ class TracedLegs(nn.Module):
         return Slab(slab.reflection, slab.loss_neper, (length - straight) / self.speed_m_s, slab.bounce_s)
 
     def _transmission(self, slab: Slab, bounces: int) -> Tensor:
-        """Transmission of one leg with this number of internal bounce pairs."""
+        """Transmission of one leg with this number of internal bounce pairs; relative to none if nothing is lost."""
+        if self.attenuates:
+            return self._slab_transmission(slab, bounces)
+        return self._slab_transmission(slab, bounces) / self._slab_transmission(slab, 0)
+
+    def _slab_transmission(self, slab: Slab, bounces: int) -> Tensor:
         if self.paper:
             return paper_transmission(slab, bounces, self.carrier_hz)
         return transmission(slab, bounces)

@@ -151,6 +151,8 @@ class PropagationPaths(TracedLegs):
         antenna: pattern of all antennas (see :mod:`~tensorsim.radar.synthesis.antenna`); None is isotropic.
         learnable: which of ``LEARNABLE`` are parameters; the others are buffers. The position of the near face
             does not depend on the thickness.
+        wall_attenuation: False is the ablation "without wall attenuation": a leg through the wall keeps its delay and
+            loses nothing, and bounces in the wall keep their ratio to it. Reflections by the wall are not changed.
 
     Shapes: positions (..., S, 3) metres, rcs (..., S) m^2 -> :class:`Paths` of (..., S, P). All float64.
     Several antennas: (..., M, S, 3), (..., M, S) -> (..., V, M, S, P), channel ``v = k A + a`` for transmitter
@@ -189,6 +191,7 @@ class PropagationPaths(TracedLegs):
         floor: FloorConfig | None = None,
         antenna: nn.Module | None = None,
         learnable: tuple[str, ...] = (),
+        wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
         for option, value, known in (
@@ -206,6 +209,7 @@ class PropagationPaths(TracedLegs):
             raise TensorsimError(f"bounces: got {bounces}, expected at least 1")
         self._shape_legs(radar, wall, incidence, polarization, floor, antenna)
         self.paper = wall_paths == "paper"
+        self.attenuates = wall_attenuation
         self.peak_gain = 10 ** (radar.antenna_gain_dbi / 10)
         self.wavelength_m = radar.wavelength_m
         self.scale = self.peak_gain * radar.wavelength_m / (4 * math.pi) ** 1.5

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from tensorsim import cli
-from tensorsim.config import WallConfig
+from tensorsim.config import SceneConfig, WallConfig
 from tensorsim.data.sets.example import EXAMPLE
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.plan import Plan, shared_out
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig
 from tensorsim.data.sets.scene import Scene, kept_inside, part_of, seen_from, varied
-from tensorsim.data.sets.synthesis import synthesize, view_config
+from tensorsim.data.sets.synthesis import people_gate, synthesize, view_config
 from tensorsim.data.sets.variations import Variation, VariationConfig, draw
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
@@ -219,6 +219,24 @@ def test_a_sample_is_the_map_of_the_stages() -> None:
     expected = 20 * (maps.doppler_time[0] / maps.doppler_time.max()).clamp_min(1e-10).log10()
     assert np.abs(made.arrays["front.doppler_time"] - expected.detach().numpy()).max() < 0.2
     assert (made.arrays["front.joints"] == scene.joints.numpy()).all()
+
+
+def test_the_gate_holds_everything_that_people_reflect() -> None:
+    recipe = small_recipe(outputs=OutputConfig(dtype="float16", rate_hz=None))
+    recipe = replace(
+        recipe, variations=replace(recipe.variations, snr_db=None), scene=SceneConfig(snr_db=None)
+    )
+    plan = Plan(recipe)
+    for clip in range(4):
+        variation = plan.variation(clip, 0)
+        scene = plan.scene(clip, "train", variation)
+        gated, whole = (
+            synthesize(replace(recipe, gate_people=gate), scene, variation) for gate in (True, False)
+        )
+        near, far = people_gate(view_config(recipe, recipe.radars[0], variation), scene)
+        assert 0.5 <= near < far < 10.0
+        power, expected = (10 ** (m.arrays["front.doppler_time"].astype(float) / 10) for m in (gated, whole))
+        assert np.abs(power - expected).sum() / expected.sum() < 0.01
 
 
 def test_walls_snr_and_bodies_vary() -> None:

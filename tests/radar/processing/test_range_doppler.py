@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig, SceneConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import RangeDopplerVideo
 from tensorsim.radar.processing.range_doppler import PointDetector, RangeDopplerAngle, RangeDopplerCube
 from tensorsim.radar.simulator import RadarSimulator
@@ -25,7 +26,7 @@ ARRAY = replace(
     tx_m=tuple((2 * k * HALF_M, 0.0, 1.5) for k in range(2)),
     rx_m=tuple((k * HALF_M, 0.0, 1.5) for k in range(2)),
 )
-TDM = replace(PRESETS["ti-awr1843-array"].radar, sample_rate_hz=2e6)
+TDM = replace(PRESETS["ti-awr1843-array"].radar, bandwidth_hz=1e9, sample_rate_hz=2e6)
 
 
 class ChannelsCase(StageTester):
@@ -58,7 +59,8 @@ class TestPointDetector(ChannelsCase):
     exports = False  # data decide which points there are
 
     def make(self) -> nn.Module:
-        return PointDetector(ARRAY, overlap=0.5, points=5, nearest_m=1.0)
+        cfar = CfarDetector((0, 2), (1, 4), 0.05, edges=("reflect", "circular"))
+        return PointDetector(ARRAY, overlap=0.5, points=5, nearest_m=1.0, cfar=cfar)
 
 
 class TestSimulatorOfAnArray(SceneCase):
@@ -83,7 +85,7 @@ def moving(
     return (middle + distance[:, None] * line)[:, None]
 
 
-@pytest.mark.parametrize(("azimuth_deg", "speed_m_s"), [(20.0, 2.0), (-35.0, 2.0), (10.0, -3.0)])
+@pytest.mark.parametrize(("azimuth_deg", "speed_m_s"), [(20.0, 4.0), (-35.0, 4.0), (10.0, -4.0)])
 def test_a_target_of_known_range_speed_and_angle(azimuth_deg: float, speed_m_s: float) -> None:
     """Through the whole chain: simulator, canceller, cube, CFAR, points; a row of 8 with transmitters in turn."""
     simulator = RadarSimulator(SceneConfig(TDM, snr_db=10.0))
@@ -95,7 +97,7 @@ def test_a_target_of_known_range_speed_and_angle(azimuth_deg: float, speed_m_s: 
     found = PointDetector(TDM, points=3)(channels)
     assert bool(found.valid[:, 0].all())
     range_m = 3.0 - speed_m_s * 850 / TDM.prf_hz
-    assert float(found.range_m[:, 0].mean()) == pytest.approx(range_m, abs=0.04)
+    assert float(found.range_m[:, 0].mean()) == pytest.approx(range_m, abs=0.15)
     assert float(found.speed_m_s[:, 0].mean()) == pytest.approx(speed_m_s, abs=0.03)
     sine = math.sin(math.radians(azimuth_deg))
     assert found.sine[:, 0].tolist() == pytest.approx([sine] * len(found.sine), abs=0.02)
@@ -103,13 +105,13 @@ def test_a_target_of_known_range_speed_and_angle(azimuth_deg: float, speed_m_s: 
     degrees = torch.arange(-60.0, 61.0, 1.0)
     angles = RangeDopplerAngle(TDM, torch.deg2rad(degrees), overlap=0.0)(channels[:, :800])[0]
     near, doppler, direction = np.unravel_index(int(angles.argmax()), angles.shape)
-    assert near * TDM.range_resolution_m == pytest.approx(3.0 - speed_m_s * 400 / TDM.prf_hz, abs=0.06)
-    assert float(degrees[direction]) == pytest.approx(azimuth_deg, abs=1.5)
+    assert near * TDM.range_resolution_m == pytest.approx(3.0 - speed_m_s * 400 / TDM.prf_hz, abs=0.15)
+    assert float(degrees[direction]) == pytest.approx(azimuth_deg, abs=1.0)
     # Without compensation the motion between the transmitters would be taken for a direction.
-    angles = RangeDopplerAngle(replace(TDM, rx_m=TDM.rx_positions_m), torch.deg2rad(degrees), overlap=0.0)
+    angles = RangeDopplerAngle(TDM, torch.deg2rad(degrees), overlap=0.0)
     angles.cube.turn_cycles.zero_()
     wrong = int(angles(channels[:, :800])[0, near, doppler].argmax())
-    assert abs(float(degrees[wrong]) - azimuth_deg) > 3
+    assert abs(float(degrees[wrong]) - azimuth_deg) > 2.5
 
 
 def test_the_maps_of_an_array_are_those_of_its_antennas() -> None:
@@ -124,6 +126,23 @@ def test_the_maps_of_an_array_are_those_of_its_antennas() -> None:
     for name, scale in (("range_time", 3), ("range_time_mti", 3), ("doppler_time", 1)):
         power = sum(getattr(maps, name).square() for maps in single)
         assert_same(getattr(whole, name), (power / scale).sqrt(), atol=1e-5)
+
+
+def test_stream_of_an_array_is_that_of_the_whole() -> None:
+    p, rcs = tensors(swinging(90, 3, 256.0), np.ones(3))
+    simulator = RadarSimulator(ARRAY, snr_db=10.0, pulse_chunk=4)
+    torch.manual_seed(0)
+    expected = simulator(p, rcs)
+    torch.manual_seed(0)
+    assert_same(simulator.stream(lambda a, b: (p[a:b], rcs), 90), expected, atol=1e-6)
+    longer = RadarSimulator(ARRAY, snr_db=None, pulse_chunk=128)
+    assert_same(
+        simulator.recorder.engine(p[None], rcs.expand(1, 90, 3), 0, simulator.echo.displacements(p[None]))[0][
+            0
+        ],
+        longer.profiles(p, rcs).transpose(0, 1).flatten(1),
+        atol=1e-6,
+    )
 
 
 def test_profiles_of_one_antenna_are_those_of_the_maps() -> None:

@@ -94,7 +94,7 @@ def test_real_receivers_have_mirror_symmetric_spectra() -> None:
     assert float(both[2 * zero - int(both.argmax())] / both.max()) < 1e-4
 
 
-@pytest.mark.parametrize(("bits", "headroom_db"), [(6, 0.0), (8, 12.0), (10, 6.0)])
+@pytest.mark.parametrize(("bits", "headroom_db"), [(8, 12.0), (10, 6.0), (12, 3.0)])
 def test_quantisation_noise_floor(bits: int, headroom_db: float) -> None:
     """A wave of full scale has 6.02 bits + 1.76 dB, spread over all bins; headroom costs as much."""
     radar = RadarConfig.free_space()
@@ -175,13 +175,13 @@ def test_both_engines_see_the_same_room(reference: str) -> None:
 
 def test_interference_is_that_of_its_stage() -> None:
     p, rcs = tensors(swinging(80, 3, 256.0), np.ones(3))
-    other = InterferenceConfig((1.0, 5.0, 1.0), 1.4, -60.0, 1e-6)
+    other = InterferenceConfig((1.0, 5.0, 1.0), 1.4, 0.0, 1e-6)
     scene = SceneConfig(SMALL, interference=other, snr_db=None)
     simulator = RadarSimulator(scene, processing=ProcessingConfig(pulse_chunk=16))
     radar = interfering_radar(SMALL, other)
     assert radar.chirp_s == pytest.approx(1.4 * SMALL.chirp_s)
     assert radar.slope_hz_per_s < SMALL.slope_hz_per_s
-    heard = Interference(SMALL, radar, 1e-6, -60.0)(EchoSynthesizer(SMALL)(p, rcs))
+    heard = Interference(SMALL, radar, 1e-6, 0.0)(EchoSynthesizer(SMALL)(p, rcs))
     profiles = RangeProfile(SMALL)(heard)
     assert_same(simulator(p, rcs).range_time, profiles.abs().T, atol=1e-5)
     clean = RangeProfile(SMALL)(EchoSynthesizer(SMALL)(p, rcs))
