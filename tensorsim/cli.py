@@ -17,6 +17,7 @@ from tensorsim.commands.evaluate_classifier import EvaluateClassifier
 from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
 from tensorsim.commands.evaluate_detector import EvaluateDetector
 from tensorsim.commands.evaluate_films import EvaluateFilms
+from tensorsim.commands.evaluate_lifter import EvaluateLifter
 from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
@@ -63,6 +64,7 @@ COMMANDS: dict[str, Any] = {
             "pose": EvaluatePose,
             "films": EvaluateFilms,
             "camera": EvaluateCamera,
+            "lifter": EvaluateLifter,
             "denoiser": EvaluateDenoiser,
             "classifier": EvaluateClassifier,
             "measured": EvaluateMeasured,
