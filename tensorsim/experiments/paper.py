@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from tensorsim.experiments.work import Report, Table, Work
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tensorsim.experiments.catalogue import Experiment
 
 
@@ -31,7 +33,7 @@ def paper_report(config: PaperConfig, work: Work, experiments: "Mapping[str, Exp
         "The experiments of RadHARSimulator V2 (arXiv 2511.09022), made again on declared data with declared figures."
     ]
     tables: list[Table] = []
-    drawn = {}
+    drawn: "dict[str, Figure]" = {}
     for name, experiment in experiments.items():
         settings = experiment.quick() if config.quick else experiment.config()
         if name == "real":
