@@ -240,7 +240,9 @@ def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -
                 found[futures[future]] = future.result()
                 bar.update()
         except BrokenProcessPool:
-            raise TensorsimError("a training ended without a result: was it killed, or out of memory?") from None
+            raise TensorsimError(
+                "a training ended without a result: was it killed, or out of memory?"
+            ) from None
         except BaseException:
             for child in active_children():  # they would train to their end
                 child.terminate()
