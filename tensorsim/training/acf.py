@@ -83,7 +83,7 @@ def crop(image: npt.NDArray[np.uint8], box: Floats, mirrored: bool) -> npt.NDArr
     import cv2
 
     scale = PERSON_HEIGHT / float(box[3] - box[1])
-    source = image
+    source: npt.NDArray[Any] = image
     # Averages first: bilinear interpolation alone would alias.
     if scale < 0.5:
         source = cv2.resize(image, None, fx=2 * scale, fy=2 * scale, interpolation=cv2.INTER_AREA)
