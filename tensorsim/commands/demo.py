@@ -58,14 +58,16 @@ class Demo(NetworkOptions, RadarOptions):
 
         from tensorsim import results
         from tensorsim.config import ACTIVITIES, SmoothingConfig
+        from tensorsim.data.array_files import array_formats
         from tensorsim.data.video import VideoReader, write_video
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
         from tensorsim.pipeline import PoseToDoppler, VideoToPose
+        from tensorsim.report import write_report
         from tensorsim.sources import drawn_by, film_source
         from tensorsim.streaming import maps_of_pose
 
-        device = usable_device(self.device)
+        device, formats = usable_device(self.device), array_formats(self.save)
         with collected_warnings() as messages, torch.inference_mode():
             recognizer = load_recognizer(config)
             networks = load_networks(detector, pose_network, config.pose.flip_test)
@@ -81,7 +83,7 @@ class Demo(NetworkOptions, RadarOptions):
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people, device)
-                pose, maps = results.simulate(source, maps_stage, folder, config, device, self.quiet)
+                pose, maps, strip = results.simulate(source, maps_stage, folder, config, device, self.quiet)
                 torch.manual_seed(config.seed)
                 true_maps = maps_of_pose(
                     true_stage,
@@ -96,8 +98,9 @@ class Demo(NetworkOptions, RadarOptions):
                 pictures = self.pictures(
                     maps_stage, label["label"], f"demo: {ACTIVITIES[activity]}", somebody
                 )
-                results.write_maps(folder, maps, results.axes_of(maps_stage, maps), true_maps, pictures)
-                results.write_pose(folder, pose, FILM_FPS, pictures)
+                axes = results.axes_of(maps_stage, maps)
+                results.write_maps(folder, maps, axes, true_maps, pictures, formats)
+                results.write_pose(folder, pose, FILM_FPS, pictures, formats)
                 if self.sound:
                     results.write_doppler_sound(folder, maps_stage, pose, FILM_FPS, device)
                 write_pose_truth(folder, film, truth.valid)
@@ -117,6 +120,7 @@ class Demo(NetworkOptions, RadarOptions):
                         "warnings": messages,
                     }
                 )
+                write_report(folder, summary, pose, FILM_FPS, maps, axes, strip, pictures, true_maps)
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
@@ -130,7 +134,7 @@ class Demo(NetworkOptions, RadarOptions):
 
     def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":
         """The configuration for a film of the demonstration, with the files of its networks."""
-        config = at_display_rate(self.configuration(), self.duration)
+        config = at_display_rate(self.configuration(), self.full_rate)
         if not self.flip_test:
             config = config.replace(pose__flip_test=False)
         return config.replace(tracking__detector=str(detector), pose__network=str(pose_network))

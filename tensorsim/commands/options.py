@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
+from tensorsim.data.array_files import array_formats
 from tensorsim.errors import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
@@ -18,8 +19,7 @@ if TYPE_CHECKING:
     from tensorsim.recognition import ActivityRecognizer
     from tensorsim.results import Pictures
 
-#: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
-FULL_RATE_PULSES = 1 << 17
+#: Columns per second of the range-time maps that are written, unless every pulse is asked for.
 DISPLAY_RATE_HZ = 256.0
 
 #: The field of the configuration that an option sets.
@@ -101,6 +101,10 @@ class RadarOptions(PanelOptions):
     """Draw no ridges over the Doppler-time map."""
     sound: bool = False
     """Write doppler.wav as well, the micro-Doppler as sound: approaching motion left, receding motion right."""
+    full_rate: bool = False
+    """Keep a column of the range-time maps for every pulse, not 256 per second."""
+    save: Annotated[str, tyro.conf.arg(metavar="npz,mat,h5")] = "npz"
+    """Formats of maps and poses: .npz, which is always written, and mat for MATLAB or h5 for HDF5 beside it."""
     device: str = "auto"
     """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
     quiet: bool = False
@@ -120,6 +124,7 @@ class RadarOptions(PanelOptions):
             raise TensorsimError(
                 f"--least-probability: got {self.least_probability}, expected a number from 0 to 1"
             )
+        array_formats(self.save)
         if out.exists() and not out.is_dir():
             raise TensorsimError(f"--out: {out} is a file, expected a folder")
 
@@ -203,10 +208,11 @@ class RadarOptions(PanelOptions):
         return config.replace(scene__radar=chosen.radar, scene__wall=wall, scene__floor=chosen.floor)
 
 
-def at_display_rate(config: "SimulationConfig", length_s: float) -> "SimulationConfig":
-    """The configuration for motion of about this many seconds: range-time maps of long motion at a display rate."""
-    long = length_s * config.scene.radar.prf_hz > FULL_RATE_PULSES
-    if config.processing.display_rate_hz is None and long:
+def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "SimulationConfig":
+    """The configuration with range-time maps of a display rate, or of every pulse."""
+    if full_rate:
+        return config.replace(processing__display_rate_hz=None)
+    if config.processing.display_rate_hz is None and config.scene.radar.prf_hz > DISPLAY_RATE_HZ:
         return config.replace(processing__display_rate_hz=DISPLAY_RATE_HZ)
     return config
 

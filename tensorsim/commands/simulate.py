@@ -50,7 +50,7 @@ _MEANT_FOR = {
 class Simulate(NetworkOptions, RadarOptions):
     """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
 
-    Writes maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
+    Writes report.html, maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
     """
 
     source: tyro.conf.Positional[Path]
@@ -94,9 +94,11 @@ class Simulate(NetworkOptions, RadarOptions):
         import torch
 
         from tensorsim import results
+        from tensorsim.data.array_files import array_formats
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
         from tensorsim.pipeline import PoseToDoppler
+        from tensorsim.report import write_report
         from tensorsim.sources import KINDS, kind_of
 
         kind = kind_of(self.source)
@@ -107,26 +109,28 @@ class Simulate(NetworkOptions, RadarOptions):
                 name = field.name.replace("_", "-")
                 raise TensorsimError(f"--{name}: got it for {KINDS[kind]}, expected it for {meant} only")
         config = self.configuration()
-        device = usable_device(self.device)
+        device, formats = usable_device(self.device), array_formats(self.save)
         with collected_warnings() as messages, torch.inference_mode():
             recognizer = load_recognizer(config)
             source, config = self._source(kind, config, device)
-            length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
-            config = at_display_rate(config, length_s)
+            config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps = results.simulate(source, stage, folder, config, device, self.quiet)
+                pose, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
                 duration_s = pose.valid.shape[2] / source.fps
                 label = results.label_of(recognizer, maps, duration_s, self.least_probability)
                 warn_of_label(recognizer, config, int(pose.valid.any(-1).sum()))
                 somebody = bool(pose.valid.any())
                 pictures = self.pictures(stage, label["label"], self.source.name, somebody)
-                results.write_maps(folder, maps, results.axes_of(stage, maps), pictures=pictures)
-                results.write_pose(folder, pose, source.fps, pictures)
+                axes = results.axes_of(stage, maps)
+                results.write_maps(folder, maps, axes, pictures=pictures, formats=formats)
+                results.write_pose(folder, pose, source.fps, pictures, formats)
                 if self.sound:
                     results.write_doppler_sound(folder, stage, pose, source.fps, device)
                 summary = label | results.summary_of(source, config, pose, maps)
-                results.write_summary(folder, summary | {"options": self.described(), "warnings": messages})
+                summary |= {"options": self.described(), "warnings": messages}
+                write_report(folder, summary, pose, source.fps, maps, axes, film, pictures)
+                results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""
