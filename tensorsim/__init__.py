@@ -29,6 +29,7 @@ from tensorsim.config import (
     WallConfig,
 )
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.live import LiveSimulator
 from tensorsim.paper import table as _paper_table
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
@@ -44,6 +45,7 @@ __all__ = [
     "CameraConfig",
     "Detections",
     "FloorConfig",
+    "LiveSimulator",
     "Pose",
     "PoseConfig",
     "PoseToDoppler",

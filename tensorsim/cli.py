@@ -20,6 +20,7 @@ from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
 from tensorsim.commands.library import BuildLibrary
+from tensorsim.commands.live import Live
 from tensorsim.commands.models import FetchModels, ListModels, VerifyModels
 from tensorsim.commands.simulate import Simulate
 from tensorsim.commands.train_classifier import TrainClassifier
@@ -37,6 +38,7 @@ examples:
   tensorsim simulate clip.mp4 --out out/ --radar ti-iwr6843
   tensorsim simulate walk.bvh --out out/ --initial-distance 4
   tensorsim demo --activity kicking --out demo/
+  tensorsim live --camera 0
   tensorsim evaluate truth --out truth/ --clips 2
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
   tensorsim check
@@ -48,6 +50,7 @@ Networks come with tensorsim; others can be named once for all runs: set TENSORS
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate,
     "demo": Demo,
+    "live": Live,
     "evaluate": (
         "Measure the pipeline against the truth, or a network on held-out data.",
         {

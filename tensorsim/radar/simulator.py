@@ -273,6 +273,21 @@ class RadarSimulator(nn.Module):
             decibels(signal, noise / (pulses * self.echo.samples))[0].to(whole),
         )
 
+    @torch.no_grad()
+    def advance(self, positions: Tensor, rcs: Tensor, pending: Pending | None) -> Piece:
+        """Maps of the next pulses of a scene without end.
+
+        The noise is that of an empty scene, see the class, as the power of what is still to come is not known.
+
+        Args:
+            positions: (B, m, S, 3) metres, m above the ``lost_pulses`` of the moving target indicator.
+            rcs: (B, m, S) m^2.
+            pending: of the piece before; None begins.
+        """
+        pending = self._nothing_pending(positions) if pending is None else pending
+        profiles, energy = self._profiles(positions, check_scene(positions, rcs))
+        return self._piece(profiles, positions, rcs, torch.zeros_like(energy), pending)
+
     def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[Tensor, Tensor]]:
         """Positions (1, m, S, 3) and RCS (1, m, S) of a source, checked; m a multiple of ``pulse_chunk``."""
         span = max(self.piece_chunks * self.pulse_chunk, self.mti.lost_pulses + 1)
