@@ -9,6 +9,7 @@ from typing import Annotated, Any, NoReturn, Union
 import tyro
 
 from tensorsim import process
+from tensorsim.commands.app import App
 from tensorsim.commands.check import Check
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_camera import EvaluateCamera
@@ -39,6 +40,7 @@ examples:
   tensorsim simulate walk.bvh --out out/ --initial-distance 4
   tensorsim demo --activity kicking --out demo/
   tensorsim live --camera 0
+  tensorsim app
   tensorsim evaluate truth --out truth/ --clips 2
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
   tensorsim check
@@ -51,6 +53,7 @@ COMMANDS: dict[str, Any] = {
     "simulate": Simulate,
     "demo": Demo,
     "live": Live,
+    "app": App,
     "evaluate": (
         "Measure the pipeline against the truth, or a network on held-out data.",
         {

@@ -18,10 +18,11 @@ from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video import VideoWriter
 from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
+from tensorsim.progress import picture, progress_bar
 from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.report.film import FilmStrip
-from tensorsim.streaming import maps_of_pose, progress_bar
+from tensorsim.streaming import maps_of_pose
 from tensorsim.types import Pose, RadarMaps
 from tensorsim.vision.tracking.selection import select_people
 
@@ -285,10 +286,22 @@ def simulate(
     """Find the people of a source, choose, and simulate their maps; writes the overlay film, and returns it as well."""
     pose = select_people(source.pose(quiet), config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
+    picture(
+        "world",
+        lambda: _figure_pixels(
+            plot.skeleton_figure(pose.joints[0].numpy(), pose.valid[0].numpy(), source.fps)
+        ),
+    )
     torch.manual_seed(config.seed)
     maps = maps_of_pose(stage, pose, source.fps, device, quiet)
     film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
     return pose, maps, film
+
+
+def _figure_pixels(figure: Any) -> np.ndarray:
+    """A figure as (H, W, 3) uint8 RGB."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
 def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
