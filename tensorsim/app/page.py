@@ -19,6 +19,11 @@ from tensorsim.radar.presets import PRESETS
 #: Kinds of files that can be dropped.
 FILE_TYPES = [".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".m4v", ".bvh", ".npz", ".json"]
 _SCENES = ("free-space", "through-wall")
+_EXAMPLES = {
+    "Walking": ("walking", "free-space", "4"),
+    "Walking behind a wall": ("walking", "through-wall", "4"),
+    "Falling": ("walking to falling", "free-space", "6"),
+}
 CSS = """
 .result iframe { width: 100%; height: 1500px; border: 1px solid #8886; border-radius: 4px; }
 .result { display: flex; flex-wrap: wrap; gap: 0.75rem; }
@@ -111,16 +116,14 @@ def _activities() -> list[str]:
     return [name.split(" ", 1)[1].lower() for name in ACTIVITIES]
 
 
-def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Number) -> None:
-    gr.Examples(
-        [
-            ["walking", "free-space", 4.0],
-            ["walking", "through-wall", 4.0],
-            ["falling to walking", "free-space", 6.0],
-        ],
-        [activity, scene, duration],
-        label="Examples that need no file",
-    )
+def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Textbox) -> None:
+    """Buttons that set activity, scene and length."""
+    gr.Markdown("Examples that need no file:")
+    with gr.Row():
+        for name, values in _EXAMPLES.items():
+            gr.Button(name, size="sm").click(
+                lambda chosen=values: chosen, None, [activity, scene, duration], api_name=False, queue=False
+            )
 
 
 def _component(control: Control) -> Any:
@@ -130,13 +133,19 @@ def _component(control: Control) -> Any:
         return gr.Checkbox(value=bool(control.default), **common)
     if control.kind == "choice":
         return gr.Dropdown(list(control.choices), value=control.default or control.choices[0], **common)
-    if control.kind in ("number", "integer"):
-        return gr.Number(value=control.default, precision=0 if control.kind == "integer" else None, **common)
-    return gr.Textbox(value=control.default, **common)
+    # Not a gr.Number: that cannot be left empty, which is the default of the scene.
+    shown = (
+        ""
+        if control.default is None
+        else f"{control.default:g}"
+        if control.kind == "number"
+        else control.default
+    )
+    return gr.Textbox(value=str(shown), placeholder="default", **common)
 
 
 def _command(
-    film: str | None, activity: str, duration: float, values: dict[str, Any], longest_s: float
+    film: str | None, activity: str, duration: str, values: dict[str, Any], longest_s: float
 ) -> Callable[[Path], Any]:
     """What makes the command of a run for its folder; it raises where the values make none."""
 
@@ -149,11 +158,24 @@ def _command(
         given |= {"out": folder, "quiet": True, "save": "mat"}
         given["multipath"] = {"on": True, "off": False}.get(given.get("multipath", ""))
         if film is None:
-            return Demo(activity=activity, duration=min(float(duration or 0), longest_s), **for_demo(given))
+            return Demo(activity=activity, duration=_length(duration, longest_s), **for_demo(given))
         _check_length(Path(film), longest_s, given)
         return Simulate(source=Path(film), **given)
 
     return command
+
+
+def _length(given: str, longest_s: float) -> float:
+    """Seconds of a generated film."""
+    try:
+        seconds = float(given)
+    except ValueError:
+        raise TensorsimError(f"Length of the generated film: got {given!r}, expected seconds") from None
+    if not 0.5 <= seconds <= longest_s:
+        raise TensorsimError(
+            f"Length of the generated film: got {seconds:g} s, expected 0.5 to {longest_s:g} s"
+        )
+    return seconds
 
 
 def _check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:

@@ -83,9 +83,12 @@ class LiveRadar:
             ("smoothing along the pulses (--smoothing-ratio)", stage.halo > 0),
             ("sway or vital signs", len(stage.small_motions) > 0),
             ("a denoiser", stage.denoises),
+            ("effects of the receiver", simulator.recorder.front_end is not None),
         ):
             if present:
                 raise TensorsimError(f"live: got {name}, expected none: it needs the whole clip")
+        if simulator.channels > 1:
+            raise TensorsimError("live: got several antennas, expected one transmitter and one receiver")
         self.stage, self.simulator, self.fps = stage, simulator, fps
         self.prf_hz = float(simulator.radar.prf_hz)
         self.people: dict[int, _Person] = {}
@@ -104,11 +107,11 @@ class LiveRadar:
         stop = max(0, math.ceil((self.frame - 1) / self.fps * self.prf_hz - 1e-6))
         # Some chains need several pulses to begin with.
         if stop - self.pulse <= self.simulator.mti.lost_pulses:
-            return self._columns(None)
+            return self._columns(None, self.pulse)
         pulses = torch.arange(self.pulse, stop, dtype=torch.float64)
         u = pulses * self.fps / self.prf_hz - (self.frame - 2)
-        self.pulse = stop
-        return self._columns(self._scene(u))
+        first, self.pulse = self.pulse, stop
+        return self._columns(self._scene(u), first)
 
     def _remember(self, joints: dict[int, tuple[Tensor, bool]]) -> None:
         step = 1 / max(1.0, FADE_S * self.fps)
@@ -143,12 +146,12 @@ class LiveRadar:
         points, rcs = self.stage.scatterers(joints[None], fade[None])
         return points, rcs
 
-    def _columns(self, scene: tuple[Tensor, Tensor] | None) -> NewColumns:
+    def _columns(self, scene: tuple[Tensor, Tensor] | None, first: int) -> NewColumns:
         end_s = self.pulse / self.prf_hz
         if scene is None:
             bins = self.simulator.range_profile.range_m.shape[0]
             return NewColumns(torch.zeros(self.simulator.doppler.bins, 0), *[torch.zeros(bins, 0)] * 2, end_s)
-        piece = self.simulator.advance(*scene, self.pending)
+        piece = self.simulator.advance(*scene, first, self.pending)
         self.pending = piece.pending
         still = self._display(0, piece.profiles[0].T.abs())
         moving = self._display(1, piece.moving[0].T.abs())

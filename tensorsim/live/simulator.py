@@ -117,12 +117,13 @@ class LiveSimulator:
         if config.processing.display_rate_hz is None and config.scene.radar.prf_hz > 256:
             config = config.replace(processing__display_rate_hz=256.0)
         self.config, self.fps = config, float(fps)
+        # First, because it refuses settings before networks are loaded.
+        self.radar = LiveRadar(PoseToDoppler.from_config(config), fps)
         self.vision = VideoToPose.from_config(config, detector, pose)
         self.lifter = _each_frame_alone(self.vision.lifter)
         self.poses = [self._causal_pose(height_m) for height_m in config.pose.person_height_m]
         self.tracker = OnlineTracker(**_tracking(config))
         self.tracks = self.tracker.begin()
-        self.radar = LiveRadar(PoseToDoppler.from_config(config), fps)
         self.labels = None
         if recognizer is not None:
             self.labels = LiveLabels(recognizer, self.radar.simulator, least_probability)

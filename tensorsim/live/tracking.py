@@ -47,8 +47,9 @@ class OnlineTracker(GNNTracker):
         living = state.living._replace(box=predicted)
         if detections is None:
             return state._replace(living=living)
-        box, strong = self._usable(detections)
-        column = self._assign(living, box, strong)
+        box, score = self._usable(detections)
+        strong = score >= self.start_score
+        column = self._assign(living, box, score, state.confirmed)
         hit = column >= 0
         strong_hits = state.strong_hits + (hit & _taken(strong, column)).to(torch.int64)
         living = self._correct(living, xyxy_to_center(box), column)
@@ -75,17 +76,17 @@ class OnlineTracker(GNNTracker):
         return state.living.rows[chosen].tolist(), center_to_xyxy(place)
 
     def _usable(self, detections: Detections) -> tuple[Tensor, Tensor]:
-        """Boxes (k, 4) of the detections that count, best first, and which of them may start a track."""
+        """Boxes (k, 4) of the detections that count, best first, and their scores (k,)."""
         boxes, scores = detections.boxes.detach().cpu().double(), detections.scores.detach().cpu().double()
         usable = (
             detections.valid.cpu()
             & (detections.labels == 0).cpu()
-            & (scores >= self.detection_threshold)
+            & (scores >= self.faint_score)
             & (boxes[..., 2:] - boxes[..., :2] >= self.min_box_px).all(-1)
         )
         best_first = scores.argsort(descending=True, stable=True)
         index = best_first[usable[best_first]]
-        return boxes[index], scores[index] >= self.start_score
+        return boxes[index], scores[index]
 
 
 def _taken(strong: Tensor, column: Tensor) -> Tensor:

@@ -206,17 +206,19 @@ def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
         report = page.frame_locator("#result iframe").first
         report.locator("body[data-ready=yes]").wait_for()
         assert report.locator("#people tr").count() == 2
-        page.screenshot(path=shots / "app_1400.png", full_page=True)
+        page.screenshot(path=shots / "app_1400.png")
 
         page.get_by_label("through-wall").check()
         page.get_by_role("button", name="Wall").click()
-        page.locator("#wall-permittivity input").fill("4")
-        page.locator("#wall-permittivity input").press("Tab")
+        page.locator("#wall-permittivity").locator("input, textarea").fill("4")
+        page.locator("#wall-permittivity").locator("input, textarea").press("Tab")
         page.click("#compare")
         page.locator("#result section").nth(1).wait_for()
         sources = [frame.get_attribute("src") for frame in page.locator("#result iframe").all()]
         wall = report_text(server, sources[1])
-        assert '"relative_permittivity":4.0' in wall
+        assert '"relative_permittivity":4.0,"loss_tangent":0.03' in wall, (
+            "what is left empty keeps its default"
+        )
         assert '"wall":null' in report_text(server, sources[0])
 
         with page.expect_download() as download:
@@ -225,7 +227,10 @@ def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
         assert maps["doppler_time"].shape == (maps["doppler_hz"].size, maps["time_s"].size)
         page.set_viewport_size({"width": 420, "height": 900})
         page.wait_for_timeout(500)
-        page.screenshot(path=shots / "app_420.png", full_page=True)
+        page.screenshot(path=shots / "app_420.png")
+        page.locator("#result iframe").last.scroll_into_view_if_needed()
+        page.wait_for_timeout(500)
+        page.screenshot(path=shots / "app_420_result.png")
         assert page.evaluate("document.documentElement.scrollWidth") <= 420
 
         page.locator("input[type=file]").first.set_input_files(broken)

@@ -4,12 +4,14 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from scipy.interpolate import BSpline
 from torch import Tensor
 
@@ -27,12 +29,24 @@ from tensorsim.live.tracking import OnlineTracker
 from tensorsim.recognition.timeline import WINDOW_S
 from tensorsim.types import Detections
 from tensorsim.vision.lifting.metric_pose import lowered, lowest_ankle
+from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.smoothing.kalman import KalmanSmoother, smooth_constant_velocity
 from tensorsim.vision.smoothing.outliers import limit_speed
 from tests.film import STANDING, RectangleDetector, StandingPose, film, walker
 
 FPS, FRAMES = 10.0, 60
 CONFIG = ts.SimulationConfig.through_wall().replace(scene__snr_db=None, pose__flip_test=False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small_library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Every 40th pose of the shipped library: the tables of all of them take seconds to make."""
+    global CONFIG
+    path = tmp_path_factory.mktemp("library") / "poses.safetensors"
+    save_file({"poses": load_pose_library()[::40].clone()}, path)
+    whole, CONFIG = CONFIG, CONFIG.replace(pose__library=str(path))
+    yield
+    CONFIG = whole
 
 
 def networks() -> tuple[RectangleDetector, StandingPose]:

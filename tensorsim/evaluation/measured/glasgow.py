@@ -19,17 +19,18 @@ from tensorsim.evaluation.measured.motions import (
     act_out,
     add_unrest,
     at_instants,
+    dim_limbs,
     knots,
     linear,
     place,
     stage_people,
-    to_and_fro,
+    walk_to_and_fro,
 )
 from tensorsim.evaluation.measured.training import drop_cells, shift
 from tensorsim.motion.exercises import drink, fall_down, pick_up
-from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import PeopleConfig
-from tensorsim.motion.scripts import sit_down, stand_up, walk
+from tensorsim.motion.scripts import sit_down, stand_up
 from tensorsim.motion.timing import segment
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.radar.processing.cfar import CfarDetector
@@ -96,14 +97,10 @@ class Glasgow:
         if label == 0:
             duration = 10.0
             time = knots(duration).expand(count, -1)
-            people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
-            leg = draw(1.6, 3.2)
-            if self.effects.to_and_fro:
-                joints = to_and_fro(walk, time, people, draw, leg, draw(0.9, 2.2), draw(0.0, 1.0) * leg)
-            else:
-                joints = act_out(walk, time, people)
-            y = joints[:, :, (8, 11), 1].mean(-1)
-            joints = place(joints, draw(-0.3, 0.3), range_m + 0.4 + y[:, :1] - y.mean(1, keepdim=True))
+            joints, offset_m = walk_to_and_fro(
+                time, people, draw, (1.6, 3.2), (0.9, 2.2), self.effects.to_and_fro
+            )
+            joints = place(joints, draw(-0.3, 0.3), range_m + 0.4 + offset_m)
         else:
             duration = 5.0
             time = knots(duration).expand(count, -1)
@@ -132,9 +129,7 @@ class Glasgow:
         at = torch.arange(pulses, dtype=torch.float64) / RADAR.prf_hz
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.dim_limbs:
-            gain_db = draw(-9.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
-            gain_db[:, 1] = 0.0  # the torso
-            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+            rcs = dim_limbs(rcs, draw, -9.0, 3.0, self.scatterers.per_segment)
         positions, rcs = at_instants(positions, at), linear(rcs, at)
         echo = self.echo(positions, rcs)
         echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()

@@ -29,6 +29,7 @@ from tensorsim.vision.smoothing.kalman import (
     smooth_constant_velocity,
 )
 from tensorsim.vision.tracking.assignment import assign
+from tensorsim.vision.tracking.joining import contained, join_tracks
 
 
 class _Living(NamedTuple):
@@ -51,11 +52,16 @@ class GNNTracker(nn.Module):
 
     1. Detections are used that are people (label 0), score at least ``detection_threshold`` and measure at least
        ``min_box_px`` in width and height.
-    2. Hungarian assignment: the cost of a pair is ``(1 - IoU) + d^2 / assignment_threshold``, d the Mahalanobis
-       distance of the detection to the predicted box, so that the distance decides where boxes do not overlap. A
-       pair needs ``d^2 <= assignment_threshold`` and centres within ``reach`` sizes (the covariance of a track
-       without detections soon spans the picture); a detection below ``start_score`` also needs an IoU of
-       ``weak_iou``, so that a lost person is not found in a piece of furniture. Any such pair is better than none.
+    2. Hungarian assignment in two passes (as in ByteTrack, Zhang et al., ECCV 2022), first of detections of at least
+       ``start_score``, then of the others to the tracks that are left. The cost of a pair is ``(1 - IoU) + d^2 /
+       assignment_threshold``, d the Mahalanobis distance of the detection to the predicted box, so that the distance
+       decides where boxes do not overlap, plus the share of ``delete_window`` since the last match, as the covariance
+       of a lost track admits much. A pair needs ``d^2 <= assignment_threshold``, centres within ``reach`` sizes and
+       areas within a factor of 4; in the second pass also an IoU of ``weak_iou``, so that a lost person is not found
+       in a piece of furniture, and a detection that is no duplicate of a matched one. A confirmed track may there
+       take one of ``faint_score`` whatever d, also if one box covers half of the other, unless a fifth of it is
+       covered by a matched one: somebody who lies down is found badly, in a box of another shape. Any such pair is
+       better than none.
     3. An unmatched detection of at least ``start_score`` starts a track, unless it overlaps a better or
        matched one by an IoU above ``duplicate_iou``, or with more than ``duplicate_part`` of its own area:
        one person detected twice.
@@ -64,7 +70,9 @@ class GNNTracker(nn.Module):
     5. People are the confirmed tracks with at least ``min_hits`` detections of ``start_score`` or more (in a clip
        with fewer observed frames: one in each), as tracks of low scores are mostly false. Of more than
        ``max_tracks`` at a time the best, by sum of scores, are kept.
-    6. A person is valid from first to last detection, gaps included, and in unobserved frames next to these.
+    6. Tracks that follow one person, together or one after the other, are joined:
+       :func:`~tensorsim.vision.tracking.joining.join_tracks`.
+    7. A person is valid from first to last detection, gaps included, and in unobserved frames next to these.
        The boxes are Rauch-Tung-Striebel smoothed; they may reach beyond the image a little.
 
     Args:
@@ -78,6 +86,7 @@ class GNNTracker(nn.Module):
         min_box_px: smallest width and height of a detection that counts.
         start_score: score from which a detection starts a track, and is matched without overlap.
         weak_iou: IoU with the predicted box that a detection of less needs.
+        faint_score: smallest score of a detection that continues a confirmed track; it counts for nothing else.
         min_hits: detections of at least ``start_score`` from which a confirmed track is a person.
         process_noise: density of the acceleration noise, size^2 / frame^3.
         measurement_noise: variance of a detected coordinate, size^2.
@@ -102,6 +111,7 @@ class GNNTracker(nn.Module):
         min_box_px: float = 5.0,
         start_score: float = 0.5,
         weak_iou: float = 0.3,
+        faint_score: float = 0.2,
         min_hits: int = 5,
         process_noise: float = 1e-3,
         measurement_noise: float = 4e-4,
@@ -114,14 +124,8 @@ class GNNTracker(nn.Module):
         for name, count in (("max_tracks", max_tracks), ("min_hits", min_hits)):
             if count < 1:
                 raise TensorsimError(f"GNNTracker.{name}: got {count}, expected at least 1")
-        if not 1 <= confirm_hits <= confirm_window:
-            raise TensorsimError(
-                f"GNNTracker.confirm_hits: got {confirm_hits} of {confirm_window}, expected M of N"
-            )
-        if not 1 <= delete_misses <= delete_window:
-            raise TensorsimError(
-                f"GNNTracker.delete_misses: got {delete_misses} of {delete_window}, expected P of R"
-            )
+        _check_window("confirm_hits", confirm_hits, confirm_window)
+        _check_window("delete_misses", delete_misses, delete_window)
         check_positive(assignment_threshold, "GNNTracker.assignment_threshold")
         check_positive(min_box_px, "GNNTracker.min_box_px")
         check_positive(process_noise, "GNNTracker.process_noise")
@@ -132,6 +136,7 @@ class GNNTracker(nn.Module):
             ("detection_threshold", detection_threshold),
             ("start_score", start_score),
             ("weak_iou", weak_iou),
+            ("faint_score", faint_score),
             ("duplicate_iou", duplicate_iou),
             ("duplicate_part", duplicate_part),
         ):
@@ -145,8 +150,10 @@ class GNNTracker(nn.Module):
         self.assignment_threshold = float(assignment_threshold)
         self.detection_threshold = float(detection_threshold)
         self.min_box_px = float(min_box_px)
-        self.start_score = float(start_score)
+        self.start_score = max(float(start_score), float(detection_threshold))
         self.weak_iou = float(weak_iou)
+        # A detection that counts is never less sure than one that only continues a track.
+        self.faint_score = min(float(faint_score), float(detection_threshold))
         self.min_hits = min_hits
         self.process_noise = float(process_noise)
         self.measurement_noise = float(measurement_noise)
@@ -169,13 +176,14 @@ class GNNTracker(nn.Module):
         usable = (
             real
             & (detections.labels == 0).to(cpu)
-            & (scores >= self.detection_threshold)
+            & (scores >= self.faint_score)
             & (boxes[..., 2:] - boxes[..., :2] >= self.min_box_px).all(-1)
             & looked.unsqueeze(-1)
         )
         tables: list[Tensor] = []
         for b in range(clips):
             table = self._associate(boxes[b], scores[b], usable[b], looked[b])
+            table = join_tracks(table, boxes[b], scores[b], looked[b], self.start_score, self.delete_window)
             tables.append(self._people(table, boxes[b], scores[b], int(looked[b].sum())))
         people = max([table.shape[0] for table in tables])
         which = torch.full((clips, people, frames), -1, dtype=torch.int64)
@@ -207,7 +215,7 @@ class GNNTracker(nn.Module):
             best_first = scores[t].argsort(descending=True, stable=True)
             index = best_first[usable[t][best_first]]
             box, strong = boxes[t][index], scores[t][index] >= self.start_score
-            column = self._assign(living, box, strong)
+            column = self._assign(living, box, scores[t][index], confirmed[living.rows])
             hit = column >= 0
             table[living.rows[hit], t] = index[column[hit]]
             living = self._correct(living, xyxy_to_center(box), column)
@@ -267,23 +275,42 @@ class GNNTracker(nn.Module):
             s.age + 1,
         )
 
-    def _assign(self, s: _Living, box: Tensor, strong: Tensor) -> Tensor:
+    def _assign(self, s: _Living, box: Tensor, score: Tensor, confirmed: Tensor) -> Tensor:
         """Detection of each living track among the boxes of a frame (n,), -1 for none."""
         x = s.box.position
         size = x[:, 2:].amax(-1).clamp(min=self.min_box_px)
         offset = (xyxy_to_center(box).unsqueeze(0) - x.unsqueeze(1)) / size[:, None, None]
         distance = offset.square().sum(-1) / (s.box.p00 + self.measurement_noise)
         x = torch.cat([x[:, :2], x[:, 2:].clamp(min=self.min_box_px)], dim=-1)
-        iou = box_iou(center_to_xyxy(x)[:, None], box[None])
+        predicted = center_to_xyxy(x)[:, None]
+        iou = box_iou(predicted, box[None])
+        ratio = box_area(box)[None] / box_area(predicted)
         near = torch.linalg.vector_norm(offset[..., :2], dim=-1) <= self.reach
-        allowed = near & (distance <= self.assignment_threshold) & (strong | (iou >= self.weak_iou))
-        return assign(1.0 - iou + distance / self.assignment_threshold, allowed, 2.0)
+        near = near & (ratio >= 0.25) & (ratio <= 4.0)
+        lost = s.history.to(torch.uint8).argmax(-1).to(iou.dtype) / self.delete_window
+        cost = 1.0 - iou + distance / self.assignment_threshold + lost[:, None] + (1.0 - score)
+        column = assign(
+            cost, near & (distance <= self.assignment_threshold) & (score >= self.start_score), 5.0
+        )
+        # Second association: tracks and detections that are left, but none that shows somebody who was found.
+        left, taken = column < 0, column[column >= 0]
+        free = ~self._double(box)[taken].any(0)
+        free[taken] = False
+        fair = (score >= self.detection_threshold) & (distance <= self.assignment_threshold)
+        overlap = iou >= self.weak_iou
+        alone = ~(contained(box[taken][:, None], box[None]) > 0.2).any(0)
+        alike = confirmed[:, None] & alone & (overlap | (contained(predicted, box[None]) >= 0.5))
+        second = assign(cost, left[:, None] & free & near & ((fair & overlap) | alike), 5.0)
+        return torch.where(left, second, column)
+
+    def _double(self, box: Tensor) -> Tensor:
+        """Whether box j (n,) shows what box i (n,) does: (n, n)."""
+        part = box_intersection(box[:, None], box[None]) / box_area(box)
+        return (box_iou(box[:, None], box[None]) > self.duplicate_iou) | (part > self.duplicate_part)
 
     def _newcomers(self, box: Tensor, strong: Tensor, taken: Tensor) -> Tensor:
         """Which detections of a frame, best first, start tracks."""
-        iou = box_iou(box[:, None], box[None])
-        part = box_intersection(box[:, None], box[None]) / box_area(box)
-        double = (iou > self.duplicate_iou) | (part > self.duplicate_part)
+        double = self._double(box)
         blocked = ~strong | double[taken].any(0)
         new: list[int] = []
         for j in range(box.shape[0]):
@@ -324,6 +351,11 @@ def _presence(matched: Tensor, looked: Tensor) -> Tensor:
     first, last = hits.argmax(-1, keepdim=True), hits.cumsum(-1).argmax(-1, keepdim=True)
     present = (before >= before.gather(-1, first)) & (until <= until.gather(-1, last))
     return present & matched.any(-1, keepdim=True)
+
+
+def _check_window(name: str, count: int, window: int) -> None:
+    if not 1 <= count <= window:
+        raise TensorsimError(f"GNNTracker.{name}: got {count} of {window}, expected M of N with 1 <= M <= N")
 
 
 def _check(detections: Detections, observed: Tensor | None) -> None:

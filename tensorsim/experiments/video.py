@@ -1,0 +1,261 @@
+"""Ablation of the vision module: other detectors, trackers, pose networks and lifters on films of known motion."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.evaluation.clips import ActivityClip, activity_clips
+from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Observed
+from tensorsim.evaluation.scores import MAPS, Maps, compare
+from tensorsim.evaluation.settings import Pipelines, Setting
+from tensorsim.evaluation.truth import pose_errors
+from tensorsim.experiments import figures
+from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
+from tensorsim.experiments.work import Report, Table, Work
+from tensorsim.motion.activities import activity_index
+from tensorsim.pipeline import VideoToPose, pretrained_pose
+from tensorsim.radar.presets import PRESETS
+from tensorsim.registry import find
+from tensorsim.render.renderer import PersonRenderer
+from tensorsim.training.maps import SCENES
+from tensorsim.types import Tracks
+from tensorsim.vision.detection.acf import AcfDetector
+from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.tracking.mosse import MosseTracker
+
+FULL = "RTMDet, GNN, HRNet, matching"
+MOSSE = "RTMDet, MOSSE"
+ACF = "ACF, GNN"
+#: Published weights that a row needs, and its name.
+BY_NAME = {"cpm-coco": "CPM, matching"}
+
+
+@dataclass(frozen=True)
+class VideoConfig:
+    """Settings of ``video-ablation``.
+
+    Attributes:
+        activities: names; empty is all twelve.
+        scenes: names of radar presets.
+        clips: per activity.
+        length_s: of a clip.
+        seed: of the first clip.
+    """
+
+    activities: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = SCENES
+    clips: int = 2
+    length_s: float = 4.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in self.activities:
+            activity_index(name)
+        for scene in self.scenes:
+            if scene not in SCENES:
+                raise TensorsimError(f"scenes: got {scene!r}, expected one of {', '.join(SCENES)}")
+        if self.clips < 1 or not 0.5 <= self.length_s <= 60:
+            raise TensorsimError(
+                f"clips, length_s: got {self.clips} and {self.length_s}, expected at least 1 and from 0.5 to 60 s"
+            )
+
+    def rows(self) -> dict[str, list[ActivityClip]]:
+        """The clips by activity."""
+        found = activity_clips(self.activities, self.clips, self.seed)
+        return {
+            row: [
+                ActivityClip(c.row, c.name, c.seed, self.length_s)
+                for c in clips
+                if isinstance(c, ActivityClip)
+            ]
+            for row, clips in found.items()
+        }
+
+
+class Watcher:
+    """The chains that are compared, each from frames to the people observed in the picture.
+
+    Attributes:
+        chains: by name: frames (T, 3, H, W) -> :class:`~tensorsim.evaluation.films.Observed`.
+        missing: rows that are left out, and why.
+    """
+
+    def __init__(self) -> None:
+        self.detector = RTMDet.from_pretrained()
+        pose = pretrained_pose()
+        self.stages: dict[str, VideoToPose] = {FULL: _stage(self.detector, pose)}
+        self.chains: dict[str, Callable[[Tensor], Observed]] = {
+            FULL: self._by_stage(FULL),
+            MOSSE: self._by_mosse,
+        }
+        try:
+            acf = AcfDetector.from_pretrained()
+            self.stages[ACF] = _stage(acf, pose)
+            self.chains[ACF] = self._by_stage(ACF)
+            without_acf = {}
+        except TensorsimError as error:
+            without_acf = {ACF: f"{error}; train them with `tensorsim train acf`"}
+        self.missing = without_acf | {
+            "TCN": "VideoPose3D: no weights are shipped, and none trained here; the published ones are "
+            "videopose3d-h36m-243 and others of `tensorsim models list`"
+        }
+        for name, row in BY_NAME.items():
+            if find(name).path.is_file():
+                self.stages[row] = _stage(self.detector, pretrained_pose(name))
+                self.chains[row] = self._by_stage(row)
+            else:
+                self.missing[row] = f"needs the published weights: tensorsim models fetch {name}"
+
+    def _by_stage(self, name: str) -> Callable[[Tensor], Observed]:
+        def watch(frames: Tensor) -> Observed:
+            seen = self.stages[name](frames[None], FPS)
+            return Observed(seen.boxes[0], seen.valid[0], seen.keypoints[0], seen.keypoint_scores[0])
+
+        return watch
+
+    def _by_mosse(self, frames: Tensor) -> Observed:
+        """RTMDet starts the filters in the first frame in which it sees somebody."""
+        for first in range(0, len(frames), 2):
+            start = self.detector(frames[first : first + 1])
+            if bool((start.valid & (start.scores >= 0.5)).any()):
+                break
+        tracks = MosseTracker()(frames[None, first:], start)
+        return _observed(self.stages[FULL], frames, tracks, first)
+
+
+def _stage(detector: nn.Module, pose: nn.Module) -> VideoToPose:
+    return VideoToPose(detector, pose, camera=CAMERA).eval()
+
+
+def _observed(stage: VideoToPose, frames: Tensor, tracks: Tracks, first: int) -> Observed:
+    """Tracks from frame ``first`` on with the key points of the stage's pose network."""
+    before = torch.zeros(tracks.valid.shape[1], first, dtype=torch.bool)
+    boxes = torch.cat([tracks.boxes.new_zeros(len(before), first, 4), tracks.boxes[0]], dim=1)
+    valid = torch.cat([before, tracks.valid[0]], dim=1)
+    keypoints, scores = stage.estimate(frames, boxes.transpose(0, 1), valid.transpose(0, 1))
+    return Observed(boxes, valid, keypoints.transpose(0, 1), scores.transpose(0, 1))
+
+
+def video_report(config: VideoConfig, work: Work) -> Report:
+    """Maps and joints of every chain on rendered films, against those of the true motion."""
+    rows = config.rows()
+    watcher = Watcher()
+    pipelines = Pipelines({scene: PRESETS[scene] for scene in config.scenes})
+    cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    jobs = [(row, k) for row, clips in rows.items() for k in range(len(clips))]
+    for row, k in tqdm(jobs, desc="films", unit="film", disable=work.quiet):
+        clip, other = rows[row][k], rows[row][(k + 1) % len(rows[row])]
+
+        def make(clip: ActivityClip = clip, other: ActivityClip = other) -> dict[str, Any]:
+            return _film(clip, other, watcher, pipelines)
+
+        settings = {
+            "row": row, "clip": clip.name, "other": other.name, "length_s": config.length_s, "scenes": config.scenes,
+            "chains": list(watcher.chains),
+        }  # fmt: skip
+        for name, cell in work.kept("film", settings, make).items():
+            cells.setdefault((row, name), []).append(cell)
+    return _report(config, rows, watcher, cells)
+
+
+@torch.inference_mode()
+def _film(clip: ActivityClip, other: ActivityClip, watcher: Watcher, pipelines: Pipelines) -> dict[str, Any]:
+    """By chain and guess: figures of the maps by scene, and errors of the joints."""
+    joints = clip.joints(FPS).float()
+    there = torch.full((1, len(joints)), clip.present)
+    frames = PersonRenderer(CAMERA, HEIGHT, WIDTH)(joints, seed=clip.seed, valid=there).frames
+    truth = {scene: pipelines.truth(scene, clip) for scene in pipelines.scenes}
+    cells: dict[str, Any] = {}
+
+    def scores(maps: dict[str, Maps]) -> dict[str, Any]:
+        return {s: compare(maps[s].like(truth[s]), truth[s], pipelines.speed_m_s(s)) for s in maps}
+
+    setting = Setting("c")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TensorsimWarning)
+        for name, watch in watcher.chains.items():
+            found, valid = pipelines.lifted(setting, clip, watch(frames))
+            maps = {s: pipelines.maps(setting, s, clip, found, valid) for s in pipelines.scenes}
+            cells[name] = {"scores": scores(maps), "pose": pose_errors(found, valid, clip)}
+        cells["empty map"] = {"scores": scores({s: truth[s].empty() for s in truth}), "pose": {}}
+        if other is not clip:
+            guess = {s: pipelines.truth(s, other) for s in truth}
+            cells["another clip"] = {"scores": scores(guess), "pose": {}}
+    return cells
+
+
+def _report(
+    config: VideoConfig,
+    rows: dict[str, list[ActivityClip]],
+    watcher: Watcher,
+    cells: dict[tuple[str, str], list[dict[str, Any]]],
+) -> Report:
+    names = [*watcher.chains, *GUESSES]
+    nan = float("nan")
+
+    def mean(values: list[float]) -> float:
+        finite = [v for v in values if v == v and v != float("inf")]
+        return sum(finite) / len(finite) if finite else nan
+
+    def psnr(row: str, name: str, scene: str, view: str) -> float:
+        return mean([c["scores"][scene][view]["psnr"] for c in cells.get((row, name), ())])
+
+    keys = [(scene, view) for scene in config.scenes for view in MAPS]
+    means = {
+        (name, s, view): mean([psnr(row, name, s, view) for row in rows])
+        for name in names
+        for s, view in keys
+    }
+    main = [[name, *(means[name, scene, view] for scene, view in keys)] for name in names]
+    columns = ["chain", *(f"{SHORT[view]}, {scene}" for scene, view in keys)]
+    tables = [Table("PSNR in dB, mean of the activities", columns, main)]
+    for scene in config.scenes:
+        lines = [[row, *(psnr(row, name, scene, "doppler_time") for name in names)] for row in rows]
+        heading = f"Doppler-time maps by activity, {scene}, PSNR in dB"
+        tables.append(Table(heading, ["activity", *names], lines, file=scene))
+    shown = {
+        name: {scene: (means[name, scene, "doppler_time"], nan) for scene in config.scenes} for name in names
+    }
+    errors = []
+    for name in watcher.chains:
+        poses = [c["pose"] for row in rows for c in cells.get((row, name), ())]
+        errors.append([name, *(mean([pose.get(key, nan) for pose in poses]) for key in _ERRORS)])
+    tables.append(
+        Table(
+            "Errors of the joints in metres, and people found",
+            ["chain", *_ERRORS.values()],
+            errors,
+            3,
+            "joints",
+        )
+    )
+    notes = [
+        f"Rendered films of generated people, {config.clips} of {config.length_s:g} s per activity, with the shipped "
+        "RTMDet and HRNet; every chain differs from the first one in what it is named after. The paper films real "
+        "people and compares with measured maps; its films and maps are not published.",
+        "Left out: " + "; ".join(f"**{row}** ({why})" for row, why in watcher.missing.items()) + ".",
+        NORMALISATION,
+    ]
+    drawn = {
+        "psnr": figures.bars(shown, "PSNR of the Doppler-time map, dB", "Vision module, mean of activities")
+    }
+    return Report(notes, tables, drawn)
+
+
+_ERRORS = {
+    "root": "hips, rms",
+    "joints": "joints about the hips, mean",
+    "range": "of these along y, rms",
+    "people": "people",
+}
+
+
+def quick_video() -> VideoConfig:
+    """One second of one walk."""
+    return VideoConfig(activities=("walking",), clips=1, length_s=1.0)

@@ -1,0 +1,97 @@
+"""Tracks that are one person: those that follow two parts of a body, and those that go on where another ended."""
+
+import torch
+from torch import Tensor
+
+from tensorsim.geometry.boxes import box_area, box_intersection
+
+
+def contained(a: Tensor, b: Tensor) -> Tensor:
+    """Share of the smaller of two boxes that the other covers: (..., 4) xyxy, broadcast -> (...), 0 for empty ones."""
+    smaller = torch.minimum(box_area(a), box_area(b))
+    return box_intersection(a, b) / smaller.clamp(min=1e-9)
+
+
+def join_tracks(
+    table: Tensor, boxes: Tensor, scores: Tensor, looked: Tensor, strong_score: float, longest_gap: int
+) -> Tensor:
+    """Join the tracks of one clip that belong to one person.
+
+    Two tracks are one person if
+
+    - both are there at a time, the smaller box mostly inside the other (median of :func:`contained` at least 0.6),
+      and in at most a quarter of these frames both have detections of ``strong_score``: two people who hug are both
+      detected, a body that crouches is once found whole and once in part; or
+    - one starts at most ``longest_gap`` observed frames after the other ended, or while it ends (in the first quarter
+      of its own frames), and the last box of the one and the next one of the other cover each other by half. Somebody
+      who falls changes the shape of the box at once.
+
+    In frames of both the detection with the better score is taken. Tracks are joined until no pair is left.
+
+    Args:
+        table: (I, T) int64 detection of each track in each frame, -1 for none.
+        boxes: (T, K, 4) xyxy.
+        scores: (T, K).
+        looked: (T,) bool, the frames that were observed.
+        strong_score: from which a detection is sure.
+        longest_gap: in observed frames.
+
+    Returns:
+        (I', T) int64 with I' <= I, in the order of the first of the joined tracks.
+    """
+    order = looked.to(torch.int64).cumsum(0)
+    again = True
+    while again:
+        again = False
+        for i in range(table.shape[0]):
+            for j in range(i + 1, table.shape[0]):
+                if not again and _same(table[i], table[j], boxes, scores, order, strong_score, longest_gap):
+                    joined = _joined(table[i], table[j], scores)
+                    table = torch.cat([table[:i], joined[None], table[i + 1 : j], table[j + 1 :]])
+                    again = True
+    return table
+
+
+def _same(
+    a: Tensor, b: Tensor, boxes: Tensor, scores: Tensor, order: Tensor, strong_score: float, longest_gap: int
+) -> bool:
+    """Whether two tracks (T,) are one person."""
+    at_a, at_b = torch.nonzero(a >= 0).squeeze(-1), torch.nonzero(b >= 0).squeeze(-1)
+    if at_a.shape[0] == 0 or at_b.shape[0] == 0:
+        return False
+    if int(at_a[0]) > int(at_b[0]):
+        a, b, at_a, at_b = b, a, at_b, at_a
+    last, first = at_a[-1], at_b[0]
+    during = int((at_b <= last).sum())
+    if 4 * during <= at_b.shape[0]:
+        after = at_b[during]
+        gap = int(order[after] - order[last])
+        if gap <= longest_gap and bool(contained(boxes[last, a[last]], boxes[after, b[after]]) >= 0.5):
+            return True
+    if int(last) < int(first):
+        return False
+    # Frames of both: a track stays at its last box for a frame in which only the other is matched.
+    stop = torch.minimum(at_a[-1], at_b[-1])
+    time = torch.arange(a.shape[0], device=a.device)
+    both = time[(time >= first) & (time <= stop) & ((a >= 0) | (b >= 0))]
+    box_a, box_b = _latest(a, at_a, both, boxes), _latest(b, at_b, both, boxes)
+    inside = contained(box_a, box_b)
+    twice = int(((_score(a, scores) >= strong_score) & (_score(b, scores) >= strong_score))[both].sum())
+    return bool(inside.median() >= 0.6) and 4 * twice <= both.shape[0]
+
+
+def _latest(track: Tensor, at: Tensor, when: Tensor, boxes: Tensor) -> Tensor:
+    """The last box (n, 4) that a track (T,), matched in the frames ``at``, had up to the frames ``when`` (n,)."""
+    frame = at[torch.searchsorted(at, when, right=True) - 1]
+    return boxes[frame, track[frame]]
+
+
+def _score(track: Tensor, scores: Tensor) -> Tensor:
+    """Score of the detection of a track in every frame (T,), -1 where it has none."""
+    found = scores.gather(1, track.clamp(min=0)[:, None])[:, 0]
+    return torch.where(track >= 0, found, -1.0)
+
+
+def _joined(a: Tensor, b: Tensor, scores: Tensor) -> Tensor:
+    """One track of two, with the better detection where both have one."""
+    return torch.where(_score(b, scores) > _score(a, scores), b, a)
