@@ -20,7 +20,6 @@ from tensorsim.errors import collected_warnings
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.recognition.map_image import MapToImage
 
-
 #: How far a body reaches beyond its joints, range bins beside it, and what bounces inside a wall add to the range.
 _BODY_M, _MARGIN_BINS, _WALL_M = 0.2, 5, 2.0
 
@@ -42,7 +41,8 @@ class Synthesized(NamedTuple):
 def view_config(recipe: DatasetRecipe, view: RadarView, variation: Variation) -> SimulationConfig:
     """The simulation of one radar for one sample."""
     config = recipe.simulation(view)
-    scene = replace(config.scene, body=variation.body, sway=variation.sway, vital_signs=variation.vital_signs)
+    body = cast(Body, variation.body)
+    scene = replace(config.scene, body=body, sway=variation.sway, vital_signs=variation.vital_signs)
     if variation.snr_db is not None:
         scene = replace(scene, snr_db=variation.snr_db)
     if scene.wall is not None:

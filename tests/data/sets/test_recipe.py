@@ -261,3 +261,35 @@ def test_one_noise_for_each_radar() -> None:
     scene = plan.scene(0, "train", variation)
     made = synthesize(recipe, Scene(*scene), variation)
     assert (made.arrays["a.doppler_time"] != made.arrays["b.doppler_time"]).any()
+
+
+def test_an_array_tells_range_direction_and_speed() -> None:
+    outputs = OutputConfig(
+        kinds=("range_doppler_angle", "point_cloud"), frames_per_s=4.0, beams=16, cube_size=(48, 32)
+    )
+    recipe = small_recipe(
+        duration_s=0.3,
+        sources=(SourceConfig(people=1, classes=("walking",)),),
+        radars=(RadarView("array", "ti-awr1843-array"),),
+        outputs=outputs,
+        variations=VariationConfig(heading_deg=(0.0, 0.0), side_m=(0.0, 0.0), distance_m=(3.5, 3.5)),
+    )
+    plan = Plan(recipe)
+    variation = plan.variation(0, 0)
+    scene = plan.scene(0, "train", variation)
+    hips = scene.joints[0, :6, (8, 11)].mean((0, 1))
+    moved = scene._replace(joints=scene.joints + torch.tensor([1.8 - float(hips[0]), 0.0, 0.0]))
+    distance = float(np.hypot(1.8, float(hips[1])))
+    made = synthesize(recipe, moved, variation).arrays
+    points = made["array.point_cloud"].reshape(-1, 4)
+    there = points[~np.isnan(points[:, 0])]
+    assert len(there) >= 3
+    range_m, speed, sine, _ = np.median(there, axis=0)
+    assert abs(range_m - distance) < 0.3
+    assert abs(sine - 1.8 / distance) < 0.08
+    assert 0.2 < speed < 2.0  # it approaches
+    cube = made["array.range_doppler_angle"]
+    assert cube.shape == (1, 48, 32, 16)
+    _, _, doppler, beam = np.unravel_index(cube.argmax(), cube.shape)
+    assert doppler >= 16
+    assert abs((beam + 0.5) / 8 - 1 - 1.8 / distance) < 0.15
