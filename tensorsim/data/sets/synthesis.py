@@ -2,14 +2,13 @@
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from tensorsim.config import SimulationConfig
-from tensorsim.config.scene import Body
 from tensorsim.data.sets import outputs
 from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.outputs import OutputConfig, Stored
@@ -19,7 +18,6 @@ from tensorsim.data.sets.variations import Variation, seed_of
 from tensorsim.errors import collected_warnings
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.recognition.map_image import MapToImage
-
 
 #: How far a body reaches beyond its joints, range bins beside it, and what bounces inside a wall add to the range.
 _BODY_M, _MARGIN_BINS, _WALL_M = 0.2, 5, 2.0
