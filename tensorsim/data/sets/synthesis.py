@@ -2,14 +2,13 @@
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from tensorsim.config import SimulationConfig
-from tensorsim.config.scene import Body
 from tensorsim.data.sets import outputs
 from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.outputs import OutputConfig, Stored
