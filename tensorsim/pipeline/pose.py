@@ -136,6 +136,7 @@ class VideoToPose(nn.Module):
                 neighbours=people.neighbours,
                 temporal=people.temporal,
                 pitch_rad=people.camera.pitch_rad,
+                roll_rad=people.camera.roll_rad,
             ),
             metric_pose=MetricPose(
                 people.camera,
@@ -160,7 +161,7 @@ class VideoToPose(nn.Module):
             )
         other = copy.copy(self)
         other._modules = dict(self._modules)
-        other.lifter = self.lifter.tilted(camera.pitch_rad)
+        other.lifter = self.lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
