@@ -10,6 +10,7 @@ import tyro
 
 from tensorsim import process
 from tensorsim.commands.check import Check
+from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_camera import EvaluateCamera
 from tensorsim.commands.evaluate_classifier import EvaluateClassifier
@@ -19,12 +20,15 @@ from tensorsim.commands.evaluate_films import EvaluateFilms
 from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
+from tensorsim.commands.experiment import RunExperiment
 from tensorsim.commands.library import BuildLibrary
 from tensorsim.commands.models import FetchModels, ListModels, VerifyModels
 from tensorsim.commands.simulate import Simulate
+from tensorsim.commands.train_acf import TrainAcf
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
 
@@ -38,7 +42,10 @@ examples:
   tensorsim simulate walk.bvh --out out/ --initial-distance 4
   tensorsim demo --activity kicking --out demo/
   tensorsim evaluate truth --out truth/ --clips 2
+  tensorsim experiment networks --out networks/ --quick
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
+  tensorsim dataset example > recipe.yaml
+  tensorsim dataset build recipe.yaml --out data/ --workers 2
   tensorsim check
 
 Networks come with tensorsim; others can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE.
@@ -66,10 +73,17 @@ COMMANDS: dict[str, Any] = {
         {
             "detector": TrainDetector,
             "pose": TrainPose,
+            "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
+            "acf": TrainAcf,
         },
     ),
+    "dataset": (
+        "Labelled data sets of radar maps from a recipe.",
+        {"build": DatasetBuild, "example": DatasetExample, "sample": DatasetSample},
+    ),
+    "experiment": RunExperiment,
     "library": ("Pools of poses for nearest-match lifting.", {"build": BuildLibrary}),
     "models": (
         "Weights by name: shipped ones and published ones.",

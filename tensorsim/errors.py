@@ -4,7 +4,7 @@ The checks compile under TorchScript, so a scripted graph refuses the same input
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -122,6 +122,18 @@ def check_not_empty(x: Tensor, name: str) -> None:
         raise TensorsimError(
             f"{name}: got an empty tensor of shape {list(x.shape)}, expected at least one element"
         )
+
+
+def check_replaced(part: str, given: Mapping[str, bool]) -> None:
+    """Refuse arguments that a ready ``part``, passed beside them, would leave without effect.
+
+    Args:
+        part: name of the argument that takes a ready module.
+        given: by name, whether each argument that the part replaces was given.
+    """
+    unused = [name for name, is_given in given.items() if is_given]
+    if unused:
+        raise TensorsimError(f"{part}: got a ready one and {', '.join(unused)}, expected one or the other")
 
 
 def is_exporting() -> bool:

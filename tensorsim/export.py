@@ -1,10 +1,12 @@
-"""Export to TorchScript files that run where tensorsim is not installed."""
+"""Export to TorchScript and ONNX files that run where tensorsim is not installed."""
 
 import os
 import warnings
+from collections.abc import Sequence
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
@@ -37,3 +39,74 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
                 part.training = True
         with complete_file(path) as scratch:
             torch.jit.save(scripted, str(scratch))
+
+
+def to_onnx(
+    module: nn.Module,
+    path: str | os.PathLike[str],
+    example: Sequence[Tensor],
+    dynamic: dict[int, dict[int, str]] | None = None,
+    outputs: Sequence[str] = (),
+) -> None:
+    """Export a stage in evaluation mode to an ONNX file, for ONNX Runtime and what else reads it.
+
+    Args:
+        module: takes tensors and returns a tensor or a tuple of them; its training mode is left as it was. ONNX has no
+            complex numbers: see :class:`ComplexPairs` for stages that have.
+        path: file to write; it appears only when complete.
+        example: inputs of the shapes that the file is for.
+        dynamic: dimensions that may have other sizes, by input and dimension, with their names: ``{0: {0: "batch"}}``.
+            Sizes 0 and 1 of an example cannot be dynamic.
+        outputs: names of the outputs.
+
+    Raises:
+        TensorsimError: the path is a folder, or the module has an operation that ONNX does not have.
+    """
+    if os.path.isdir(path):
+        raise TensorsimError(f"{os.fspath(path)}: is a folder, expected a file to write")
+    shapes: Any = None
+    if dynamic:
+        shapes = tuple(
+            {d: torch.export.Dim(name) for d, name in dynamic.get(i, {}).items()} for i in range(len(example))
+        )
+    training = [part for part in module.modules() if part.training]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporter about its own parts
+        try:
+            program = torch.onnx.export(
+                module.eval(),
+                tuple(example),
+                dynamo=True,
+                dynamic_shapes=shapes,
+                output_names=list(outputs) or None,
+                verbose=False,
+            )
+        except Exception as error:  # the exporter's errors share no base class
+            cause = str(error.__cause__ or error).strip().splitlines()
+            raise TensorsimError(
+                f"to_onnx: got a {type(module).__name__} that ONNX cannot express ({cause[0] if cause else error})"
+            ) from error
+        finally:
+            for part in training:
+                part.training = True
+        if program is None:
+            raise TensorsimError(f"to_onnx: got no program for {type(module).__name__}, expected one")
+        with complete_file(path) as scratch:
+            program.save(str(scratch))
+
+
+class ComplexPairs(nn.Module):
+    """A stage with complex inputs or outputs as one with pairs (..., 2) of real and imaginary part.
+
+    Args:
+        stage: takes and returns a tensor, either of them complex.
+    """
+
+    def __init__(self, stage: nn.Module) -> None:
+        super().__init__()
+        self.stage = stage
+
+    def forward(self, pairs: Tensor) -> Tensor:
+        """Pairs (..., 2) to what the stage returns, complex numbers as pairs."""
+        found = self.stage(torch.view_as_complex(pairs))
+        return torch.view_as_real(found) if found.is_complex() else found

@@ -78,7 +78,7 @@ def complete_or_nothing(out: Path) -> Iterator[Path]:
         TensorsimError: another process is writing into ``out``, or there is a folder where a file should be.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(out):
+    with locked(out):
         scratch = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
         try:
             new, old = scratch / "new", scratch / "old"
@@ -127,7 +127,7 @@ def _listed(out: Path) -> list[str]:
 
 
 @contextmanager
-def _locked(out: Path) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """Lock a folder for this process; the lock is released when the process ends, also by a crash."""
     try:
         import fcntl

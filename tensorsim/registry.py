@@ -1,7 +1,7 @@
-"""Weights by name: those that come with tensorsim, and those that others publish.
+"""Weights by name: those shipped with tensorsim, and those that others publish.
 
 Shipped files are inside the package; others are downloaded once into the user's cache and checked against their
-SHA-256. Instead of a name, a path always works.
+SHA-256. A path can be given in place of a name.
 """
 
 import hashlib
@@ -23,11 +23,11 @@ class ModelEntry:
         network: class that loads it.
         file: its file name.
         licence: terms of the weights.
-        source: who made them from what.
-        metrics: accuracy as its makers state it, or a reference to the card.
-        preprocessing: what the network expects; the class does it.
+        source: authors and training data.
+        metrics: accuracy as its authors state it, or a reference to the card.
+        preprocessing: of the input, which the class does.
         sha256: full digest, its first eight digits where only those are published, or "" where none is.
-        url: where it is downloaded from; None for a shipped file.
+        url: address of the file; None for a shipped one.
         default: whether ``from_pretrained()`` without a name loads it.
     """
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
 from tensorsim.data.motion_files import load_motion, place
@@ -224,8 +225,8 @@ def motion_source(
 
 def _in_front(motion: Motion, nearest: float) -> Motion:
     """People moved so that none comes nearer than :data:`NEAREST_M` and their paths are centred on x = 0."""
-    hips = motion.joints[motion.valid][:, (8, 11), 0]
-    shift = motion.joints.new_tensor([-float(hips.min() + hips.max()) / 2, NEAREST_M - nearest, 0.0])
+    x = mid_hips(motion.joints[motion.valid])[:, 0]
+    shift = motion.joints.new_tensor([-float(x.min() + x.max()) / 2, NEAREST_M - nearest, 0.0])
     return motion._replace(joints=(motion.joints + shift) * motion.valid[..., None, None])
 
 

@@ -1,7 +1,7 @@
-"""Weight files: read what others publish without running it, and load it completely or not at all.
+"""Weight files: read without running code in them, and loaded completely or not at all.
 
-A ``.pth`` file is a pickle, that is, a program. It is read here by an unpickler that knows how to build
-tensors and nothing else, so a published file is safe to open whoever made it.
+A ``.pth`` file is a pickle, that is, a program. It is read here by an unpickler that can build tensors and nothing
+else, so that files from any source are safe to open.
 """
 
 import functools
@@ -25,11 +25,11 @@ from tensorsim.files import check_pickle_memo, complete_file
 
 PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
 
-# Published files are called `...-HASH8.pth` or `...-HASH8_DATE.pth`, HASH8 the head of their SHA-256.
+# Published files are called `...-HASH8.pth` or `...-HASH8_DATE.pth`, where HASH8 are the first digits of the SHA-256.
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8})(?:_\d{8})?$")
 _DATE = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 
-# What a file of weights is made of. Only these names of a pickle become the real thing.
+# The types in a weight file. Only these names in a pickle are resolved to real objects.
 _TENSOR_PARTS = {
     ("collections", "OrderedDict"): OrderedDict,
     ("torch", "Size"): torch.Size,
@@ -40,17 +40,17 @@ _TENSOR_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
     ("torch._utils", "_rebuild_parameter"): torch._utils._rebuild_parameter,
 }
 
-# Training logs lie beside the weights in published checkpoints (mmengine's message hub, NumPy scalars). Their
-# objects are read as placeholders that do nothing; a name from anywhere else is refused.
+# Published checkpoints also contain training logs (mmengine's message hub, NumPy scalars). Their objects are read as
+# placeholders that do nothing; names of other packages are refused.
 _LOG_PACKAGES = ("mmengine", "mmcv", "numpy", "collections", "datetime", "_codecs")
 _LOG_BUILTINS = ("getattr", "set", "frozenset", "slice", "range", "complex", "bytearray")
 
-# Unpacked over packed size of a checkpoint; torch writes about 1.
+# Largest ratio of unpacked to packed size of a checkpoint; files that torch writes have about 1.
 _MAX_COMPRESSION = 20
 
 
 class _Placeholder:
-    """Stands for an object beside the weights: accepts whatever a pickle does to it and does nothing."""
+    """Takes the place of an object beside the weights: accepts all calls of a pickle and does nothing."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
@@ -141,7 +141,7 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 
 def read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
-    """What the header of a ``.safetensors`` file says beside its tensors; {} of any other file.
+    """The metadata in the header of a ``.safetensors`` file; {} for any other file.
 
     Raises:
         TensorsimError: a damaged file.
@@ -159,8 +159,8 @@ def read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
 
 
 def input_size_of(path: Path) -> tuple[int, int] | None:
-    """(height, width) of the pictures that weights were trained on: as their header states it (``"128x96"``), or as
-    published files have it in their names (``...384x288...``); None if neither does.
+    """(height, width) of the pictures that weights were trained on, from the header (``"128x96"``) or from the name of
+    a published file (``...384x288...``); None where neither states it.
 
     Raises:
         TensorsimError: a damaged file.
@@ -179,7 +179,7 @@ def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | 
     Args:
         module: receives the weights.
         state_dict: tensors by name.
-        source: where they come from, for the message.
+        source: their file, for the message.
 
     Raises:
         TensorsimError: names what is missing, unexpected or of another shape.
@@ -251,7 +251,7 @@ def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict
 
 
 def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Refuse what no training leaves behind: numbers that are not finite, variances below zero, repeated storage."""
+    """Refuse values that trained weights cannot have: not finite, negative variances, fewer stored than shown."""
     for key, value in tensors.items():
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise TensorsimError(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer, warn_of_label
+from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
 from tensorsim.errors import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tensorsim.config import CameraConfig, SimulationConfig
     from tensorsim.motion.activities import GeneratedMotion
     from tensorsim.render.renderer import RenderedVideo
-    from tensorsim.types import Pose
+    from tensorsim.types import Pose, RadarMaps
 
 FILM_FPS = 30.0
 #: The true motion is worked out this many times per frame of the film.
@@ -83,50 +83,29 @@ class Demo(NetworkOptions, RadarOptions):
                 source = film_source(VideoReader(folder / "film.mp4"), people, device)
                 pose, maps = results.simulate(source, maps_stage, folder, config, device, self.quiet)
                 torch.manual_seed(config.seed)
-                true_maps = maps_of_pose(
-                    true_stage,
-                    true_pose(truth.joints, truth.valid),
-                    FILM_FPS * MOMENTS_PER_FRAME,
-                    device,
-                    self.quiet,
-                )
-                label = results.label_of(recognizer, maps, frames / FILM_FPS, self.least_probability)
-                warn_of_label(recognizer, config, int(pose.valid.any(-1).sum()))
+                rate_hz = FILM_FPS * MOMENTS_PER_FRAME
+                joints = true_pose(truth.joints, truth.valid)
+                true_maps = maps_of_pose(true_stage, joints, rate_hz, device, self.quiet)
                 somebody = bool(truth.valid.any() | pose.valid.any())
-                pictures = self.pictures(
-                    maps_stage, label["label"], f"demo: {ACTIVITIES[activity]}", somebody
-                )
-                results.write_maps(folder, maps, results.axes_of(maps_stage, maps), true_maps, pictures)
-                results.write_pose(folder, pose, FILM_FPS, pictures)
-                if self.sound:
-                    results.write_doppler_sound(folder, maps_stage, pose, FILM_FPS, device)
+                name = f"demo: {ACTIVITIES[activity]}"
+                done = Run(config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device)
+                label = self.write_results(folder, done, true_maps)
                 write_pose_truth(folder, film, truth.valid)
-                likeness = results.similarity(maps, true_maps)
-                empty = maps._replace(**{name: torch.zeros_like(getattr(maps, name)) for name in likeness})
-                empty_likeness = results.similarity(empty, true_maps)
-                summary = (
-                    label
-                    | results.summary_of(source, config, pose, maps)
-                    | {
-                        "activity": ACTIVITIES[activity],
-                        "person_height_m": round(height_m, 4),
-                        **drawn_by(camera, (HEIGHT, WIDTH)),
-                        "film_against_truth": likeness | joint_errors(pose, film),
-                        "empty_map_against_truth": empty_likeness,
-                        "options": self.described(),
-                        "warnings": messages,
-                    }
-                )
-                results.write_summary(folder, summary)
+                likeness, empty_likeness = likeness_to_truth(maps, true_maps)
+                about = {
+                    "activity": ACTIVITIES[activity],
+                    "person_height_m": round(height_m, 4),
+                    **drawn_by(camera, (HEIGHT, WIDTH)),
+                    "film_against_truth": likeness | joint_errors(pose, film),
+                    "empty_map_against_truth": empty_likeness,
+                    "options": self.described(),
+                    "warnings": messages,
+                }
+                results.write_summary(folder, label | results.summary_of(source, config, pose, maps) | about)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
-        figures = likeness["doppler_time"]
-        people_found = int(pose.valid[0].any(1).sum())
-        print(
-            f"{self.out}: {ACTIVITIES[activity]}, {people_found} people found; Doppler-time map from the film "
-            f"against that of the true motion: PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']} "
-            f"(an empty map: PSNR {empty_likeness['doppler_time']['psnr_linear_db']} dB)"
-        )
+        found = f"{ACTIVITIES[activity]}, {int(pose.valid[0].any(1).sum())} people found"
+        print(f"{self.out}: {found}; {described_likeness(likeness, empty_likeness)}")
 
     def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":
         """The configuration for a film of the demonstration, with the files of its networks."""
@@ -196,9 +175,32 @@ def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":
     return Pose(blank[..., :2, :].flatten(-2), blank, blank[..., 0], joints[None].float(), valid[None])
 
 
+def likeness_to_truth(maps: "RadarMaps", truth: "RadarMaps") -> tuple[dict[str, Any], dict[str, Any]]:
+    """How like maps are to the true ones, and how like empty maps are; see :func:`tensorsim.results.similarity`."""
+    import torch
+
+    from tensorsim.results import similarity
+
+    likeness = similarity(maps, truth)
+    empty = maps._replace(**{name: torch.zeros_like(getattr(maps, name)) for name in likeness})
+    return likeness, similarity(empty, truth)
+
+
+def described_likeness(likeness: dict[str, Any], empty: dict[str, Any]) -> str:
+    """The figures of the Doppler-time map in one line."""
+    figures = likeness["doppler_time"]
+    return (
+        "Doppler-time map from the film against that of the true motion: "
+        f"PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']} "
+        f"(an empty map: PSNR {empty['doppler_time']['psnr_linear_db']} dB)"
+    )
+
+
 def joint_errors(pose: "Pose", film: "RenderedVideo") -> dict[str, Any]:
     """How far the joints that were found are from the true ones, for the person found longest; None without."""
     import torch
+
+    from tensorsim.body.skeleton import mid_hips
 
     found = pose.valid[0]
     if not bool(found.any()) or not bool(film.valid.any()):
@@ -206,7 +208,7 @@ def joint_errors(pose: "Pose", film: "RenderedVideo") -> dict[str, Any]:
     best = int(found.sum(dim=1).argmax())
     both = found[best] & film.valid[0]
     estimate, truth = pose.joints[0, best, both], film.joints[0, both]
-    root, true_root = estimate[:, (8, 11)].mean(dim=1), truth[:, (8, 11)].mean(dim=1)
+    root, true_root = mid_hips(estimate), mid_hips(truth)
     posture = (estimate - root[:, None]) - (truth - true_root[:, None])
     away = (root - true_root)[:, 1]
     return {

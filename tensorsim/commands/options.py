@@ -5,25 +5,29 @@ import math
 import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
+from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
 from tensorsim.errors import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
+    import torch
+
     from tensorsim.config import SimulationConfig
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.recognition import ActivityRecognizer
     from tensorsim.results import Pictures
+    from tensorsim.types import Pose, RadarMaps
 
 #: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
 FULL_RATE_PULSES = 1 << 17
 DISPLAY_RATE_HZ = 256.0
 
 #: The field of the configuration that an option sets.
-FIELDS = {
+FIELDS: dict[str, str] = {
     "body": "scene__body",
     "integration": "processing__integration",
     "wall_paths": "scene__wall_paths",
@@ -33,7 +37,8 @@ FIELDS = {
     "classifier": "classifier",
     "seed": "seed",
     "people": "pose__people",
-} | PANEL_FIELDS
+}
+FIELDS |= PANEL_FIELDS | RECEIVER_FIELDS
 
 
 def check_seed(seed: int, option: str = "--seed") -> None:
@@ -43,7 +48,7 @@ def check_seed(seed: int, option: str = "--seed") -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RadarOptions(PanelOptions):
+class RadarOptions(PanelOptions, ReceiverOptions):
     """How people's joints become maps. Options without a value keep that of the configuration."""
 
     config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None
@@ -83,7 +88,8 @@ class RadarOptions(PanelOptions):
     snr: float | None = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
     denoiser: str | None = None
-    """DnCNN weights (.pth or .safetensors, or a name such as dncnn-radar-maps) to clean the shown maps."""
+    """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
+    .safetensors or a name of `tensorsim models list`). Default: none."""
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
@@ -154,6 +160,29 @@ class RadarOptions(PanelOptions):
             None if somebody else plot.person_peaks(simulator),
         )
 
+    def write_results(self, folder: Path, run: "Run", truth: "RadarMaps | None" = None) -> dict[str, Any]:
+        """Label the maps of a run and write them, the poses, their pictures and the sound.
+
+        Args:
+            folder: where to.
+            run: what was simulated.
+            truth: maps of the true motion, where it is known; drawn beside the others.
+
+        Returns:
+            What ``summary.json`` says of the label.
+        """
+        from tensorsim import results
+
+        pose, maps, stage = run.pose, run.maps, run.stage
+        label = results.label_of(run.recognizer, maps, pose.valid.shape[2] / run.fps, self.least_probability)
+        warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()))
+        pictures = self.pictures(stage, label["label"], run.film, run.somebody)
+        results.write_maps(folder, maps, results.axes_of(stage, maps), truth, pictures)
+        results.write_pose(folder, pose, run.fps, pictures)
+        if self.sound:
+            results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
+        return label
+
     def configuration(self) -> "SimulationConfig":
         """The configuration of the run: that of ``--config``, with the other options in place of its fields.
 
@@ -172,6 +201,7 @@ class RadarOptions(PanelOptions):
         for switch in ("leakage", "wall_echo", "sway", "vital_signs"):
             if getattr(self, switch):
                 config = config.replace(**{f"scene__{switch}": True})
+        config = self.with_receiver(config)
         for option, field in FIELDS.items():
             value = getattr(self, option)
             if value is not None:
@@ -194,13 +224,33 @@ class RadarOptions(PanelOptions):
             chosen = radar_scene(self.radar)
         except TensorsimError as error:
             raise TensorsimError(f"--radar: {error}") from None
-        if chosen.radar.has_array:
-            raise TensorsimError(
-                f"--radar: {self.radar} has several antennas, expected one transmitter and one receiver: the maps "
-                "of this command have no antenna dimension"
-            )
         wall = chosen.wall if chosen.wall is not None else config.scene.wall
         return config.replace(scene__radar=chosen.radar, scene__wall=wall, scene__floor=chosen.floor)
+
+
+class Run(NamedTuple):
+    """What was simulated, and how.
+
+    Attributes:
+        config: of the run.
+        stage: made the maps.
+        recognizer: of the maps; None gives no label.
+        pose, maps: what came out, on the CPU; the maps without batch dimensions.
+        fps: frames per second of the poses.
+        film: what the people come from, for the titles.
+        somebody: whether a person is in the scene.
+        device: that ``stage`` is on.
+    """
+
+    config: "SimulationConfig"
+    stage: "PoseToDoppler"
+    recognizer: "ActivityRecognizer | None"
+    pose: "Pose"
+    maps: "RadarMaps"
+    fps: float
+    film: str
+    somebody: bool
+    device: "torch.device"
 
 
 def at_display_rate(config: "SimulationConfig", length_s: float) -> "SimulationConfig":

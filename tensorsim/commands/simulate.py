@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer, warn_of_label
+from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
 from tensorsim.errors import TensorsimError, collected_warnings
 from tensorsim.limits import check_range
 
@@ -39,6 +39,7 @@ _MEANT_FOR = {
     "calibrate": ("video",),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
+    "lifter": ("video", "keypoints"),
     "library": ("video", "keypoints"),
     "image_size": ("keypoints",),
     "clip": ("motion",),
@@ -70,8 +71,11 @@ class Simulate(NetworkOptions, RadarOptions):
     """Estimate tilt, height and field of view of the camera from the people of the film."""
     position: Literal["camera", "paper"] | None = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
+    lifter: Literal["temporal", "nearest"] | None = None
+    """How key points become 3D: by a network that sees a window of time, or from the nearest poses of a library.
+    Default: nearest."""
     library: Path | None = None
-    """Pool of poses for the lifting to 3D, as `tensorsim library build` writes it. Default: the shipped one."""
+    """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -116,15 +120,11 @@ class Simulate(NetworkOptions, RadarOptions):
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
                 pose, maps = results.simulate(source, stage, folder, config, device, self.quiet)
-                duration_s = pose.valid.shape[2] / source.fps
-                label = results.label_of(recognizer, maps, duration_s, self.least_probability)
-                warn_of_label(recognizer, config, int(pose.valid.any(-1).sum()))
                 somebody = bool(pose.valid.any())
-                pictures = self.pictures(stage, label["label"], self.source.name, somebody)
-                results.write_maps(folder, maps, results.axes_of(stage, maps), pictures=pictures)
-                results.write_pose(folder, pose, source.fps, pictures)
-                if self.sound:
-                    results.write_doppler_sound(folder, stage, pose, source.fps, device)
+                done = Run(
+                    config, stage, recognizer, pose, maps, source.fps, self.source.name, somebody, device
+                )
+                label = self.write_results(folder, done)
                 summary = label | results.summary_of(source, config, pose, maps)
                 results.write_summary(folder, summary | {"options": self.described(), "warnings": messages})
         for message in messages:
@@ -141,6 +141,7 @@ class Simulate(NetworkOptions, RadarOptions):
             ("pose__initial_distance_m", self.initial_distance),
             ("pose__camera__horizontal_fov_rad", camera_fov),
             ("pose__position", self.position),
+            ("pose__lifter", self.lifter if self.library is None or self.lifter is not None else "nearest"),
             ("pose__library", None if self.library is None else str(self.library)),
         ):
             if value is not None:
@@ -152,16 +153,6 @@ class Simulate(NetworkOptions, RadarOptions):
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
         super().check(out)
-        for name, values in (
-            ("person-height", self.person_height),
-            ("initial-distance", self.initial_distance),
-            ("image-size", self.image_size),
-        ):
-            if values is not None and (
-                len(values) == 0 or not all(math.isfinite(v) and v > 0 for v in values)
-            ):
-                unit = "pixels" if name == "image-size" else "metres"
-                raise TensorsimError(f"--{name}: got {values}, expected positive numbers of {unit}")
         for name, quantity in (
             ("person_height", "body height"),
             ("initial_distance", "distance"),
@@ -173,9 +164,11 @@ class Simulate(NetworkOptions, RadarOptions):
             ("end", "time"),
             ("stride", "stride"),
         ):
-            given = getattr(self, name)
+            given, option = getattr(self, name), f"--{name.replace('_', '-')}"
+            if given == ():
+                raise TensorsimError(f"{option}: got no numbers, expected at least one")
             for value in given if isinstance(given, tuple) else [given] * (given is not None):
-                check_range(value, quantity, f"--{name.replace('_', '-')}")
+                check_range(value, quantity, option)
         if self.calibrate and (self.camera_fov is not None or self.initial_distance is not None):
             raise TensorsimError(
                 "--calibrate: got --camera-fov or --initial-distance beside it, expected one way to the camera"

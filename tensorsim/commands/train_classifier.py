@@ -1,5 +1,6 @@
-"""``tensorsim train classifier``: train an activity classifier on maps of generated people."""
+"""``tensorsim train classifier``: train a classifier on maps of generated people, or on a data set of your own."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,6 +16,12 @@ class TrainClassifier(TrainOptions):
 
     Attributes:
         maps: folder of maps; those that are missing are made first (hours: 12 clips per person and scene).
+        data: a data set of ``tensorsim dataset build`` in place of ``maps``: its classes, its parts for training and
+            validation. Beside the weights, the confusion matrix (confusion.md) and the network as TorchScript and ONNX
+            (picture_to_label.pt, .onnx) are written. Of the other options, network, size, learning_rate, masks, epochs,
+            batch and init count; ``init`` may have other classes.
+        labels: classes of ``data`` to train on; all if none are given.
+        radars: radars of ``data`` whose maps are seen, as channels; all if none are given.
         network: SPNet on 224x224 pictures, or SPGNet (s2p6) on 32x32.
         scenes: what to train on.
         people: people per scene; each does all 12 activities, and every fifth is held out.
@@ -34,7 +41,10 @@ class TrainClassifier(TrainOptions):
         film_seed: of people, motion and noise of ``film_maps``.
     """
 
-    maps: Path
+    maps: Path | None = None
+    data: Path | None = None
+    labels: tuple[str, ...] = ()
+    radars: tuple[str, ...] = ()
     network: Literal["spnet", "spgnet"] = "spnet"
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     people: int = 300
@@ -52,6 +62,44 @@ class TrainClassifier(TrainOptions):
 
     def run(self) -> None:
         """Do it."""
+        if (self.maps is None) == (self.data is None):
+            raise TensorsimError("--maps, --data: got both or none, expected one of them")
+        if self.maps is not None:
+            if self.labels or self.radars:
+                raise TensorsimError("--labels, --radars: got some without --data, expected none")
+            self._train_on_activities(self.maps)
+        elif self.data is not None:
+            self._train_on_data(self.data)
+
+    def _train_on_data(self, data: Path) -> None:
+        from tensorsim.training.map_classifier import MapRecipe, write_outcome
+
+        self.loop(steps=1, batch=self.batch)  # refuses what cannot work before the data are read
+        recipe = MapRecipe(
+            data,
+            self.network,
+            self.labels or None,
+            None,
+            self.radars or None,
+            self.size,
+            self.init,
+            self.seed,
+            self.learning_rate,
+            self.masks,
+        )
+        epoch = max(1, len(recipe.training) // self.batch)
+        loop = self.loop(
+            steps=self.epochs * epoch,
+            batch=self.batch,
+            checkpoint_every=min(50, epoch),
+            validate_every=epoch,
+            ema_decay=0.0,
+        )
+        best = self.train(recipe, loop)
+        if int(os.environ.get("RANK", 0)) == 0:
+            write_outcome(recipe, best)
+
+    def _train_on_activities(self, maps: Path) -> None:
         from tensorsim.config import ACTIVITIES
         from tensorsim.training.classifier import ClassifierRecipe, held_out
         from tensorsim.training.film_errors import FilmErrors, watched_films
@@ -79,10 +127,10 @@ class TrainClassifier(TrainOptions):
                 self.film_maps, self.film_people, self.scenes, settings, quiet=self.quiet, errors=errors
             )
             filmed = MapStore(self.film_maps)
-        build_maps(self.maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
+        build_maps(maps, self.people, self.scenes, MapSettings(seed=self.maps_seed), quiet=self.quiet)
         recipe = ClassifierRecipe(
             self.network,
-            MapStore(self.maps),
+            MapStore(maps),
             self.scenes,
             self.people,
             self.snr,

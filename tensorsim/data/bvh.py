@@ -12,9 +12,9 @@ from tensorsim.data.skeletons import Motion, motion_of, plain_name
 from tensorsim.errors import TensorsimError
 from tensorsim.files import reading
 
-#: Metres per unit that capture files come in: metres, centimetres, inches, millimetres, CMU's ASF units.
+#: Units of capture files in metres: metre, centimetre, inch, millimetre, unit of CMU's ASF files.
 _UNITS_M = (1.0, 0.01, 0.0254, 0.001, 0.0254 / 0.45)
-#: Trunk, thigh and shank of a body 1.75 m tall.
+#: Length of trunk, thigh and shank together, of a body 1.75 m tall.
 _TYPICAL_M = 1.36
 
 
@@ -31,7 +31,7 @@ def read_bvh(path: Path, fps: float | None, unit_m: float | None) -> Motion:
     with reading(path, "BVH"):
         clip = pybvh.read_bvh_file(path)
         nodes = torch.from_numpy(np.ascontiguousarray(clip.node_positions(), dtype=np.float64))
-        # "+y" and the like; the other two axes keep their handedness and y-up files face the radar.
+        # For example "+y". The frame stays right-handed, and people of y-up files face the radar.
         vertical = str(clip.world_up)
         head = next((n for n in clip.joint_names if plain_name(n) == "head"), None)
         end = None if head is None else clip.joint_tips.get(head)
@@ -58,7 +58,7 @@ def _upright(points: Tensor, vertical: str) -> Tensor:
 
 
 def _size(joints: Tensor) -> float:
-    """Median length of trunk, thigh and shank together, (T, 14, 3) -> one number."""
+    """Median over the frames of the length of trunk, thigh and shank together, of joints (T, 14, 3)."""
 
     def length(a: Tensor, b: Tensor) -> float:
         return float((a - b).norm(dim=-1).median())

@@ -18,8 +18,8 @@ class Keypoints2D(NamedTuple):
 
     Attributes:
         keypoints: (T, P, 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
-        scores: (T, P, 17); 0 where a keypoint was not labelled.
-        valid: (T, P) bool, whether the person is in that frame.
+        scores: (T, P, 17); 0 where a keypoint is not labelled.
+        valid: (T, P) bool, whether the person is in the frame.
         size: (height, width) of the frames in pixels; None where the file does not say.
     """
 
@@ -30,14 +30,15 @@ class Keypoints2D(NamedTuple):
 
 
 def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
-    """Reads COCO keypoints of a video: annotations or results in one JSON file, or a folder with one per frame.
+    """Read COCO keypoints of a video: annotations or results in one JSON file, or a folder with one file per frame.
 
-    Frames are image ids in ascending order (files of a folder in order of name); people are ``track_id`` where
-    there is one, else they stand in their order. ``keypoints`` are 51 numbers (x, y, visibility or score).
+    Frames are in ascending order of their image ids, or of the names of the files in a folder. People are told apart by
+    ``track_id`` where there is one, else by their order in each frame. ``keypoints`` are 51 numbers: x, y, and
+    visibility or score of each.
 
     Raises:
-        TensorsimError: files that are missing or not such JSON, no people, other than 17 keypoints, a ``track_id``
-            of some people only.
+        TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, a
+            ``track_id`` for some people only.
     """
     path = Path(path)
     if not path.exists():

@@ -1,7 +1,7 @@
 """Human3.6M as VideoPose3D publishes it: a pickle inside an npz.
 
-A pickle is a program, and one that builds NumPy's objects from raw bytes can reach any address of the process. Here
-it can name five things only, and each of them is a class of this file that keeps what it is given; the arrays are made
+A pickle is a program, and one that builds NumPy objects from raw bytes can read and write any address of the process.
+Here a pickle can refer to five names only. Each is a class of this file that stores its arguments; the arrays are built
 afterwards, from numbers of plain types.
 """
 
@@ -19,19 +19,19 @@ from tensorsim.data.skeletons import Motion, motion_of
 from tensorsim.errors import TensorsimError
 from tensorsim.files import check_pickle_memo
 
-#: The joints of Human3.6M's 32 that the body needs, by index.
+#: Those of the 32 joints of Human3.6M that the body needs, by index.
 H36M_JOINTS = {
     14: "nose", 25: "right_shoulder", 26: "right_elbow", 27: "right_wrist", 17: "left_shoulder", 18: "left_elbow",
     19: "left_wrist", 1: "right_hip", 2: "right_knee", 3: "right_ankle", 6: "left_hip", 7: "left_knee", 8: "left_ankle",
 }  # fmt: skip
 H36M_FPS = 50.0
 
-#: Plain numbers; no objects, no structures, no text.
+#: Types of arrays that are read: no objects, structures or text.
 _NUMBERS = ("f2", "f4", "f8")
 
 
 class _Dtype:
-    """What a pickle says of a ``numpy.dtype``."""
+    """The arguments and the state of a pickled ``numpy.dtype``."""
 
     def __init__(self, code: Any = "", *_: Any) -> None:
         self.code = code
@@ -45,7 +45,7 @@ class _Dtype:
 
 
 class _Array:
-    """What a pickle says of a ``numpy.ndarray``."""
+    """The arguments and the state of a pickled ``numpy.ndarray``."""
 
     def __init__(self, *_: Any) -> None:
         self.state: tuple[Any, ...] = ()
@@ -54,7 +54,7 @@ class _Array:
         self.state = tuple(state)
 
     def item(self) -> Any:
-        """The only entry of an array of objects without dimensions."""
+        """The element of a zero-dimensional array of objects."""
         _, shape, dtype, _, content = self.state
         if dtype.code not in ("O", "O8") or shape != () or not isinstance(content, list):
             raise pickle.UnpicklingError("it is no dictionary")
@@ -62,7 +62,7 @@ class _Array:
         return item
 
     def numbers(self) -> np.ndarray:
-        """The array, if it is one of plain numbers and its bytes are as many as its shape needs."""
+        """The array; refused unless it has plain numbers, and as many bytes as its shape needs."""
         _, shape, dtype, columns_first, content = self.state
         if dtype.code not in _NUMBERS or dtype.order not in ("<", ">", "="):
             raise pickle.UnpicklingError(f"an array of {dtype.code!r}, expected one of {', '.join(_NUMBERS)}")
@@ -74,7 +74,7 @@ class _Array:
 
 
 class _Encoded:
-    """``_codecs.encode(text, "latin1")``, which is how older protocols write bytes."""
+    """``_codecs.encode(text, "latin1")``, by which older protocols write bytes."""
 
     def __new__(cls, text: str, _: str) -> Any:
         """The bytes themselves."""
@@ -85,7 +85,7 @@ class _Encoded:
 
 
 class _ArraysOnly(pickle.Unpickler):
-    """Unpickles dictionaries, strings and arrays; whatever else a pickle asks for is refused."""
+    """Unpickles dictionaries, strings and arrays; refuses all other objects."""
 
     def find_class(self, module: str, name: str) -> Any:
         core = module in ("numpy.core.multiarray", "numpy._core.multiarray")
@@ -98,24 +98,33 @@ class _ArraysOnly(pickle.Unpickler):
         raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}, expected arrays only")
 
 
-def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) -> Motion:
-    """The clip ``key`` ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+def clips_of_h36m(path: Path, arrays: Arrays) -> dict[str, Any]:
+    """The arrays of VideoPose3D's ``data_3d_h36m.npz`` by subject and action ("S1/Walking").
 
     Raises:
-        TensorsimError: a pickle that holds anything but dictionaries of arrays, no such clip.
+        TensorsimError: a pickle that holds anything but dictionaries of arrays.
     """
     data = arrays.pickled("positions_3d")
     try:
         file = io.BytesIO(data)
         check_pickle_memo(file)
         subjects = _ArraysOnly(file, encoding="latin1").load().item()
-        clips = {
+        return {
             f"{subject}/{action}": clip for subject in subjects for action, clip in subjects[subject].items()
         }
     except TensorsimError:
         raise
     except (AttributeError, EOFError, IndexError, TypeError, ValueError) as error:
         raise TensorsimError(f"{path}: got positions_3d that hold no dictionary ({error})") from error
+
+
+def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) -> Motion:
+    """The clip ``key`` ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+
+    Raises:
+        TensorsimError: a pickle that holds anything but dictionaries of arrays, no such clip.
+    """
+    clips = clips_of_h36m(path, arrays)
     if key is None and len(clips) == 1:
         key = next(iter(clips))
     if key not in clips:

@@ -1,6 +1,6 @@
-"""Motion capture files as joints, whatever their format: npz, BVH, Human3.6M of VideoPose3D, AMASS.
+"""Reading of motion capture files: npz, BVH, Human3.6M as VideoPose3D publishes it, AMASS.
 
-Positions are turned to metres in the world frame (x right, y away, z up).
+Positions are converted to metres in the world frame (x right, y away, z up).
 """
 
 import math
@@ -9,14 +9,15 @@ from pathlib import Path
 
 import torch.nn.functional as F
 
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.data.bvh import read_bvh
-from tensorsim.data.h36m import read_h36m
+from tensorsim.data.h36m import clips_of_h36m, read_h36m
 from tensorsim.data.npz import motions_in, open_npz, preferred, read_npz
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError, check_positive, check_tensor
 from tensorsim.limits import check_range
 
-#: Height of ankles over the floor that they stand on.
+#: Height of the ankles of somebody who stands, above the floor.
 ANKLE_HEIGHT_M = 0.07
 
 
@@ -36,6 +37,21 @@ def motion_keys(path: str | os.PathLike[str]) -> list[str | None]:
         return [None] if preferred(motions) is not None else [*motions] or [None]
 
 
+def h36m_keys(path: str | os.PathLike[str]) -> list[str]:
+    """The clips ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+
+    Raises:
+        TensorsimError: no such file, or another one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise TensorsimError(f"{path}: no such file, expected data_3d_h36m.npz")
+    with open_npz(path) as arrays:
+        if "positions_3d" not in arrays.files:
+            raise TensorsimError(f"{path}: got no positions_3d, expected Human3.6M of VideoPose3D")
+        return list(clips_of_h36m(path, arrays))
+
+
 def load_motion(
     path: str | os.PathLike[str],
     key: str | None = None,
@@ -43,25 +59,26 @@ def load_motion(
     joint_names: tuple[str, ...] | None = None,
     unit_m: float | None = None,
 ) -> Motion:
-    """Reads a motion capture file; what kind it is follows from its suffix and, for npz, its arrays.
+    """Read a motion capture file. Its suffix and, for npz, its arrays tell the format.
 
-    - ``.bvh``: joints named as by CMU, Mixamo, Biped or Biovision; the vertical axis is found by the reader.
-    - ``.npz`` with ``joints_m``, or any array (T, J, 3) or (P, T, J, 3) in world axes, and ``fps``;
-      ``joint_names`` in it or as argument, needed unless J is 14 (ours), 17 (COCO) or 22, 24, 52 or more (SMPL);
-      ``valid`` (P, T) if there is one.
+    - ``.bvh``: joints with the names of CMU, Mixamo, Biped or Biovision; the reader finds the vertical axis.
+    - ``.npz`` with ``joints_m``, or any array (T, J, 3) or (P, T, J, 3) in world axes, and ``fps``. Names of the
+      joints, as ``joint_names`` in the file or as argument, are needed unless J is 14 (``tensorsim.JOINTS``), 17 (COCO)
+      or 22, 24, 52 or more (SMPL). ``valid`` (P, T) is read if it is there.
     - ``.npz`` with ``joints`` or ``Jtr`` and ``mocap_framerate``: AMASS, SMPL joints, z up.
     - ``.npz`` with ``positions_3d``: VideoPose3D's Human3.6M, 32 joints. Its pickle may hold dictionaries, strings
       and arrays; anything else in it is refused and not run.
 
     Args:
         path: the file.
-        key: the array in an npz, or ``"S1/Walking"`` (subject and action); not needed when there is one.
-        fps: frames per second; overrides the file, needed where it says nothing.
+        key: the array in an npz, or subject and action as in ``"S1/Walking"``; not needed where there is only one.
+        fps: frames per second, in place of what the file states; needed where it states none.
         joint_names: names of the joints in the file, in order.
-        unit_m: metres per unit; None takes the unit in which a BVH is nearest to an adult, metres for npz.
+        unit_m: length of the file's unit in metres. None: for BVH the unit that gives a body nearest to the size of an
+            adult, for npz the metre.
 
     Raises:
-        TensorsimError: files that are missing or not readable, unknown joints, no frame rate, NaN.
+        TensorsimError: a file that is missing or cannot be read, unknown joints, no frame rate, NaN.
     """
     path = Path(path)
     if not path.is_file():
@@ -81,19 +98,19 @@ def load_motion(
 
 
 def place(motion: Motion, range_m: float | None = None, heading_rad: float = 0.0, x_m: float = 0.0) -> Motion:
-    """Puts a motion on the floor, turns it and moves its start.
+    """Put a motion on the floor, turn it and move its start.
 
     Args:
-        motion: people; they keep their places relative to one another.
+        motion: one or more people; their relative places stay.
         range_m: y of the first person's hips in its first valid frame; None keeps x and y where they are.
         heading_rad: turn about the vertical through these hips, counter-clockwise seen from above.
-        x_m: their x, used with ``range_m``.
+        x_m: x of these hips, used with ``range_m``.
 
     Returns:
         The motion with its lowest joint at ankle height over z = 0.
 
     Raises:
-        TensorsimError: a first person who is never there, joints or a place that are not finite.
+        TensorsimError: a first person without a valid frame; joints or a place that are not finite.
     """
     joints = motion.joints
     check_tensor(joints, "motion", "(P, T, 14, 3)")
@@ -106,7 +123,7 @@ def place(motion: Motion, range_m: float | None = None, heading_rad: float = 0.0
     if not bool(motion.valid[:1].any()):
         raise TensorsimError("motion: got a first person without a valid frame, expected at least one")
     first = int(motion.valid[0].int().argmax())
-    middle = F.pad((joints[0, first, 8] + joints[0, first, 11])[:2] / 2, (0, 1))
+    middle = F.pad(mid_hips(joints[0, first])[:2], (0, 1))
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     turn = joints.new_tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     to = middle if range_m is None else joints.new_tensor([x_m, range_m, 0.0])

@@ -1,4 +1,4 @@
-"""Motion capture in npz files: arrays of joints by name, AMASS."""
+"""Motion capture in npz files: arrays of named joints, AMASS."""
 
 import math
 import zipfile
@@ -23,12 +23,12 @@ SMPL_JOINTS = (
 )  # fmt: skip
 
 
-#: Unpacked bytes of one array: an hour of 52 joints at 120 frames per second, in float64, is half of it.
+#: Largest unpacked size of one array in bytes; an hour of 52 joints at 120 frames per second in float64 is half of it.
 MAX_BYTES = 10**9
 
 
 class Arrays:
-    """The arrays of an npz. Types and sizes are looked at before any data is read, and pickles are never run."""
+    """The arrays of an npz. Types and sizes are checked before data is read, and pickles are never run."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
@@ -86,7 +86,7 @@ def motions_in(arrays: Arrays) -> list[str]:
 
 
 def preferred(motions: list[str]) -> str | None:
-    """The array that is taken where there are several, by its usual name."""
+    """The array with a usual name, where there are several; None if none has one."""
     return next((name for name in ("joints_m", "joints", "Jtr") if name in motions), None)
 
 

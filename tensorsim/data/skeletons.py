@@ -1,6 +1,6 @@
 """Skeletons of capture files as the 14 joints of ``tensorsim.JOINTS``.
 
-Skeletons differ in their joints and agree in their names, more or less: names are matched.
+File formats differ in their joints and in how they name them; joints are found by their names.
 """
 
 import re
@@ -15,7 +15,7 @@ from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_finite, check_positive
 from tensorsim.limits import check_range
 
-#: What skeletons call a joint, best first, after the side: Mixamo and CMU name bones by where they start.
+#: Names of each joint in files, without the side, the most specific first. Mixamo and CMU name a bone's start.
 _ALIASES = {
     "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder"),
     "elbow": ("elbow", "forearm", "lowerarm", "lowarm"),
@@ -31,7 +31,7 @@ class Motion(NamedTuple):
 
     Attributes:
         joints: (P, T, 14, 3) float32 metres, order of ``tensorsim.JOINTS``, x right, y away, z up.
-        valid: (P, T) bool, whether the person is there.
+        valid: (P, T) bool, whether the person is in the scene.
         fps: frames per second.
     """
 
@@ -43,12 +43,12 @@ class Motion(NamedTuple):
 def body_joints(positions: Tensor, names: tuple[str, ...], top: Tensor | None = None) -> Tensor:
     """The 14 joints from a skeleton with named joints.
 
-    The neck is the middle of the shoulders. Where no nose is named, it is put before the head: half way to the
-    top of the head and as far to the front, or by the size of a typical head where no ``top`` is known.
+    The neck is the middle of the shoulders. Where there is no nose, it is placed in front of the head joint: half way
+    to the top of the head and as far forward, or by the size of a typical head where ``top`` is not known.
 
     Args:
         positions: (..., J, 3) world metres.
-        names: J names, sides as "right", "r", "left" or "l" before or after them, in any case and with any prefix.
+        names: J names, with "right", "r", "left" or "l" before or after, in upper or lower case, with any prefix.
         top: (..., 3) top of the head.
     """
     index = {plain_name(name): i for i, name in reversed(list(enumerate(names)))}
@@ -90,7 +90,7 @@ def body_joints(positions: Tensor, names: tuple[str, ...], top: Tensor | None = 
 
 
 def plain_name(name: str) -> str:
-    """A joint's name without prefix, case and punctuation: "mixamorig:RightArm" -> "rightarm"."""
+    """A joint's name without prefix and punctuation in lower case: "mixamorig:RightArm" -> "rightarm"."""
     name = re.sub(
         r"^(bip\d*|valvebiped|mixamorig\d*|character\d*)[\s_:.]+", "", name.strip(), flags=re.IGNORECASE
     )
@@ -101,14 +101,14 @@ def motion_of(
     path: Path, positions: Tensor, names: tuple[str, ...], fps: float | None, valid: Tensor | None = None,
     top: Tensor | None = None,
 ) -> Motion:  # fmt: skip
-    """The motion of a file, checked.
+    """The motion in a file, checked.
 
     Args:
         path: the file, for messages.
         positions: (..., T, J, 3) world metres.
         names: of the J joints.
         fps: frames per second.
-        valid: (P, T) bool; None for people who are always there.
+        valid: (P, T) bool; None: everybody is there in all frames.
         top: (..., T, 3) top of the head.
 
     Raises:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tensorsim.body.skeleton import body_height
+from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.config import ACTIVITIES
 from tensorsim.data.motion_files import load_motion, motion_keys, place
 from tensorsim.data.skeletons import Motion
@@ -133,7 +133,7 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
 
 def _kept_away(motion: Motion, nearest_m: float = 1.5, farthest_m: float = 7.0) -> Motion:
     """Motion moved along y by the least amount that keeps it within the generator's ranges, the nearest one first."""
-    y = motion.joints[..., (8, 11), 1]
+    y = mid_hips(motion.joints)[..., 1]
     shift = (farthest_m - y.max()).clamp(max=0.0)
     shift = torch.maximum(shift, nearest_m - y.min())
     return motion._replace(joints=motion.joints + torch.stack([0 * shift, shift, 0 * shift]))

@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from tensorsim import plot
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.data.video import VideoReader
 from tensorsim.evaluation.labelled_films import LabelledFilm, Verdict
 from tensorsim.results import Axes
@@ -147,7 +148,7 @@ def _draw_places(axes: "matplotlib.axes.Axes", pose: Pose, fps: float) -> None:
     for person in range(pose.valid.shape[1]):
         there = pose.valid[0, person].numpy()
         joints = pose.joints[0, person].numpy()
-        hips = joints[:, (8, 11)].mean(axis=1)
+        hips = mid_hips(pose.joints[0, person]).numpy()
         colour = np.array(plot.PERSON_COLOURS[person % len(plot.PERSON_COLOURS)]) / 255
         label = f"person {person + 1}" if person < _NAMED else None
         axes.plot(time_s, np.where(there, hips[:, 1], np.nan), "-", color=colour, label=label)

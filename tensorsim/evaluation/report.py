@@ -117,24 +117,29 @@ def markdown(cells: Cells) -> str:
         text += _table(heads, lines)
     posed = [n for n in names if any(c["pose"].get("root") is not None for c in chosen(n))]
     if posed:
-        text += ["## Errors of the joints at the frame rate, mean of rows", ""]
-        keys = {
-            "root": "hips, rms m",
-            "joints": "joints about the hips, mean m",
-            "range": "of these along y, rms m",
-        }
-        lines = [
-            [label, *(f"{_pose_mean(cells, rows, n, key):.3f}" for n in posed)] for key, label in keys.items()
+        text += [
+            "## Errors of the joints at the frame rate, mean of rows",
+            "",
+            *_pose_table(cells, rows, posed),
         ]
-        text += _table(["error", *posed], lines)
     return "\n".join(text)
 
 
-def _pose_mean(cells: Cells, rows: list[str], setting: str, key: str) -> float:
-    return mean(
-        mean(c["pose"].get(key, math.nan) for c in cells if c["setting"] == setting and c["row"] == row)
-        for row in rows
-    )
+def _pose_table(cells: Cells, rows: list[str], settings: list[str]) -> list[str]:
+    keys = {
+        "root": "hips, rms m",
+        "joints": "joints about the hips, mean m",
+        "range": "of these along y, rms m",
+    }
+
+    def pose_mean(setting: str, key: str) -> float:
+        return mean(
+            mean(c["pose"].get(key, math.nan) for c in cells if c["setting"] == setting and c["row"] == row)
+            for row in rows
+        )
+
+    lines = [[label, *(f"{pose_mean(n, key):.3f}" for n in settings)] for key, label in keys.items()]
+    return _table(["error", *settings], lines)
 
 
 def save_pictures(

@@ -31,6 +31,23 @@ def sinusoids(time_s: Tensor, frequency_hz: Tensor, amplitude: Tensor, phase: Te
     return (amplitude * torch.cos(angle)).sum(-1).to(time_s.dtype)
 
 
+def times_and_processes(joints: Tensor, rate_hz: float, start: int, people: int) -> tuple[Tensor, Tensor]:
+    """Times of the frames of joints (..., P, T, 14, 3), and which of ``people`` processes each person has.
+
+    Args:
+        joints: their first frame is number ``start`` of a clip.
+        rate_hz: frames per second.
+        start: number of the first frame.
+        people: number of processes; person p has ``p % people``.
+
+    Returns:
+        (T,) float64 seconds and (P,) indices.
+    """
+    persons, frames = joints.shape[-4], joints.shape[-3]
+    time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / rate_hz
+    return time_s, torch.arange(persons, device=joints.device) % people
+
+
 class RandomProcess(nn.Module):
     """Independent Gaussian processes with one power spectrum.
 

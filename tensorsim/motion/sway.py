@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from tensorsim.body.proportions import SHANK, THIGH
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_points, check_positive
-from tensorsim.motion.random_process import RandomProcess
+from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
 #: Height of the centre of mass over the ankles, of a body of 1.75 m; sway is quoted there.
@@ -68,9 +68,8 @@ class PosturalSway(nn.Module):
         """Joints of frames ``start`` onwards, swaying; frame k is at ``k / rate_hz``."""
         layout = "(..., P, T, 14, 3)"
         check_points(joints, 4, 14, 3, "joints", layout)
-        persons, frames = joints.shape[-4], joints.shape[-3]
-        time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / self.rate_hz
-        who, own = torch.arange(persons, device=joints.device) % self.people, min(persons, self.people)
+        time_s, who = times_and_processes(joints, self.rate_hz, start, self.people)
+        own = min(who.shape[0], self.people)
         along = self.forwards(time_s, own)[:, who].T.to(joints.dtype)[..., None, None]  # (P, T, 1, 1)
         aside = self.sideways(time_s, own)[:, who].T.to(joints.dtype)[..., None, None]
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_floating, check_points, check_positive
-from tensorsim.motion.random_process import RandomProcess
+from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
 Range = tuple[float, float]
@@ -97,10 +97,8 @@ class VitalSigns(nn.Module):
         """Joints of frames ``start`` onwards, breathing; frame k is at ``k / rate_hz``."""
         layout = "(..., P, T, 14, 3)"
         check_points(joints, 4, 14, 3, "joints", layout)
-        persons, frames = joints.shape[-4], joints.shape[-3]
-        time_s = (start + torch.arange(frames, dtype=torch.float64, device=joints.device)) / self.rate_hz
-        who = torch.arange(persons, device=joints.device) % self.people
-        chest = self.displacement_m(time_s, persons)[:, who].T.to(joints.dtype)[
+        time_s, who = times_and_processes(joints, self.rate_hz, start, self.people)
+        chest = self.displacement_m(time_s, who.shape[0])[:, who].T.to(joints.dtype)[
             ..., None, None
         ]  # (P, T, 1, 1)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig, RadarConfig, SceneConfig, SimulationConfig, WallConfig
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_replaced
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.pipeline.networks import pretrained_pose
 from tensorsim.pipeline.pose import VideoToPose
@@ -34,7 +34,11 @@ class VideoToDoppler(nn.Module):
             from torch's global generator (``torch.manual_seed``).
         person_height_m, initial_distance_m, camera, detection_interval: see :class:`VideoToPose`.
         denoiser: see :class:`PoseToDoppler`.
-        video_to_pose, pose_to_doppler: whole replacements; the arguments above that configure them are then unused.
+        video_to_pose, pose_to_doppler: ready halves in place of those that the arguments above describe.
+
+    Raises:
+        TensorsimError: a ready half beside arguments that describe it; no detector or pose network and no ready half;
+            parts that are not such stages.
 
     Example:
         >>> sim = ts.VideoToDoppler(detector, pose, radar=ts.RadarConfig.free_space())
@@ -51,10 +55,10 @@ class VideoToDoppler(nn.Module):
         leakage: bool = False,
         wall_echo: bool = False,
         snr_db: float | None = 50.0,
-        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        person_height_m: tuple[float, ...] | None = None,
         initial_distance_m: tuple[float, ...] | None = None,
         camera: CameraConfig | None = None,
-        detection_interval: int = 2,
+        detection_interval: int | None = None,
         denoiser: nn.Module | None = None,
         video_to_pose: VideoToPose | None = None,
         pose_to_doppler: PoseToDoppler | None = None,
@@ -72,13 +76,27 @@ class VideoToDoppler(nn.Module):
                 person_height_m=person_height_m,
                 initial_distance_m=initial_distance_m,
                 camera=camera,
-                detection_interval=detection_interval,
+                detection_interval=2 if detection_interval is None else detection_interval,
             )
+        else:
+            of_pose = {
+                "detector": detector,
+                "pose": pose,
+                "person_height_m": person_height_m,
+                "initial_distance_m": initial_distance_m,
+                "camera": camera,
+                "detection_interval": detection_interval,
+            }
+            check_replaced("video_to_pose", {name: value is not None for name, value in of_pose.items()})
         self.video_to_pose = video_to_pose
         if pose_to_doppler is None:
             scene = as_scene(radar, wall)
             scene = replace(scene, multipath=multipath, leakage=leakage, wall_echo=wall_echo, snr_db=snr_db)
             pose_to_doppler = PoseToDoppler(RadarSimulator(scene), denoiser=denoiser)
+        else:
+            of_radar = {"radar": radar is not None, "wall": wall is not None, "multipath": multipath}
+            of_radar |= {"leakage": leakage, "wall_echo": wall_echo, "snr_db": snr_db != SceneConfig().snr_db}
+            check_replaced("pose_to_doppler", of_radar | {"denoiser": denoiser is not None})
         self.pose_to_doppler = pose_to_doppler
 
     @classmethod
@@ -161,6 +179,9 @@ class VideoToActivity(nn.Module):
         video_to_doppler: frames to maps.
         recognizer: :class:`RadarMaps` -> logits (B, classes); see :class:`tensorsim.recognition.ActivityRecognizer`.
 
+    Raises:
+        TensorsimError: a recognizer made for another radar, or that is none.
+
     Example:
         >>> sim = ts.VideoToActivity.from_pretrained()
         >>> label = ts.ACTIVITIES[int(sim(video, fps).logits[0].argmax())]
@@ -170,6 +191,11 @@ class VideoToActivity(nn.Module):
         super().__init__()
         self.video_to_doppler = video_to_doppler
         self.recognizer = check_part(recognizer, "recognizer")
+        radar = video_to_doppler.pose_to_doppler.simulator.radar
+        if isinstance(recognizer, ActivityRecognizer) and recognizer.radar != radar:
+            raise TensorsimError(
+                f"recognizer: got one for the maps of {recognizer.radar}, expected {radar}, the radar of the simulation"
+            )
 
     @classmethod
     def from_pretrained(
@@ -249,11 +275,10 @@ def as_scene(radar: RadarConfig | str | None, wall: WallConfig | None) -> SceneC
 
 
 def warn_of_empty_clips(valid: Tensor) -> None:
-    """Say which clips have no person (``valid`` (B, P, T)); their maps show the empty scene."""
-    empty = torch.nonzero(~valid.flatten(1).any(dim=1)).flatten().tolist()
-    if empty:
+    """Warn of clips without a person (``valid`` (B, P, T)); ``valid`` of the output says which."""
+    if not bool(valid.flatten(1).any(dim=1).all()):
         warnings.warn(
-            f"no person found in clip {', '.join(map(str, empty))} of {valid.shape[0]}: its maps show the empty scene",
+            "no person found in a clip: its maps show the empty scene",
             TensorsimWarning,
             stacklevel=3,
         )

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import SimulationConfig
-from tensorsim.enhance.dncnn import MapDenoiser
+from tensorsim.enhance.choice import map_denoiser
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.body_scatterers import BodyScatterers
@@ -37,6 +37,10 @@ class PoseToDoppler(nn.Module):
         small_motions: motions of the body that no camera resolves, added at the pulse rate, e.g.
             :class:`tensorsim.motion.PosturalSway` and :class:`tensorsim.motion.VitalSigns`: modules
             (joints (B, P, M, 14, 3), first pulse) -> joints.
+
+    Raises:
+        TensorsimError: a resampler or small motions of another rate than the PRF of the simulator's radar, factors that
+            are not positive, parts that are not such stages.
     """
 
     rcs_scale: Tensor
@@ -53,7 +57,15 @@ class PoseToDoppler(nn.Module):
     ) -> None:
         super().__init__()
         self.simulator = simulator
-        self.resampler = resampler if resampler is not None else PoseResampler(simulator.radar.prf_hz)
+        prf_hz = simulator.radar.prf_hz
+        self.resampler = resampler if resampler is not None else PoseResampler(prf_hz)
+        rates = [("resampler", self.resampler.prf_hz)]
+        rates += [("small_motions", getattr(motion, "rate_hz", prf_hz)) for motion in small_motions]
+        for name, rate_hz in rates:
+            if rate_hz != prf_hz:
+                raise TensorsimError(
+                    f"{name}: got a rate of {rate_hz:g} Hz, expected the radar's PRF of {prf_hz:g} Hz"
+                )
         # Pulses beside a piece of motion that the filter needs to give the same values as on the whole.
         self.halo = 0 if pulse_smoother is None else pulse_smoother.window
         self.pulse_smoother = pulse_smoother if pulse_smoother is not None else nn.Identity()
@@ -93,10 +105,10 @@ class PoseToDoppler(nn.Module):
             small_motions.append(PosturalSway(prf_hz, seed=config.seed))
         if scene.vital_signs:
             small_motions.append(VitalSigns(prf_hz, seed=config.seed))
-        denoiser = None if processing.denoiser is None else MapDenoiser.from_pretrained(processing.denoiser)
+        denoiser = map_denoiser(processing.denoiser)
         people = len(config.pose.person_weight_kg)
         return cls(
-            RadarSimulator(scene, processing=processing),
+            RadarSimulator(scene, processing=processing, seed=config.seed),
             PoseResampler(prf_hz, method=smoothing.resampling),
             pulse_smoother,
             bodies[scene.body](),

@@ -6,15 +6,15 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import coco_to_body
-from tensorsim.config import CameraConfig, SimulationConfig
-from tensorsim.errors import TensorsimError, check_positive, check_rank, check_size
-from tensorsim.pipeline.networks import pretrained_pose, top_down
+from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
+from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
+from tensorsim.pipeline.networks import pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
-from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
@@ -33,6 +33,7 @@ class VideoToPose(nn.Module):
         pose: crops -> heat maps, e.g. :class:`tensorsim.vision.HRNet`, which is asked about the mirror image as well;
             or a module (frames, boxes, valid) -> (key points, scores), e.g. :class:`tensorsim.vision.TopDownPose`.
         person_height_m: body heights in metres by person (order of appearance); the last one serves the rest.
+            Default 1.80 and 1.70.
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
         camera: where the camera stands and its focal length.
         keypoint_threshold: score from which a keypoint counts as seen.
@@ -40,19 +41,21 @@ class VideoToPose(nn.Module):
         fewest_joints: of the 14, in a frame that says anything of the pose.
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
-        tracker, lifter, metric_pose, smoother: replacements of the default stages.
+        tracker, lifter, metric_pose, smoother: replacements of the default stages. A ``metric_pose`` has heights,
+            distances and camera of its own.
         bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
             keypoints that are exact; None leaves it out.
 
     Raises:
-        TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1.
+        TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1; a ``metric_pose`` beside heights,
+            distances or a camera; parts that are not such stages.
     """
 
     def __init__(
         self,
         detector: nn.Module,
         pose: nn.Module,
-        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        person_height_m: tuple[float, ...] | None = None,
         initial_distance_m: tuple[float, ...] | None = None,
         camera: CameraConfig | None = None,
         keypoint_threshold: float = 0.3,
@@ -76,12 +79,22 @@ class VideoToPose(nn.Module):
         self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
-        self.lifter = check_part(NearestPoseLifter() if lifter is None else lifter, "lifter")
-        self.metric_pose = (
-            metric_pose
-            if metric_pose is not None
-            else MetricPose(camera, person_height_m, initial_distance_m, keypoint_threshold)
-        )
+        if lifter is None:
+            lifter = NearestPoseLifter(pitch_rad=0.0 if camera is None else camera.pitch_rad)
+        # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
+        self.temporal = lifter if isinstance(lifter, TemporalLifter) else None
+        self.lifter = None if self.temporal is not None else check_part(lifter, "lifter")
+        if metric_pose is None:
+            heights = PoseConfig().person_height_m if person_height_m is None else person_height_m
+            metric_pose = MetricPose(camera, heights, initial_distance_m, keypoint_threshold)
+        else:
+            ignored = {
+                "person_height_m": person_height_m,
+                "initial_distance_m": initial_distance_m,
+                "camera": camera,
+            }
+            check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
+        self.metric_pose = metric_pose
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.keypoint_threshold = keypoint_threshold
@@ -112,7 +125,6 @@ class VideoToPose(nn.Module):
             detector = RTMDet.from_pretrained(tracking.detector)
         if pose is None:
             pose = pretrained_pose(people.network, people.flip_test)
-        library = None if people.library is None else load_pose_library(people.library)
         return cls(
             detector,
             top_down(pose, people.flip_test),
@@ -131,13 +143,7 @@ class VideoToPose(nn.Module):
                 process_noise=tracking.process_noise,
                 measurement_noise=tracking.measurement_noise,
             ),
-            lifter=NearestPoseLifter(
-                library,
-                neighbours=people.neighbours,
-                temporal=people.temporal,
-                pitch_rad=people.camera.pitch_rad,
-                roll_rad=people.camera.roll_rad,
-            ),
+            lifter=pretrained_lifter(people),
             metric_pose=MetricPose(
                 people.camera,
                 people.person_height_m,
@@ -154,14 +160,20 @@ class VideoToPose(nn.Module):
         Raises:
             TensorsimError: a lifter or metric pose of another class, which may know no camera.
         """
-        if not isinstance(self.lifter, NearestPoseLifter) or not isinstance(self.metric_pose, MetricPose):
+        lifter = self.lifter if self.temporal is None else self.temporal
+        if not isinstance(lifter, (NearestPoseLifter, TemporalLifter)) or not isinstance(
+            self.metric_pose, MetricPose
+        ):
             raise TensorsimError(
-                f"seen_by: got {type(self.lifter).__name__} and {type(self.metric_pose).__name__}, expected "
-                "NearestPoseLifter and MetricPose"
+                f"seen_by: got {type(lifter).__name__} and {type(self.metric_pose).__name__}, expected "
+                "NearestPoseLifter or TemporalLifter, and MetricPose"
             )
         other = copy.copy(self)
         other._modules = dict(self._modules)
-        other.lifter = self.lifter.tilted(camera.pitch_rad, camera.roll_rad)
+        if isinstance(lifter, TemporalLifter):
+            other.temporal = lifter.seen_by(camera)
+        else:
+            other.lifter = lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
@@ -294,7 +306,13 @@ class VideoToPose(nn.Module):
         usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
         usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
         usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
-        lifted = self.lifter(body, body_scores)
+        if self.temporal is not None:
+            found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
+            lifted = self.temporal.in_picture(found, body_scores, height, width)
+            body, noise = lifted.keypoints, found.deviation
+        else:
+            lifted = self.lifter(body, body_scores)
+            noise = keypoint_noise(body_scores, lifted.scale)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
@@ -302,7 +320,6 @@ class VideoToPose(nn.Module):
         # the joint of the matched pose replaces it, as long as the person is in the scene.
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
-        noise = keypoint_noise(body_scores, lifted.scale)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
         # Nobody is where no frame of a track shows a joint.

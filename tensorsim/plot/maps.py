@@ -185,10 +185,7 @@ def map_figure(
             shown = decibels(levels, style.dynamic_range_db, peak) > -style.dynamic_range_db
             _draw_ridges(axes, time_s, clear_ridges(lines, axis, shown, _LEAST_HEIGHT * (high - low)))
         if note is not None:
-            box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none"}
-            axes.text(
-                0.5, 0.5, note, transform=axes.transAxes, ha="center", va="center", color="white", bbox=box
-            )
+            _write_note(axes, note)
         axes.set_ylim(low, high)
         axes.set_title(heading)
         axes.set_xlabel("time in s")
@@ -200,6 +197,12 @@ def map_figure(
     label = "dB below the peak" if peak is None else "dB below the echo of a person"
     figure.colorbar(image, ax=list(row), label=label, pad=0.02)
     return figure
+
+
+def _write_note(axes: Axes, note: str) -> None:
+    """Words in the middle of a map."""
+    box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none"}
+    axes.text(0.5, 0.5, note, transform=axes.transAxes, ha="center", va="center", color="white", bbox=box)
 
 
 def _add_speed_axis(axes: Axes, speed_per_axis: float) -> None:

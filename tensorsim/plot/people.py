@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
-from tensorsim.body.skeleton import LIMBS
+from tensorsim.body.skeleton import LIMBS, mid_hips
 from tensorsim.plot.figure import new_figure
 
 if TYPE_CHECKING:
@@ -56,8 +57,8 @@ def skeleton_figure(
         _draw_person(axes, person, joints_m[person], frames, chosen, fps)
     axes.scatter([0], [0], [1.5], color="black", marker="^", s=50, label="radar")
     bodies = np.concatenate([*shown, np.zeros((0, 14, 3))])
-    hips = bodies[:, (8, 11)].mean(axis=1, keepdims=True)
-    attached = np.linalg.norm(bodies - hips, axis=-1) <= _LIMB_REACH_M
+    hips = mid_hips(torch.from_numpy(bodies)).numpy()
+    attached = np.linalg.norm(bodies - hips[:, None], axis=-1) <= _LIMB_REACH_M
     points = np.concatenate([bodies[attached], [[-0.75, 0.0, 0.0], [0.75, 1.0, 2.0]]])
     low, high = points.min(axis=0), points.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -106,7 +107,7 @@ def _draw_person(
         if (np.linalg.norm(labelled - top, axis=1) > 0.4).all():
             axes.text(*top, f"{frame / fps:.1f} s", color=colour, fontsize=7)
             labelled = np.concatenate([labelled, top[None]])
-    track = joints[frames][:, (8, 11)].mean(axis=1)
+    track = mid_hips(torch.from_numpy(joints[frames])).numpy()
     label = f"person {person + 1}, {frames[0] / fps:.1f} to {frames[-1] / fps:.1f} s"
     axes.plot(track[:, 0], track[:, 1], 0 * track[:, 2], color=colour, linestyle=":", label=label)
 

@@ -11,11 +11,13 @@ from tensorsim.radar.presets import (
     radar_scene,
     save_radar_yaml,
 )
+from tensorsim.radar.processing.ambiguity import gate_around
 from tensorsim.radar.processing.array import AngleMapper, AngleMaps, align_transmitters
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo, doppler_time_map
 from tensorsim.radar.processing.mti import MovingTargetIndicator, two_pulse_canceller
 from tensorsim.radar.processing.point_cloud import PointCloud, Points
+from tensorsim.radar.processing.range_doppler import PointDetector, RangeDopplerAngle, RangeDopplerCube
 from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile, range_profile
 from tensorsim.radar.processing.ridges import PathRidgeExtractor, RidgeExtractor
 from tensorsim.radar.processing.synchrosqueeze import SynchrosqueezedMap
@@ -55,11 +57,14 @@ __all__ = [
     "PathRidgeExtractor",
     "PhaseNoise",
     "PointCloud",
+    "PointDetector",
     "Points",
     "QuadratureImbalance",
     "RadarScene",
     "RadarSimulator",
     "RangeBinSynthesizer",
+    "RangeDopplerAngle",
+    "RangeDopplerCube",
     "RangeDopplerVideo",
     "RangeProfile",
     "RealReceiver",
@@ -71,6 +76,7 @@ __all__ = [
     "TabulatedAntenna",
     "align_transmitters",
     "doppler_time_map",
+    "gate_around",
     "intermediate_frequency",
     "load_radar_yaml",
     "load_scene_yaml",

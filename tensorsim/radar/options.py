@@ -6,17 +6,18 @@ from torch import nn
 
 from tensorsim.config import ProcessingConfig, RadarConfig, SceneConfig, WallConfig
 from tensorsim.config.documents import suggestion
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_replaced
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 
 #: Fields of a scene that an EchoSynthesizer is made from.
 _ECHO_FIELDS = (
     "floor", "multipath", "leakage", "wall_echo", "wall_paths", "incidence", "polarization", "bounces", "direct",
-    "paths",
+    "paths", "wall_attenuation",
 )  # fmt: skip
 #: Options that a module given in place of them would leave without effect.
 _REPLACED = {
-    "echo": _ECHO_FIELDS,
+    "echo": (*_ECHO_FIELDS, "antenna", "learnable", "wall"),
+    "mti": ("mti",),
     "doppler": ("window_s", "overlap", "integration"),
     "ridges": ("ridge_count",),
 }
@@ -58,22 +59,40 @@ def configured(
 
 def refuse_conflicts(
     ready: dict[str, nn.Module | None],
-    options: dict[str, Any],
-    wall: WallConfig | None,
-    antenna: nn.Module | None,
-    learnable: tuple[str, ...],
+    scene: SceneConfig,
+    processing: ProcessingConfig,
+    options: set[str],
 ) -> None:
-    """Refuse options that a module given in their place would leave without effect."""
-    given = sorted(options)
-    given += [name for name, value in (("antenna", antenna), ("wall", wall)) if value is not None]
-    given += ["learnable"] if learnable else []
+    """Refuse options, and fields of configurations, that a ready module would leave without effect.
+
+    Args:
+        ready: modules by the name of their argument; None where none was given.
+        scene, processing: the configurations; a field counts as given where it differs from the default.
+        options: names of the arguments that were given beside them.
+    """
     for part, module in ready.items():
-        more = ("antenna", "learnable", "wall") if part == "echo" else ()
-        without_effect = [name for name in given if name in _REPLACED[part] + more]
-        if module is not None and without_effect:
-            raise TensorsimError(
-                f"{part}: got a ready one and {', '.join(without_effect)}, expected one or the other"
+        if module is not None:
+            check_replaced(
+                part,
+                {
+                    name: name in options or _differs(scene, name) or _differs(processing, name)
+                    for name in _REPLACED[part]
+                },
             )
+            for name in ("carrier_hz", "slope_hz_per_s", "sample_rate_hz", "prf_hz"):
+                theirs, ours = getattr(module, name, None), getattr(scene.radar, name)
+                if theirs is not None and theirs != ours:
+                    raise TensorsimError(
+                        f"{part}: got one for a {name} of {theirs}, expected {ours} as the radar"
+                    )
+
+
+def _differs(config: SceneConfig | ProcessingConfig, name: str) -> bool:
+    """Whether a field of a configuration differs from its default; not if it has no such field."""
+    if name == "multipath" and isinstance(config, SceneConfig):
+        return config.has_multipath
+    field = config.__dataclass_fields__.get(name)
+    return field is not None and getattr(config, name) != field.default
 
 
 def echo_of(

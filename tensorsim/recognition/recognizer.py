@@ -38,7 +38,7 @@ class ActivityRecognizer(nn.Module):
     Shapes: RadarMaps -> (..., classes). Differentiable by the maps.
 
     Attributes:
-        class_names: as given.
+        radar, class_names: as given.
         labels: the same as a :class:`LabelSet`.
 
     Raises:
@@ -78,6 +78,7 @@ class ActivityRecognizer(nn.Module):
                 "name"
             )
         self.class_names = self.labels.names
+        self.radar = radar
         self.inputs = inputs
         self.size, self.speed_m_s, self.range_db = size, speed_m_s, range_db
         self.doppler_picture = MapToImage.doppler(radar, speed_m_s=speed_m_s, size=size, range_db=range_db)

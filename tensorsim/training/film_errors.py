@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import Clip, activity_clips
@@ -51,7 +52,7 @@ class Look(NamedTuple):
         """From joints (T, 14, 3) and the camera of ``tensorsim.evaluation.films``."""
         joints = joints.double()
         pixels, inside, view = project(joints)
-        depth = view.project(0.5 * (joints[:, 8] + joints[:, 11]))[1]
+        depth = view.project(mid_hips(joints))[1]
         return cls(pixels, inside, view.scale * height_m / depth.clamp_min(0.3))
 
     @property

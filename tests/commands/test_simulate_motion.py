@@ -104,7 +104,7 @@ def test_keypoints_give_what_a_video_gives(
         ("walk.npz", ["--image-size", "9", "9"], "--image-size: got it for motion capture"),
         ("walk.json", ["--heading", "9"], "--heading: got it for COCO keypoints"),
         ("walk.mp4", ["--clip", "a"], "--clip: got it for a video"),
-        ("walk.json", ["--image-size", "0", "9"], "--image-size: got .* positive numbers of pixels"),
+        ("walk.json", ["--image-size", "0", "9"], "--image-size: got 0, expected image side"),
         ("walk.npz", ["--heading", "nan"], "--heading: got nan"),
         ("walk.npz", ["--initial-distance", "1", "2"], "--initial-distance: got .* the first person"),
         ("walk.npz", ["--clip", "nothing"], "got key 'nothing', expected one of joints"),

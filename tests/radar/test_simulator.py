@@ -9,10 +9,11 @@ import torch
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.radar.processing.ambiguity import check_unambiguous, radial_speed
+from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around, radial_speed
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.range_profile import FollowingGate
 from tensorsim.radar.processing.ridges import RidgeExtractor
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
@@ -203,6 +204,7 @@ def test_stream_takes_the_rcs_per_pulse_and_refuses_bad_pieces():
         {"range_gate_m": 0.8, "engine": "range-bins", "near_bins": 3},
     ],
 )
+@pytest.mark.filterwarnings("ignore:positions. some scatterer leaves the range gate")
 def test_pieces_and_the_doppler_map_alone_equal_forward(options):
     p, rcs = tensors(np.stack([swinging(300, 3, 256.0, seed=i) for i in (0, 1)]), np.ones(3))
     module = RadarSimulator(SMALL, snr_db=10.0, pulse_chunk=8, **options)
@@ -238,6 +240,7 @@ def test_scene_is_that_of_the_echo_synthesizer():
         RadarSimulator(SMALL, WallConfig(), echo=EchoSynthesizer(SMALL), direct=False)
 
 
+@pytest.mark.filterwarnings("ignore:positions. some scatterer leaves the range gate")
 def test_fixed_gate_is_a_cut_through_the_maps():
     p, rcs = tensors(swinging(1000, 3, FREE.prf_hz), np.ones(3))
     whole, gated = (
@@ -273,6 +276,17 @@ def test_following_gate_follows():
     assert abs(center[-1] - center[0]) > 0.3  # else nothing was followed
     nobody = simulator(p, torch.zeros(6, dtype=torch.float64))
     assert float(nobody.range_time_mti.abs().max()) == 0
+
+
+def test_pulses_without_anybody_are_not_gated():
+    """The gate is closed where somebody is; before that, and after, all bins stay."""
+    gate = FollowingGate(SMALL, 0.375 * torch.arange(12), 0.8)
+    profiles = torch.ones(3, 12, dtype=torch.complex64)
+    positions = torch.tensor([0.0, 2.0, 1.5]).expand(3, 2, 3)
+    rcs = torch.tensor([[0.0, 0.0], [1.0, 0.5], [0.0, 0.0]])
+    kept = gate(profiles, positions, rcs).real
+    assert kept[0].tolist() == kept[2].tolist() == [1.0] * 12
+    assert torch.nonzero(kept[1])[:, 0].tolist() == [5, 6]  # 1.88 and 2.25 m
 
 
 def test_block_rms():
@@ -314,7 +328,7 @@ def test_motion_beyond_the_pulse_rate():
         check_unambiguous(mover(4.0, 128), rcs, THROUGH)
     one_foot = mover(0.5, 128)
     one_foot[:, 2] = mover(-6.0, 128)[:, 2]
-    with pytest.warns(TensorsimWarning, match="some scatterer has a radial speed of 6.00 m/s"):
+    with pytest.warns(TensorsimWarning, match="some scatterer has a radial speed above"):
         check_unambiguous(one_foot, rcs, THROUGH)
     appearing = mover(0.5, 128)
     appearing[:10] = 0  # not there yet: no position, no RCS
@@ -340,13 +354,35 @@ def test_bad_display_rate(rate):
 
 def test_warns_of_what_the_range_axis_cannot_show():
     far = torch.tensor([0.0, 9.0, 1.5]).expand(64, 2, 3).clone()
-    with pytest.warns(TensorsimWarning, match=r"9\.00 m away, more than the 7\.49 m"):
+    with pytest.warns(TensorsimWarning, match=r"beyond the 7\.49 m"):
         check_unambiguous(far, torch.ones(64, 2), RadarConfig.free_space())
     check_unambiguous(far, torch.zeros(64, 2), RadarConfig.free_space())  # nobody is there
     check_unambiguous(far, torch.ones(64, 2), THROUGH)  # 30 m
 
 
-def test_refuses_an_array_of_antennas():
-    radar = RadarConfig(rx_m=((0.0, 0.0, 1.5), (0.002, 0.0, 1.5)))
-    with pytest.raises(TensorsimError, match="several antennas"):
-        RadarSimulator(radar)
+@pytest.mark.parametrize(("near_m", "far_m"), [(0.0, 0.0), (0.5, 0.0), (0.0, -0.5)])
+def test_warning_when_somebody_leaves_a_fixed_gate(near_m, far_m):
+    p, rcs = mover(3.5, 128), torch.ones(4)
+    near, far = gate_around(p, THROUGH, margin_m=0.1)
+    simulator = RadarSimulator(THROUGH, range_gate_m=(near + near_m, far + far_m), snr_db=None)
+    for run in (
+        lambda: simulator(p, rcs),
+        lambda: simulator.stream(lambda a, b: (p[a:b], rcs), len(p)),
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run()
+        leaves = any("some scatterer leaves the range gate of" in str(w.message) for w in caught)
+        assert leaves == (near_m != far_m)
+
+
+def test_warnings_of_several_clips_have_one_text():
+    """Python shows a text once: not one for every clip of a data set."""
+    rcs = torch.ones(40, 4)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for speed in (5.0, 6.0):
+            one_foot = mover(0.5, 128)
+            one_foot[:, 2] = mover(-speed, 128)[:, 2]
+            check_unambiguous(one_foot, rcs, THROUGH)
+    assert len({str(w.message) for w in caught}) == 1 < len(caught)

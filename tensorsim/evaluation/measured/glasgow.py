@@ -19,17 +19,18 @@ from tensorsim.evaluation.measured.motions import (
     act_out,
     add_unrest,
     at_instants,
+    dim_limbs,
     knots,
     linear,
     place,
     stage_people,
-    to_and_fro,
+    walk_to_and_fro,
 )
-from tensorsim.evaluation.measured.training import drop_cells, shift
+from tensorsim.evaluation.measured.training import drop_cells, shift, warp
 from tensorsim.motion.exercises import drink, fall_down, pick_up
-from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import PeopleConfig
-from tensorsim.motion.scripts import sit_down, stand_up, walk
+from tensorsim.motion.scripts import sit_down, stand_up
 from tensorsim.motion.timing import segment
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.radar.processing.cfar import CfarDetector
@@ -96,14 +97,10 @@ class Glasgow:
         if label == 0:
             duration = 10.0
             time = knots(duration).expand(count, -1)
-            people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
-            leg = draw(1.6, 3.2)
-            if self.effects.to_and_fro:
-                joints = to_and_fro(walk, time, people, draw, leg, draw(0.9, 2.2), draw(0.0, 1.0) * leg)
-            else:
-                joints = act_out(walk, time, people)
-            y = joints[:, :, (8, 11), 1].mean(-1)
-            joints = place(joints, draw(-0.3, 0.3), range_m + 0.4 + y[:, :1] - y.mean(1, keepdim=True))
+            joints, offset_m = walk_to_and_fro(
+                time, people, draw, (1.6, 3.2), (0.9, 2.2), self.effects.to_and_fro
+            )
+            joints = place(joints, draw(-0.3, 0.3), range_m + 0.4 + offset_m)
         else:
             duration = 5.0
             time = knots(duration).expand(count, -1)
@@ -132,9 +129,7 @@ class Glasgow:
         at = torch.arange(pulses, dtype=torch.float64) / RADAR.prf_hz
         positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
         if self.effects.dim_limbs:
-            gain_db = draw(-9.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
-            gain_db[:, 1] = 0.0  # the torso
-            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+            rcs = dim_limbs(rcs, draw, -9.0, 3.0, self.scatterers.per_segment)
         positions, rcs = at_instants(positions, at), linear(rcs, at)
         echo = self.echo(positions, rcs)
         echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
@@ -196,6 +191,18 @@ def read(folder: Path) -> tuple[Tensor, Tensor]:
     return masks[:, ROWS], labels
 
 
+def read_ranges(folder: Path) -> Tensor:
+    """Pictures (N, 1, 40, 64) over Doppler (+-156 Hz) and range of the same clips as :func:`read` gives."""
+    with np.load(folder / "masks.npz") as file:
+        masks = torch.from_numpy(np.unpackbits(file["dr_packed"], axis=-1).astype(bool))
+    return F.avg_pool2d(masks[:, 88:168].float().unsqueeze(1), (2, 4))
+
+
+def augment_ranges(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Pictures over Doppler and range, moved in range, with cells missing."""
+    return drop_cells(shift(shown, 6, -1, generator), 0.05, generator)
+
+
 def pictures(masks: Tensor) -> Tensor:
     """Masks (N, 128, 256) to pictures (N, 1, 40, 64) of +-156 Hz, without the filter's start in the first columns."""
     shown = masks[:, 24:104].float()
@@ -205,11 +212,20 @@ def pictures(masks: Tensor) -> Tensor:
 
 def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
     """Pictures moved in time, thickened, thinned, and with cells missing."""
-    count = shown.shape[0]
     shown = shift(shown, 14, -1, generator)
     shown = shift(shown, 1, -2, generator)
-    chance = torch.rand(count, 1, 1, 1, generator=generator)
+    return drop_cells(thicken(shown, generator), 0.03, generator)
+
+
+def augment_measured(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Measured pictures, which are few and less varied than simulated ones: at other tempos and speeds as well."""
+    shown = warp(shown, generator, time=0.2, doppler=0.12, later=0.4)
+    return drop_cells(thicken(shown, generator), 0.1, generator)
+
+
+def thicken(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Pictures of which some are wider along Doppler and some narrower."""
+    chance = torch.rand(shown.shape[0], 1, 1, 1, generator=generator)
     thick = F.max_pool2d(shown, (3, 1), 1, (1, 0))
     thin = -F.max_pool2d(-shown, (3, 1), 1, (1, 0))
-    shown = torch.where(chance < 0.25, thick, torch.where(chance > 0.85, thin, shown))
-    return drop_cells(shown, 0.03, generator)
+    return torch.where(chance < 0.25, thick, torch.where(chance > 0.85, thin, shown))

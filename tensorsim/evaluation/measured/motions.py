@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import rotation
-from tensorsim.body.skeleton import mirror
+from tensorsim.body.skeleton import mid_hips, mirror
 from tensorsim.motion.act import Act
 from tensorsim.motion.activities import perform
+from tensorsim.motion.limb_scatterers import SEGMENTS
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature
+from tensorsim.motion.scripts import walk
 
 #: Joints are worked out at this rate and interpolated by a C2 spline.
 KNOT_HZ = 120.0
@@ -92,7 +94,7 @@ def act_out(script: Script, time: Tensor, people: People) -> Tensor:
 
 def place(joints: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     """Move people (N, K, 14, 3) to (N, 1) x and y at the first knot."""
-    hips = joints[:, :1, (8, 11), :].mean(dim=2)
+    hips = mid_hips(joints[:, :1])
     shift = torch.stack([x_m - hips[..., 0], y_m - hips[..., 1], torch.zeros_like(x_m)], dim=-1)
     return joints + shift[:, :, None]
 
@@ -134,6 +136,50 @@ def to_and_fro(
     path = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
     joints = turned + path[:, :, None]
     return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
+
+
+def dim_limbs(rcs: Tensor, draw: Draw, low_db: float, high_db: float, per_segment: int) -> Tensor:
+    """Cross sections (N, K, S) with another gain for each segment of each body; that of the torso stays.
+
+    Args:
+        rcs: of :class:`~tensorsim.motion.LimbScatterers`.
+        draw: random numbers.
+        low_db, high_db: bounds of the mean gain of a body; segments differ from it by 3 dB rms.
+        per_segment: scatterers of a segment.
+    """
+    gain_db = draw(low_db, high_db) + 3 * draw.normal(len(SEGMENTS))
+    gain_db[:, 1] = 0.0  # the torso
+    return rcs * 10 ** (gain_db.repeat_interleave(per_segment, 1) / 10).unsqueeze(1)
+
+
+def walk_to_and_fro(
+    time: Tensor,
+    people: People,
+    draw: Draw,
+    leg_m: tuple[float, float],
+    turn_s: tuple[float, float],
+    turns: bool,
+) -> tuple[Tensor, Tensor]:
+    """People who walk towards or away from the radar, and turn round or go straight on.
+
+    Args:
+        time: (N, K) s.
+        people: N people.
+        draw: random numbers.
+        leg_m, turn_s: bounds of the straight parts and of the time of a turn.
+        turns: whether they turn round.
+
+    Returns:
+        Joints (N, K, 14, 3), and what to add to the wanted mean y (N, 1) of the walk for the y of its start.
+    """
+    people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
+    leg = draw(*leg_m)
+    if turns:
+        joints = to_and_fro(walk, time, people, draw, leg, draw(*turn_s), draw(0.0, 1.0) * leg)
+    else:
+        joints = act_out(walk, time, people)
+    y = mid_hips(joints)[..., 1]
+    return joints, y[:, :1] - y.mean(1, keepdim=True)
 
 
 def at_instants(joints: Tensor, time_s: Tensor) -> Tensor:

@@ -14,18 +14,18 @@ from tensorsim.evaluation.measured.motions import (
     act_out,
     add_unrest,
     at_instants,
+    dim_limbs,
     in_beam,
     knots,
     linear,
     place,
     stage_people,
-    to_and_fro,
+    walk_to_and_fro,
 )
 from tensorsim.evaluation.measured.training import drop_cells, shift
 from tensorsim.motion.exercises import box, jump, jumping_jack, squat
-from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import PeopleConfig
-from tensorsim.motion.scripts import walk
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS, RADHAR_CHIRPS
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.point_cloud import local_maxima
@@ -87,14 +87,10 @@ class RadHar:
         )
         time = knots(FRAMES / FRAME_HZ).expand(count, -1)
         if label == 4:
-            people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
-            if self.effects.to_and_fro:
-                leg = draw(1.2, 2.5)
-                joints = to_and_fro(walk, time, people, draw, leg, draw(0.8, 2.0), draw(0.0, 1.0) * leg)
-            else:
-                joints = act_out(walk, time, people)
-            y = joints[:, :, (8, 11), 1].mean(-1)
-            joints = place(joints, draw(-0.4, 0.4), draw(1.6, 3.3) + y[:, :1] - y.mean(1, keepdim=True))
+            joints, offset_m = walk_to_and_fro(
+                time, people, draw, (1.2, 2.5), (0.8, 2.0), self.effects.to_and_fro
+            )
+            joints = place(joints, draw(-0.4, 0.4), draw(1.6, 3.3) + offset_m)
         else:
             script = (box, jumping_jack, jump, squat)[label]
             joints = act_out(script, time * draw(0.65, 1.2) + draw(0.0, 5.0), people)
@@ -111,9 +107,7 @@ class RadHar:
         if self.effects.beam:
             rcs = in_beam(positions, rcs, RADAR.tx_positions_m[0][2], draw(14.0, 32.0))
         if self.effects.dim_limbs:
-            gain_db = draw(-8.0, 3.0) + 3 * draw.normal(len(SEGMENTS))
-            gain_db[:, 1] = 0.0  # the torso
-            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+            rcs = dim_limbs(rcs, draw, -8.0, 3.0, self.scatterers.per_segment)
         if self.effects.hands:
             # A forearm seen end-on, as in a punch, is an edge of no size without its hand.
             hands = (10 ** draw(-2.6, -1.2)).expand(-1, 2)[:, None].expand(-1, joints.shape[1], -1)

@@ -13,6 +13,7 @@ from tensorsim.evaluation.measured.motions import (
     Unrest,
     add_unrest,
     at_instants,
+    dim_limbs,
     in_beam,
     knots,
     linear,
@@ -22,7 +23,7 @@ from tensorsim.evaluation.measured.motions import (
 from tensorsim.evaluation.measured.training import shift
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import creep, run, stride
-from tensorsim.motion.limb_scatterers import SEGMENTS, LimbScatterers
+from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import PeopleConfig
 from tensorsim.motion.scripts import walk
 from tensorsim.radar.measured_sensors import (
@@ -128,9 +129,7 @@ class Sense2Gol:
         if self.effects.beam:
             rcs = in_beam(positions, rcs, ANTENNA_M[2], draw(25.0, 55.0))
         if self.effects.dim_limbs:
-            gain_db = draw(-10.0, 2.0) + 3 * draw.normal(len(SEGMENTS))
-            gain_db[:, 1] = 0.0  # the torso
-            rcs = rcs * 10 ** (gain_db.repeat_interleave(self.scatterers.per_segment, 1) / 10).unsqueeze(1)
+            rcs = dim_limbs(rcs, draw, -10.0, 2.0, self.scatterers.per_segment)
         echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
         far = echo[:, : 6 * SENSE2GOL_BURST_SAMPLES].abs().square().mean(-1, keepdim=True).sqrt()
         echo = echo / far * 10 ** (draw(36.0, 52.0) / 20).float()

@@ -1,12 +1,13 @@
 """Checks that the speeds and ranges of a scene are unambiguous for a radar."""
 
+import math
 import warnings
 
 import torch
 from torch import Tensor
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_finite, check_not_empty
 from tensorsim.radar.synthesis.legs import leg_length
 
 
@@ -25,6 +26,26 @@ def radial_speed(positions: Tensor, radar: RadarConfig) -> Tensor:
     return mean_range(positions, radar).diff(dim=-2) * radar.prf_hz
 
 
+def gate_around(positions: Tensor, radar: RadarConfig, margin_m: float = 0.5) -> tuple[float, float]:
+    """The range gate (nearest, farthest) in metres that holds all scatterers, for ``range_gate_m`` of a simulator.
+
+    Args:
+        positions: (..., 3) m of everybody in the data set.
+        radar: the radar.
+        margin_m: added on both sides, for the width of a target in range and the delay of a wall.
+
+    Raises:
+        TensorsimError: no positions, or positions that are not finite.
+
+    >>> gate_around(torch.tensor([[0.0, 2.0, 1.0], [0.0, 5.0, 1.0]]), RadarConfig(tx_m=(0, 0, 1), rx_m=(0, 0, 1)))
+    (1.5, 5.5)
+    """
+    check_not_empty(positions, "positions")
+    check_finite(positions, "positions")
+    distance = mean_range(positions, radar)
+    return max(0.0, float(distance.min()) - margin_m), float(distance.max()) + margin_m
+
+
 class SpeedCheck:
     """Collects the radial speeds and ranges of a scene, piece by piece, and compares them with the radar's limits.
 
@@ -32,13 +53,18 @@ class SpeedCheck:
     RCS-weighted mean of the absolute radial speed (over scatterers and pulses of a clip) is above this limit, the
     whole map is wrong: an error. If only some scatterers are, a foot for instance: a warning. A scatterer at a range
     larger than that of the last bin has a beat frequency above half the sample rate and is not in the map: a warning.
-    Scatterers with RCS 0, such as people before they appear, are ignored.
+    A scatterer outside of a fixed range gate is cut off: a warning. Scatterers with RCS 0, such as people before they
+    appear, are ignored.
+
+    Args:
+        radar: the radar.
+        gate_m: (nearest, farthest) m of a fixed range gate; None is all of the range axis.
     """
 
-    def __init__(self, radar: RadarConfig) -> None:
-        self.radar = radar
+    def __init__(self, radar: RadarConfig, gate_m: tuple[float, float] | None = None) -> None:
+        self.radar, self.gate_m = radar, gate_m
         self.weighted, self.weight = torch.zeros(()), torch.zeros(())
-        self.fastest, self.farthest = 0.0, 0.0
+        self.fastest, self.farthest, self.nearest = 0.0, 0.0, math.inf
 
     def add(self, positions: Tensor, rcs: Tensor) -> None:
         """Add positions (..., M, S, 3) m and the RCS per pulse (..., M, S) m^2."""
@@ -47,6 +73,7 @@ class SpeedCheck:
         rcs = rcs.detach().double()
         distance = mean_range(positions.detach(), self.radar)
         self.farthest = max(self.farthest, float(torch.where(rcs > 0, distance, 0.0).max()))
+        self.nearest = min(self.nearest, float(torch.where(rcs > 0, distance, math.inf).min()))
         weight = torch.minimum(rcs[..., 1:, :], rcs[..., :-1, :])
         speed = torch.where(weight > 0, distance.diff(dim=-2).abs() * self.radar.prf_hz, 0.0)
         self.weighted = self.weighted + (weight * speed).sum((-2, -1)).cpu()
@@ -58,8 +85,16 @@ class SpeedCheck:
         reach_m = self.radar.range_resolution_m * (self.radar.samples_per_chirp // 2)
         if self.farthest > reach_m:
             warnings.warn(
-                f"positions: some scatterer is {self.farthest:.2f} m away, more than the {reach_m:.2f} m of this "
-                "radar's range axis",
+                f"positions: some scatterer is beyond the {reach_m:.2f} m of this radar's range axis and does not "
+                "appear in the maps",
+                TensorsimWarning,
+                stacklevel=3,
+            )
+        elif self.gate_m is not None and (self.nearest < self.gate_m[0] or self.farthest > self.gate_m[1]):
+            near, far = self.gate_m
+            warnings.warn(
+                f"positions: some scatterer leaves the range gate of {near:g} to {far:g} m and is missing from the "
+                "maps; tensorsim.radar.gate_around gives a gate that holds all",
                 TensorsimWarning,
                 stacklevel=3,
             )
@@ -67,19 +102,25 @@ class SpeedCheck:
         if self.fastest <= limit:
             return
         mean = float((self.weighted / self.weight.clamp_min(1e-300)).max())
-        speed = mean if mean > limit else self.fastest
-        enough = 4 * speed / self.radar.doppler_wavelength_m
-        message = (
-            f"radial speed of {speed:.2f} m/s, above the unambiguous {limit:.2f} m/s of a PRF of "
-            f"{self.radar.prf_hz:g} Hz; expected a PRF of at least {enough:.0f} Hz"
-        )
+        unambiguous = f"above the unambiguous {limit:.2f} m/s of a PRF of {self.radar.prf_hz:g} Hz"
         if mean > limit:
-            raise TensorsimError(f"positions: got a scene moving at a mean {message}")
-        warnings.warn(f"positions: some scatterer has a {message}", TensorsimWarning, stacklevel=3)
+            enough = 4 * mean / self.radar.doppler_wavelength_m
+            raise TensorsimError(
+                f"positions: got a scene moving at a mean radial speed of {mean:.2f} m/s, {unambiguous}; expected a "
+                f"PRF of at least {enough:.0f} Hz"
+            )
+        # Without the measured speed: Python shows a warning of one text once, not for every clip of a data set.
+        warnings.warn(
+            f"positions: some scatterer has a radial speed {unambiguous}: it appears at a wrong Doppler frequency",
+            TensorsimWarning,
+            stacklevel=3,
+        )
 
 
-def check_unambiguous(positions: Tensor, rcs: Tensor, radar: RadarConfig) -> None:
+def check_unambiguous(
+    positions: Tensor, rcs: Tensor, radar: RadarConfig, gate_m: tuple[float, float] | None = None
+) -> None:
     """:class:`SpeedCheck` of a whole scene: positions (..., M, S, 3) m and RCS per pulse (..., M, S) m^2."""
-    check = SpeedCheck(radar)
+    check = SpeedCheck(radar, gate_m)
     check.add(positions, rcs)
     check.judge()

@@ -17,9 +17,9 @@ METHODS = ("two-pulse", "n-pulse", "mean", "high-pass")
 
 
 def two_pulse_canceller(profiles: Tensor) -> Tensor:
-    """Two-pulse canceller ``y[m] = x[m + 1] - x[m]``: (..., M, R) -> (..., M - 1, R).
+    r"""Two-pulse canceller: (..., M, R) -> (..., M - 1, R).
 
-    Its response to a Doppler frequency fd is ``|2 sin(pi fd / PRF)|``.
+    $$ y[m] = x[m + 1] - x[m], \quad |H(f_d)| = |2 \sin(\pi f_d / \mathrm{PRF})| $$
     """
     return profiles[..., 1:, :] - profiles[..., :-1, :]
 
@@ -88,6 +88,19 @@ class MovingTargetIndicator(nn.Module):
             raise TensorsimError(f"method: got {method!r}, expected one of {METHODS}")
         if method == "n-pulse" and pulses < 2:
             raise TensorsimError(f"pulses: got {pulses}, expected at least 2")
+        unused = [
+            name
+            for name, differs, used_by in (
+                ("pulses", pulses != 3, "n-pulse"),
+                ("cutoff_m_s", cutoff_m_s != 0.2, "high-pass"),
+                ("order", order != 4, "high-pass"),
+            )
+            if differs and method != used_by
+        ]
+        if unused:
+            raise TensorsimError(
+                f"{', '.join(unused)}: got a value, which the method {method!r} does not use"
+            )
         self.method = method
         self.lost_pulses = {"two-pulse": 1, "n-pulse": pulses - 1}.get(method, 0)
         self.delay_pulses = self.lost_pulses / 2

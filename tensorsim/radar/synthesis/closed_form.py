@@ -137,6 +137,7 @@ class RangeBinSynthesizer(nn.Module):
         profile: the window, and the gate if it has one.
         near_bins: compute only the bins at most this far from the one nearest to each path; None computes all.
             All bins take longer than the time-domain engine, a few bins several times less.
+        energy_stride: :meth:`energy` is worked out for every n-th pulse and taken for those up to the next.
 
     Shapes: positions (..., M, S, 3) m, rcs (..., S), (..., M, S) or (S,) m^2 -> (..., M, R) complex, free of
     noise; complex64, and complex128 after ``.double()``. Differentiable by both.
@@ -146,15 +147,24 @@ class RangeBinSynthesizer(nn.Module):
             fraction of the window's energy in the other bins, averaged over fractions of a bin. 0 for all bins.
 
     Raises:
-        TensorsimError: ``near_bins`` below 1, an echo with several antennas or a closed Airy slab; see
+        TensorsimError: ``near_bins`` or ``energy_stride`` below 1, an echo with several antennas or a closed Airy slab; see
             :class:`~tensorsim.radar.EchoSynthesizer`.
     """
 
     table: Tensor
     bin_cycles: Tensor
 
-    def __init__(self, echo: EchoSynthesizer, profile: RangeProfile, near_bins: int | None = None) -> None:
+    def __init__(
+        self,
+        echo: EchoSynthesizer,
+        profile: RangeProfile,
+        near_bins: int | None = None,
+        energy_stride: int = 1,
+    ) -> None:
         super().__init__()
+        if energy_stride < 1:
+            raise TensorsimError(f"energy_stride: got {energy_stride}, expected at least 1")
+        self.energy_stride = energy_stride
         if near_bins is not None and near_bins < 1:
             raise TensorsimError(f"near_bins: got {near_bins}, expected at least 1 or None for all")
         if echo.paths.airy or echo.paths.has_array:
@@ -221,7 +231,14 @@ class RangeBinSynthesizer(nn.Module):
 
     @torch.jit.export
     def energy(self, beat: Tensor, strength: Tensor, total: bool) -> Tensor:
-        """Energy (...) over the N samples of :meth:`tones` (..., P); ``total`` adds the static paths to them."""
+        """Energy (..., m) over the N samples of :meth:`tones` (..., m, P); ``total`` adds the static paths to them."""
+        if self.energy_stride == 1:
+            return self._energy_of(beat, strength, total)
+        chosen = torch.arange(0, beat.shape[-2], self.energy_stride, device=beat.device)
+        some = self._energy_of(beat.index_select(-2, chosen), strength.index_select(-2, chosen), total)
+        return some.repeat_interleave(self.energy_stride, -1)[..., : beat.shape[-2]]
+
+    def _energy_of(self, beat: Tensor, strength: Tensor, total: bool) -> Tensor:
         if total:
             static = self.echo.paths.static()
             fixed = self._tones(static.delay_s, static.gain)

@@ -124,14 +124,8 @@ class GNNTracker(nn.Module):
         for name, count in (("max_tracks", max_tracks), ("min_hits", min_hits)):
             if count < 1:
                 raise TensorsimError(f"GNNTracker.{name}: got {count}, expected at least 1")
-        if not 1 <= confirm_hits <= confirm_window:
-            raise TensorsimError(
-                f"GNNTracker.confirm_hits: got {confirm_hits} of {confirm_window}, expected M of N"
-            )
-        if not 1 <= delete_misses <= delete_window:
-            raise TensorsimError(
-                f"GNNTracker.delete_misses: got {delete_misses} of {delete_window}, expected P of R"
-            )
+        _check_window("confirm_hits", confirm_hits, confirm_window)
+        _check_window("delete_misses", delete_misses, delete_window)
         check_positive(assignment_threshold, "GNNTracker.assignment_threshold")
         check_positive(min_box_px, "GNNTracker.min_box_px")
         check_positive(process_noise, "GNNTracker.process_noise")
@@ -357,6 +351,11 @@ def _presence(matched: Tensor, looked: Tensor) -> Tensor:
     first, last = hits.argmax(-1, keepdim=True), hits.cumsum(-1).argmax(-1, keepdim=True)
     present = (before >= before.gather(-1, first)) & (until <= until.gather(-1, last))
     return present & matched.any(-1, keepdim=True)
+
+
+def _check_window(name: str, count: int, window: int) -> None:
+    if not 1 <= count <= window:
+        raise TensorsimError(f"GNNTracker.{name}: got {count} of {window}, expected M of N with 1 <= M <= N")
 
 
 def _check(detections: Detections, observed: Tensor | None) -> None:

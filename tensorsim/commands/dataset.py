@@ -1,0 +1,96 @@
+"""``tensorsim dataset``: labelled data sets of radar maps from a recipe."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from tensorsim.errors import TensorsimError
+
+if TYPE_CHECKING:
+    from tensorsim.data.sets.engines import Engine
+
+
+@dataclass(frozen=True)
+class DatasetBuild:
+    """Build a data set; run again with the same arguments, it goes on where it stopped.
+
+    The files depend on the recipe alone, not on the engine or the number of workers.
+    """
+
+    recipe: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RECIPE.yaml")]]
+    """What to make; `tensorsim dataset example` prints one."""
+    out: Path
+    """Folder of the data set."""
+    workers: int = 1
+    """Processes of this machine."""
+    engine: Literal["processes", "ray"] = "processes"
+    """Ray runs on clusters as well: pip install 'tensorsim[scale]'."""
+    address: str | None = None
+    """Of a running Ray cluster, whose nodes all see the folder; by default one is started here."""
+    cache: Path | None = None
+    """Folder for the people found in films, which several data sets can share. Default: OUT/.people."""
+    strict: bool = False
+    """Stop at the first clip that fails, in place of a line in failures.csv."""
+    quiet: bool = False
+    """No progress bars."""
+
+    def run(self) -> None:
+        """Do it."""
+        if self.workers < 1:
+            raise TensorsimError(f"--workers: got {self.workers}, expected at least 1")
+        if self.address is not None and self.engine != "ray":
+            raise TensorsimError("--address: got one without --engine ray, expected both")
+        if self.out.exists() and not self.out.is_dir():
+            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        from tensorsim.data.sets.build import build_dataset
+        from tensorsim.data.sets.recipe import DatasetRecipe
+
+        recipe = DatasetRecipe.from_yaml(self.recipe)
+        built = build_dataset(recipe, self.out, self._engine(), self.cache, self.strict, self.quiet)
+        failed = f", {built.failures} clips failed (failures.csv)" if built.failures else ""
+        print(f"{self.out}: {built.samples} samples, {built.made} of them made now{failed}")
+
+    def _engine(self) -> "Engine":
+        from tensorsim.data.sets.engines import Processes, RayCluster, Serial
+
+        if self.engine == "ray":
+            return RayCluster(self.address, self.workers)
+        return Serial() if self.workers == 1 else Processes(self.workers)
+
+
+@dataclass(frozen=True)
+class DatasetExample:
+    """Print a small recipe with comments: two activities, 8 samples."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.data.sets.example import EXAMPLE
+
+        print(EXAMPLE, end="")
+
+
+@dataclass(frozen=True)
+class DatasetSample:
+    """Make one sample of a data set again from its row of the manifest, and compare it with the stored hash."""
+
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DIR")]]
+    """The data set."""
+    id: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="ID")]]
+    """The sample, as in the manifest."""
+    out: Path | None = None
+    """Folder for its arrays, as ID.RADAR.OUTPUT.npy."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.data.sets.again import sample_again
+        from tensorsim.data.sets.shards import npy_bytes
+        from tensorsim.files import complete_file
+
+        sample = sample_again(self.folder, self.id)
+        if self.out is not None:
+            for name, array in sample.arrays.items():
+                with complete_file(self.out / f"{self.id}.{name}.npy") as scratch:
+                    scratch.write_bytes(npy_bytes(array))
+        print(f"{self.id}: {sample.row['label']}, the same to the bit ({sample.row['sha256']})")

@@ -1,0 +1,284 @@
+"""Lists of labelled clips: folders with a folder per class, tables, and the layouts of public sets.
+
+Names of clips are relative to the folder, so that a data set does not depend on where the files are.
+"""
+
+import csv
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tensorsim.data.layouts.movi import movi_descriptions
+from tensorsim.data.layouts.ntu import ntu_name
+from tensorsim.data.motion_files import h36m_keys, motion_keys
+from tensorsim.data.sets.clips import Clip
+from tensorsim.data.sets.recipe import SourceConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.files import reading
+
+FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".gif", ".wmv")
+CAPTURED = (".bvh", ".npz")
+
+
+def _folder(source: SourceConfig) -> Path:
+    folder = Path(source.path or "")
+    if not folder.is_dir():
+        raise TensorsimError(f"{folder}: got no such folder, expected one for the source {source.kind!r}")
+    return folder
+
+
+def _some(clips: list[Clip], where: Path | str, expected: str) -> list[Clip]:
+    if not clips:
+        raise TensorsimError(f"{where}: got no clips, expected {expected}")
+    return clips
+
+
+def _of_classes(source: SourceConfig, suffixes: tuple[str, ...], expected: str) -> list[Clip]:
+    """Clips of a folder with a folder per class; everybody is somebody else, by file."""
+    folder = _folder(source)
+    clips = []
+    for group in sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."):
+        for file in sorted(group.rglob("*")):
+            name = file.relative_to(folder).as_posix()
+            if file.suffix.lower() in suffixes and file.is_file():
+                clips += [
+                    Clip(
+                        f"{name}:{key}" if key else name,
+                        group.name,
+                        name,
+                        name,
+                        path=str(file),
+                        key=key or "",
+                    )
+                    for key in _keys(file)
+                ]
+    return _some(clips, folder, expected)
+
+
+def _keys(file: Path) -> list[str | None]:
+    """Motions of a file; a file that cannot be read has one, which fails with the reason when it is used."""
+    try:
+        return motion_keys(file)
+    except TensorsimError:
+        return [None]
+
+
+def folder_of_films(source: SourceConfig) -> list[Clip]:
+    """``CLASS/.../film.mp4``.
+
+    Raises:
+        TensorsimError: no such folder, or no films in folders of classes.
+    """
+    return _of_classes(source, FILMS, f"films ({', '.join(FILMS)}) in a folder for each class")
+
+
+def folder_of_keypoints(source: SourceConfig) -> list[Clip]:
+    """``CLASS/.../film.json`` of COCO key points.
+
+    Raises:
+        TensorsimError: as :func:`folder_of_films`.
+    """
+    return _of_classes(source, (".json",), "COCO key points (.json) in a folder for each class")
+
+
+def folder_of_motion(source: SourceConfig) -> list[Clip]:
+    """``CLASS/.../motion.bvh`` or ``.npz``; of a file with several motions each is a clip.
+
+    Raises:
+        TensorsimError: as :func:`folder_of_films`.
+    """
+    return _of_classes(source, CAPTURED, "captured motion (.bvh, .npz) in a folder for each class")
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """The rows of a CSV or Parquet file by column.
+
+    Raises:
+        TensorsimError: no such file, or one that cannot be read.
+    """
+    if not path.is_file():
+        raise TensorsimError(f"{path}: got no such file, expected a table (.csv or .parquet)")
+    with reading(path, "a table"):
+        if path.suffix.lower() == ".parquet":
+            import pyarrow.parquet as pq
+
+            rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+            return rows
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return list(csv.DictReader(file))
+
+
+def _columns(path: Path, rows: list[dict[str, Any]], names: Iterable[str]) -> None:
+    there = list(rows[0]) if rows else []
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise TensorsimError(
+            f"{path}: got the columns {', '.join(map(str, there)) or 'none'}, expected {', '.join(missing)} as well"
+        )
+
+
+def _seconds(value: Any, where: str) -> float | None:
+    """A number of seconds, None where there is none."""
+    if value is None or str(value).strip() == "":
+        return None
+    try:
+        return float(value)
+    except ValueError:
+        raise TensorsimError(f"{where}: got {value!r}, expected a number of seconds") from None
+
+
+def table(source: SourceConfig) -> list[Clip]:
+    """A table with columns path and label, and if they are known start, end (s), person, key and split.
+
+    Paths are relative to the table. Without a person, everybody is somebody else, by file.
+
+    Raises:
+        TensorsimError: no such table, or columns that are missing.
+    """
+    path = Path(source.path or "")
+    rows = read_table(path)
+    _columns(path, rows, ("path", "label"))
+    clips = []
+    for number, row in enumerate(rows):
+        where = f"{path}: row {number + 1}"
+        start, end = _seconds(row.get("start"), where), _seconds(row.get("end"), where)
+        name = str(row["path"])
+        clips.append(
+            Clip(
+                f"{name}#{number}", str(row["label"]), str(row.get("person") or name), name,
+                str(row.get("split") or ""), str(path.parent / name), str(row.get("key") or ""), start, end,
+            )
+        )  # fmt: skip
+    return _some(clips, path, "rows")
+
+
+def ntu(source: SourceConfig) -> list[Clip]:
+    """NTU RGB+D: ``.skeleton`` files; classes A001 and on, people P001 and on.
+
+    Raises:
+        TensorsimError: no such folder, no such files, or one with another name.
+    """
+    folder = _folder(source)
+    clips = []
+    for file in sorted(folder.rglob("*.skeleton")):
+        name = ntu_name(file)
+        where = file.relative_to(folder).as_posix()
+        clips.append(Clip(where, f"A{name.action:03d}", f"P{name.performer:03d}", where, path=str(file)))
+    return _some(clips, folder, "files such as S001C001P001R001A001.skeleton")
+
+
+def _film(folder: Path, *names: str) -> Path:
+    """The film of one of these names (without suffix) in a folder or its folders; else a path that is not there."""
+    for name in names:
+        for suffix in FILMS:
+            for place in (folder / f"{name}{suffix}", *folder.glob(f"*/{name}{suffix}")):
+                if place.is_file():
+                    return place
+    return folder / f"{names[0]}.mp4"
+
+
+def kinetics(source: SourceConfig) -> list[Clip]:
+    """Kinetics: a CSV with label, youtube_id, time_start, time_end and split beside a folder of films.
+
+    Films are called ``ID_START_END`` (six digits each) if they are cut already, or ``ID``, of which the times are a
+    part; in the folder or in a folder of it. The person is the id. Source: W. Kay et al., "The Kinetics Human Action
+    Video Dataset", 2017.
+
+    Raises:
+        TensorsimError: no such folder or table, or columns that are missing.
+    """
+    folder, path = _folder(source), Path(source.table or "")
+    rows = read_table(path)
+    _columns(path, rows, ("label", "youtube_id", "time_start", "time_end"))
+    parts = {"train": "train", "val": "validation", "validate": "validation", "test": "test"}
+    clips = []
+    for number, row in enumerate(rows):
+        where = f"{path}: row {number + 1}"
+        start, end = _seconds(row["time_start"], where), _seconds(row["time_end"], where)
+        name = str(row["youtube_id"])
+        short = f"{name}_{int(start or 0):06d}_{int(end or 0):06d}"
+        film = _film(folder, short, name)
+        times = (None, None) if film.stem == short else (start, end)
+        part = parts.get(str(row.get("split") or ""), "")
+        clips.append(Clip(short, str(row["label"]), name, name, part, str(film), "", *times))
+    return _some(clips, path, "rows")
+
+
+def charades(source: SourceConfig) -> list[Clip]:
+    """Charades: a CSV with id, subject and actions beside a folder of films ``ID.mp4``; a clip per action.
+
+    ``actions`` are such as ``c092 11.90 21.20;c147 0.00 12.60``: class, start and end in seconds. Source: G. Sigurdsson
+    et al., "Hollywood in Homes", ECCV 2016.
+
+    Raises:
+        TensorsimError: no such folder or table, columns that are missing, or actions of another form.
+    """
+    folder, path = _folder(source), Path(source.table or "")
+    rows = read_table(path)
+    _columns(path, rows, ("id", "subject", "actions"))
+    clips = []
+    for row in rows:
+        name = str(row["id"])
+        for number, action in enumerate(filter(None, str(row["actions"] or "").split(";"))):
+            words = action.split()
+            if len(words) != 3 or not re.fullmatch(r"c\d{3}", words[0]):
+                raise TensorsimError(
+                    f"{path}: {name}: got the action {action!r}, expected one such as c092 11.9 21.2"
+                )
+            start, end = (_seconds(word, f"{path}: {name}") for word in words[1:])
+            film = str(_film(folder, name))
+            clips.append(
+                Clip(f"{name}#{number}", words[0], str(row["subject"]), name, "", film, "", start, end)
+            )
+    return _some(clips, path, "rows with actions")
+
+
+def movi(source: SourceConfig) -> list[Clip]:
+    """MoVi: ``F_amass_Subject_N.mat``; a clip per motion, its class the description.
+
+    With a ``table`` of the columns file and label: AMASS ``.npz`` files with joints, and their labels.
+
+    Raises:
+        TensorsimError: no such folder, no such files, or columns that are missing.
+    """
+    folder = _folder(source)
+    clips = []
+    if source.table is not None:
+        rows = read_table(Path(source.table))
+        _columns(Path(source.table), rows, ("file", "label"))
+        for row in rows:
+            name = str(row["file"])
+            person = str(row.get("person") or _subject(name))
+            clips.append(Clip(name, str(row["label"]), person, name, path=str(folder / name)))
+        return _some(clips, source.table, "rows")
+    for file in sorted(folder.rglob("*_amass_Subject_*.mat")):
+        where = file.relative_to(folder).as_posix()
+        try:
+            labels = movi_descriptions(file)
+        except TensorsimError:
+            labels = ["unreadable"]
+        clips += [
+            Clip(f"{where}#{k}", label, _subject(where), where, path=str(file), key=str(k))
+            for k, label in enumerate(labels)
+        ]
+    return _some(clips, folder, "files such as F_amass_Subject_1.mat")
+
+
+def _subject(name: str) -> str:
+    found = re.search(r"Subject_(\d+)", name)
+    return name if found is None else f"Subject_{found.group(1)}"
+
+
+def h36m(source: SourceConfig) -> list[Clip]:
+    """Human3.6M as VideoPose3D publishes it, ``data_3d_h36m.npz``: classes are actions without their number.
+
+    Raises:
+        TensorsimError: no such file, or another one.
+    """
+    path = Path(source.path or "")
+    clips = []
+    for key in h36m_keys(path):
+        subject, action = key.split("/", 1)
+        clips.append(Clip(key, re.sub(r"\s*\d+$", "", action), subject, path.name, path=str(path), key=key))
+    return _some(clips, path, "subjects with actions")

@@ -1,0 +1,31 @@
+"""A stored sample, made again from its row of the manifest alone."""
+
+from pathlib import Path
+
+from tensorsim.data.sets.manifest import recipe_of, rows_of
+from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.samples import Sample, sample_of_row
+from tensorsim.errors import TensorsimError
+
+
+def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample:
+    """The sample of this id, from the row and the recipe in ``manifest.parquet``; shards are not read.
+
+    Films and captured motion are needed where the recipe names them.
+
+    Raises:
+        TensorsimError: no such data set or sample, or arrays that differ from those that were stored: another version
+            of tensorsim, torch or the films, or a processor of another kind.
+    """
+    row = next(rows_of(folder, id=sample), None)
+    if row is None:
+        last = max(row["id"] for row in rows_of(folder))
+        raise TensorsimError(f"{folder}: got no sample {sample!r}, expected an id such as {last}")
+    plan = Plan(recipe_of(folder), str(folder / ".people" if cache is None else cache))
+    made = sample_of_row(plan, row)
+    if made.row["sha256"] != row["sha256"]:
+        raise TensorsimError(
+            f"{folder}: got other arrays for {sample} than were stored, expected the same: is it another version of "
+            "tensorsim, torch or the films, or a processor of another kind?"
+        )
+    return made

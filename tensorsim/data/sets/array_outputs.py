@@ -1,0 +1,138 @@
+"""Outputs of a radar with several antennas: range-Doppler-angle cubes and point clouds."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tensorsim.config import RadarConfig, SimulationConfig
+from tensorsim.data.sets.outputs import OutputConfig, Stored, in_decibels
+from tensorsim.data.sets.scene import Scene
+from tensorsim.errors import TensorsimError
+from tensorsim.pipeline.maps import PoseToDoppler
+from tensorsim.radar.options import echo_of
+from tensorsim.radar.processing.array import align_transmitters, steering_vectors
+from tensorsim.radar.processing.cfar import CfarDetector
+from tensorsim.radar.processing.doppler import DopplerFrames
+from tensorsim.radar.processing.mti import MovingTargetIndicator
+from tensorsim.radar.processing.point_cloud import PointCloud
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.noise import ReceiverNoise, mean_power
+from tensorsim.recognition.map_image import area_weights
+
+#: Detection of points: guard and training cells in range and Doppler, and the share of false alarms.
+_GUARD, _TRAINING, _FALSE_ALARM = (2, 2), (6, 6), 1e-5
+#: Pulses in the estimate of the echo's power that the noise refers to.
+_POWER_PULSES = 256
+
+
+def array_outputs(config: SimulationConfig, wanted: OutputConfig, scene: Scene) -> dict[str, Stored]:
+    """``range_doppler_angle`` and ``point_cloud`` as :class:`~tensorsim.data.sets.outputs.OutputConfig` says.
+
+    Each frame is a Doppler window of ``processing.window_s``; transmitters that fire in turn are aligned, echoes that
+    stand still are removed by the moving target indicator of the configuration.
+
+    Raises:
+        TensorsimError: a point cloud of antennas that are no even line along x.
+    """
+    radar, processing = config.scene.radar, config.processing
+    profile = RangeProfile(radar, processing.range_window, _fixed(processing.range_gate_m))
+    frames = DopplerFrames(radar, processing.window_s, processing.overlap)
+    cubes = list(_cubes(config, wanted, scene, profile, frames))
+    found = {}
+    if "range_doppler_angle" in wanted.kinds:
+        beams = torch.stack([_beams(cube, radar, wanted) for cube in cubes])
+        found["range_doppler_angle"] = in_decibels(beams, wanted)
+    if "point_cloud" in wanted.kinds:
+        found["point_cloud"] = _points(torch.stack(cubes), radar, profile, frames, wanted)
+    return found
+
+
+def _fixed(gate_m: tuple[float, float] | float | None) -> tuple[float, float] | None:
+    if isinstance(gate_m, float | int):
+        raise TensorsimError(f"range_gate_m: got {gate_m} for an array, expected nearest and farthest range")
+    return gate_m
+
+
+def _cubes(
+    config: SimulationConfig,
+    wanted: OutputConfig,
+    scene: Scene,
+    profile: RangeProfile,
+    frames: DopplerFrames,
+) -> Iterator[Tensor]:
+    """Complex cubes (V, R, F) of the frames, Doppler ascending, positive = approaching."""
+    radar = config.scene.radar
+    pair = replace(radar, tx_m=radar.tx_positions_m[0], rx_m=radar.rx_positions_m[0])
+    stage = PoseToDoppler.from_config(config.replace(scene__radar=pair, processing__near_bins=None))
+    joints, valid = scene.joints[None], scene.valid[None]
+    coefficients = stage.resampler.coefficients(joints, scene.fps)
+    pulses = stage.resampler.pulses(joints.shape[2], scene.fps)
+    points, rcs = stage.scene(coefficients, valid, scene.fps, 0, pulses)
+    echo = echo_of(config.scene, config.processing.pulse_chunk, None, ())
+    every = max(1, pulses // _POWER_PULSES)
+    signal = mean_power(echo.target_echo(points[:, ::every], rcs[:, ::every])).mean()
+    noise = ReceiverNoise(
+        config.scene.snr_db,
+        config.scene.noise_reference,
+        empty_power=(echo.paths.scale / 3.0**2) ** 2,
+        bandwidth_hz=radar.sample_rate_hz,
+        noise_figure_db=config.scene.noise_figure_db,
+        transmit_power_w=config.scene.transmit_power_w,
+    )
+    mti = MovingTargetIndicator(config.processing.mti)
+    length = frames.length + mti.lost_pulses
+    hop = max(1, round(radar.prf_hz / wanted.frames_per_s))
+    window = frames.shifting_window.float()
+    for first in range(0, pulses - length + 1, hop):
+        clean = echo(points[:, first : first + length], rcs[:, first : first + length])[0]
+        if not noise.noiseless:
+            clean = clean + noise.draw(clean, noise.noise_power(signal).expand(clean.shape[0]))
+        profiles = align_transmitters(profile(clean), len(radar.tx_positions_m))
+        moving = mti(profiles).transpose(-2, -1)
+        yield torch.fft.ifft(moving * window, frames.bins, norm="forward")
+
+
+def _beams(cube: Tensor, radar: RadarConfig, wanted: OutputConfig) -> Tensor:
+    """Power (R', F', D) of D beams in steps of equal sine, mean over cells of range and Doppler."""
+    sines = (torch.arange(wanted.beams, dtype=torch.float64) + 0.5) * (2 / wanted.beams) - 1
+    cycles = steering_vectors(_virtual_m(radar), sines.asin(), 0.0, radar.doppler_wavelength_m)
+    weights = torch.polar(torch.ones_like(cycles), 2 * torch.pi * cycles).to(cube.dtype) / cycles.shape[1]
+    power = torch.einsum("dv,vrf->rfd", weights.conj(), cube).abs().square()
+    rows, columns = wanted.cube_size
+    for axis, cells in ((0, rows), (1, columns)):
+        count = power.shape[axis]
+        if count > cells:
+            shares = area_weights(torch.arange(count, dtype=torch.float64), 1.0, 0.0, float(count), cells)
+            power = torch.tensordot(shares.to(power.dtype), power.movedim(axis, 0), 1).movedim(0, axis)
+    return power
+
+
+def _virtual_m(radar: RadarConfig) -> Tensor:
+    """Virtual elements (V, 3): sums of the places of transmitter and receiver, transmitter by transmitter."""
+    tx = torch.tensor(radar.tx_positions_m, dtype=torch.float64)
+    rx = torch.tensor(radar.rx_positions_m, dtype=torch.float64)
+    return (tx[:, None] + rx).flatten(0, 1)
+
+
+def _points(
+    cubes: Tensor, radar: RadarConfig, profile: RangeProfile, frames: DopplerFrames, wanted: OutputConfig
+) -> Stored:
+    """Points (frames, points, 4) of cubes (frames, V, R, F)."""
+    steps = _virtual_m(radar).diff(dim=0)
+    if not torch.allclose(steps, steps[:1] * torch.tensor([1.0, 0, 0]).double(), atol=1e-6):
+        raise TensorsimError("point_cloud: got other antennas, expected an even line along x")
+    cfar = CfarDetector(_GUARD, _TRAINING, _FALSE_ALARM, edges=("reflect", "circular"))
+    cloud = PointCloud(
+        radar.range_resolution_m,
+        radar.prf_hz / frames.bins * radar.doppler_wavelength_m / 2,
+        wanted.points,
+        float(steps[0, 0]) / radar.doppler_wavelength_m,
+    )
+    power = cubes.abs().square().mean(1)
+    found = cloud(cubes.conj().resolve_conj(), cfar(power))
+    strength = 10 * found.power.clamp_min(1e-30).log10()
+    ranges = found.range_m + float(profile.range_m[0])
+    rows = torch.stack([ranges, found.speed_m_s, found.sine, strength], dim=-1)
+    return Stored(torch.where(found.valid[..., None], rows, torch.nan).float().numpy(), 1.0)

@@ -1,0 +1,193 @@
+"""Building a data set: what is missing is made, shard by shard, and at the end listed in the manifest."""
+
+import json
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from tensorsim.config.documents import to_document
+from tensorsim.data.sets.engines import Engine, Serial
+from tensorsim.data.sets.manifest import finish
+from tensorsim.data.sets.plan import Plan, Shard
+from tensorsim.data.sets.recipe import DatasetRecipe
+from tensorsim.data.sets.samples import make_sample
+from tensorsim.data.sets.shards import write_shard
+from tensorsim.errors import TensorsimError
+from tensorsim.files import locked, write_json
+
+#: The recipe of the data set of a folder, the folder of finished shards' rows, and the file that is written last.
+RECIPE, ROWS, DONE = "recipe.yaml", ".rows", "dataset.json"
+
+
+class Job(NamedTuple):
+    """What a worker needs to know: plain values, so that it travels to any process.
+
+    Attributes:
+        recipe: as JSON.
+        out: folder of the data set.
+        cache: folder of the people found in films.
+        number: of the shard, or of the clip to prepare.
+        strict: whether the first failure ends the work.
+    """
+
+    recipe: str
+    out: str
+    cache: str
+    number: int
+    strict: bool
+
+
+class Built(NamedTuple):
+    """What a call of :func:`build_dataset` leaves.
+
+    Attributes:
+        samples, failures: numbers of samples stored and of clips that failed.
+        made: number of samples that this call made.
+    """
+
+    samples: int
+    failures: int
+    made: int
+
+
+@lru_cache(maxsize=2)
+def plan_of(recipe: str, cache: str) -> Plan:
+    """The plan of a recipe as JSON; kept, since a worker does many shards of one recipe."""
+    return Plan(DatasetRecipe.from_document(json.loads(recipe)), cache)
+
+
+def prepare_clip(job: Job) -> int:
+    """Find the people of one clip's film, for all samples of it. Failures are met again by its samples."""
+    plan = plan_of(job.recipe, job.cache)
+    source, clip = plan.clip(job.number)
+    try:
+        source.prepare(clip)
+    except (TensorsimError, OSError):
+        if job.strict:
+            raise
+    return 1
+
+
+def build_shard(job: Job) -> int:
+    """Make one shard and its rows; returns the number of its samples, made or failed."""
+    plan = plan_of(job.recipe, job.cache)
+    shard = plan.shards[job.number]
+    samples, failures = [], []
+    for number in range(shard.first, shard.stop):
+        try:
+            samples.append(make_sample(plan, number, shard.name))
+        except (TensorsimError, OSError) as error:
+            if job.strict:
+                raise TensorsimError(str(error)) from error
+            clip = plan.clip(plan.clip_of_sample(number)[1])[1]
+            failures.append({"clip": clip.name, "path": clip.path, "reason": " ".join(str(error).split())})
+    out = Path(job.out)
+    files = write_shard(out, plan.recipe.storage, shard.name, samples)
+    rows = [sample.row for sample in samples]
+    write_json(rows_path(out, shard), {"rows": rows, "failures": failures, "files": files})
+    return shard.stop - shard.first
+
+
+def rows_path(out: Path, shard: Shard) -> Path:
+    """Where the rows of a finished shard wait for the manifest."""
+    return out / ROWS / f"{shard.name}.json"
+
+
+def build_dataset(
+    recipe: DatasetRecipe,
+    out: Path,
+    engine: Engine | None = None,
+    cache: Path | None = None,
+    strict: bool = False,
+    quiet: bool = False,
+) -> Built:
+    """Build the data set of a recipe, or what is missing of it.
+
+    The files depend on the recipe (and the films that it names) alone: not on the engine, the number of workers, or
+    interruptions. A shard is complete or not there; one that was finished is not made again.
+
+    Args:
+        recipe: what to make.
+        out: folder; new, empty, or with an unfinished data set of the same recipe.
+        engine: runs the work; None: this process.
+        cache: folder of the people found in films; None: ``.people`` in ``out``.
+        strict: the first clip that fails ends the work, in place of a line in ``failures.csv``.
+        quiet: no progress bar.
+
+    Raises:
+        TensorsimError: another data set or other files in the folder, another run that is writing there, a source that
+            is not there, every sample failed, or, if ``strict``, a clip that fails.
+    """
+    with locked(out):
+        if _starts_or_goes_on(out, recipe):
+            done = json.loads((out / DONE).read_text(encoding="utf-8"))
+            return Built(done["samples"], done["failures"], 0)
+        engine = Serial() if engine is None else engine
+        people = out / ".people" if cache is None else cache
+        document, kept = json.dumps(recipe.to_document(), sort_keys=True), str(people.resolve())
+        plan = plan_of(document, kept)
+
+        def job(number: int) -> Job:
+            return Job(document, str(out.resolve()), kept, number, strict)
+
+        films = _films(plan)
+        _run(engine, "people", "film", len(films), engine.run(prepare_clip, map(job, films)), quiet)
+        missing = [k for k, shard in enumerate(plan.shards) if not rows_path(out, shard).is_file()]
+        count = sum(plan.shards[k].stop - plan.shards[k].first for k in missing)
+        _run(engine, "samples", "sample", count, engine.run(build_shard, map(job, missing)), quiet)
+        samples, failures = finish(out, plan, [rows_path(out, shard) for shard in plan.shards])
+        return Built(samples, failures, count)
+
+
+def _run(engine: Engine, name: str, unit: str, total: int, done: Iterator[int], quiet: bool) -> None:
+    """Go through the results of the workers, with a progress bar."""
+    if total == 0:
+        return
+    with tqdm(desc=f"{name:<8}", total=total, unit=unit, disable=quiet) as bar:
+        for count in done:
+            bar.update(count)
+
+
+def _films(plan: Plan) -> list[int]:
+    """One clip of every film whose people networks have to find."""
+    first: dict[str, int] = {}
+    for number, source in enumerate(plan.sources):
+        for index in range(len(source) if source.finds_people else 0):
+            first.setdefault(source.clip(index).path, int(plan.starts[number]) + index)
+    return list(first.values())
+
+
+def _starts_or_goes_on(out: Path, recipe: DatasetRecipe) -> bool:
+    """Make the folder ready; true if it holds the whole data set already.
+
+    Raises:
+        TensorsimError: another data set, or other files.
+    """
+    described = out / RECIPE
+    if described.is_file():
+        there = DatasetRecipe.from_yaml(described)
+        if there != recipe:
+            raise TensorsimError(
+                f"{out}: got a data set of another recipe (first difference: {_difference(there, recipe)}), expected "
+                "the same or a new folder"
+            )
+        for left in (*out.rglob(".*.tmp"),):
+            left.unlink(missing_ok=True)
+    else:
+        if out.exists() and any(out.iterdir()):
+            raise TensorsimError(f"{out}: got a folder with other files, expected a new or an empty one")
+        recipe.to_yaml(described)
+    return (out / DONE).is_file()
+
+
+def _difference(there: Any, here: Any, name: str = "") -> str:
+    """The first field in which two recipes differ, and its values."""
+    there, here = to_document(there), to_document(here)
+    if isinstance(there, dict) and isinstance(here, dict):
+        for key in there:
+            if there[key] != here.get(key):
+                return _difference(there[key], here.get(key), f"{name}.{key}" if name else key)
+    return f"{name} {there!r} there, {here!r} here"

@@ -1,0 +1,145 @@
+"""Ways to run the work: in this process, in several, or on the nodes of a Ray cluster."""
+
+import json
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Protocol
+
+from tensorsim.errors import TensorsimError
+
+Work = Callable[[Any], int]
+
+#: Times that a worker may die in a row before the work is given up.
+_DEATHS = 3
+
+
+class Engine(Protocol):
+    """Runs independent jobs in any order."""
+
+    def run(self, work: Work, jobs: Iterable[Any]) -> Iterator[int]:
+        """Call ``work`` for every job; yields what it returns, as it comes."""
+
+
+class Serial:
+    """In this process, one after the other."""
+
+    def run(self, work: Work, jobs: Iterable[Any]) -> Iterator[int]:
+        """See :class:`Engine`."""
+        for job in jobs:
+            yield work(job)
+
+
+class Processes:
+    """In several processes of this machine; one that dies is replaced and its job done again.
+
+    Processes are started anew, so a script that uses them needs ``if __name__ == "__main__":``.
+
+    Args:
+        workers: number of processes.
+
+    Raises:
+        TensorsimError: a worker dies several times in a row; what a job raises.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+
+    def run(self, work: Work, jobs: Iterable[Any]) -> Iterator[int]:
+        """See :class:`Engine`."""
+        waiting = list(jobs)[::-1]
+        deaths = 0
+        while waiting:
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(min(self.workers, len(waiting)), context, _one_thread)
+            running: dict[Future[int], Any] = {}
+            try:
+                while waiting or running:
+                    while waiting and len(running) < 2 * self.workers:
+                        job = waiting.pop()
+                        running[pool.submit(work, job)] = job
+                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        count = future.result()
+                        del running[future]
+                        deaths = 0
+                        yield count
+            except BrokenProcessPool:
+                deaths += 1
+                waiting += running.values()
+                if deaths == _DEATHS:
+                    raise TensorsimError(
+                        f"workers: got {_DEATHS} processes that died in a row, expected them to live; is the memory "
+                        "enough for so many?"
+                    ) from None
+            finally:
+                _end(pool)
+
+
+def _one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Do not wait for jobs that nobody asks for any more."""
+    processes = list((pool._processes or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+
+
+class RayCluster:
+    """On the nodes of a Ray cluster, by Ray Data; all of them need the folder of the data set.
+
+    Args:
+        address: of a running cluster; None starts one on this machine.
+        workers: processors to use on this machine where one is started.
+
+    Raises:
+        TensorsimError: Ray is not installed.
+    """
+
+    def __init__(self, address: str | None = None, workers: int = 1) -> None:
+        try:
+            import ray.data  # noqa: F401
+        except ImportError as error:
+            raise TensorsimError(
+                f"--engine ray: got no Ray ({error}), expected it installed: pip install 'tensorsim[scale]'"
+            ) from None
+        self.address, self.workers = address, workers
+
+    def run(self, work: Work, jobs: Iterable[Any]) -> Iterator[int]:
+        """See :class:`Engine`."""
+        import ray
+
+        waiting = list(jobs)
+        if not waiting:
+            return
+        started = not ray.is_initialized()
+        if started:
+            ray.init(
+                address=self.address,
+                num_cpus=self.workers if self.address is None else None,
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+            )
+        try:
+            ray.data.DataContext.get_current().enable_progress_bars = False
+            rows = ray.data.from_items(
+                [{"job": json.dumps(job)} for job in waiting], override_num_blocks=len(waiting)
+            )
+            kind = type(waiting[0])
+
+            def done(row: dict[str, Any]) -> dict[str, int]:
+                _one_thread()
+                return {"count": work(kind(*json.loads(row["job"])))}
+
+            for row in rows.map(done, num_cpus=1).iter_rows():
+                yield int(row["count"])
+        finally:
+            if started:
+                ray.shutdown()

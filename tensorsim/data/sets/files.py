@@ -1,0 +1,103 @@
+"""Files of people as a source of labelled clips: films, key points, captured motion, and the layouts of public sets."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+from tensorsim.data.layouts import listing
+from tensorsim.data.sets.clips import Clip
+from tensorsim.data.sets.people import PeopleFinder, is_film
+from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig
+from tensorsim.data.sets.scene import Scene, part_of, varied
+from tensorsim.data.sets.variations import Variation
+from tensorsim.data.skeletons import Motion
+from tensorsim.errors import TensorsimError
+
+#: How the clips of each kind of source are listed.
+LISTS: dict[str, Callable[[SourceConfig], list[Clip]]] = {
+    "films": listing.folder_of_films,
+    "keypoints": listing.folder_of_keypoints,
+    "motion": listing.folder_of_motion,
+    "table": listing.table,
+    "ntu": listing.ntu,
+    "kinetics": listing.kinetics,
+    "charades": listing.charades,
+    "movi": listing.movi,
+    "h36m": listing.h36m,
+}
+
+
+class FileClips:
+    """Clips of files.
+
+    Args:
+        recipe: gives length and rate of the motion.
+        source: kind and place of the files.
+        number: of the source in the recipe.
+        cache: folder of the people that were found in films; None finds them every time.
+
+    Raises:
+        TensorsimError: a folder or table that is not there or has no clips, or an unknown class.
+    """
+
+    def __init__(
+        self, recipe: DatasetRecipe, source: SourceConfig, number: int, cache: str | None = None
+    ) -> None:
+        self.recipe, self.source = recipe, source
+        found = LISTS[source.kind](source)
+        there = sorted({clip.label for clip in found})
+        missing = [label for label in source.classes if label not in there]
+        if missing:
+            raise TensorsimError(
+                f"sources: got the class {missing[0]!r} for {source.path}, expected some of {', '.join(there[:50])}"
+            )
+        self.labels = source.classes or tuple(there)
+        self.clips = [clip for clip in found if clip.label in self.labels]
+        self.finder = PeopleFinder(source, None if cache is None else Path(cache))
+        self.finds_people = any(is_film(Path(clip.path)) for clip in self.clips)
+        # Variations of one clip often follow one another.
+        self._motion = lru_cache(maxsize=8)(self.finder.motion)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def clip(self, index: int) -> Clip:
+        """See :class:`~tensorsim.data.sets.clips.ClipSource`."""
+        return self.clips[index]
+
+    def person(self, index: int) -> str:
+        """See :class:`~tensorsim.data.sets.clips.ClipSource`."""
+        return self.clips[index].person
+
+    def adapted(self, clip: Clip, variation: Variation) -> Variation:
+        """As it is."""
+        return variation
+
+    def scene(self, clip: Clip, variation: Variation) -> Scene:
+        """See :class:`~tensorsim.data.sets.clips.ClipSource`."""
+        motion = cut(self._motion(clip.path, clip.key), clip)
+        moved = varied(motion, variation)
+        return part_of(moved, self.recipe.duration_s, self.recipe.motion_hz, variation.start)
+
+    def prepare(self, clip: Clip) -> None:
+        """Find the people of the clip's file."""
+        self.finder.motion(clip.path, clip.key)
+
+
+def cut(motion: Motion, clip: Clip) -> Motion:
+    """The part of a motion between the times of a clip.
+
+    Raises:
+        TensorsimError: fewer than two frames are left.
+    """
+    if clip.start_s is None and clip.end_s is None:
+        return motion
+    count = motion.valid.shape[1]
+    first = 0 if clip.start_s is None else round(clip.start_s * motion.fps)
+    stop = count if clip.end_s is None else min(count, round(clip.end_s * motion.fps))
+    if stop - first < 2:
+        raise TensorsimError(
+            f"{clip.path}: got {clip.start_s} to {clip.end_s} s of {count / motion.fps:.3g} s, expected at least "
+            "two frames in it"
+        )
+    return motion._replace(joints=motion.joints[:, first:stop], valid=motion.valid[:, first:stop])

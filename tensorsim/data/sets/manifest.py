@@ -1,0 +1,145 @@
+"""What tells of a finished data set: manifest, failures, data card, contact sheet."""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from tensorsim.data.sets.card import card
+from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.recipe import DatasetRecipe
+from tensorsim.data.sets.samples import columns
+from tensorsim.data.sets.sheet import draw_sheet
+from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file, reading, write_json
+
+Row = dict[str, Any]
+
+
+def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
+    """Write everything beside the shards of a complete data set; ``dataset.json`` is the last.
+
+    Args:
+        out: folder of the data set.
+        plan: of its recipe.
+        finished: the rows of each shard, in order.
+
+    Returns:
+        Numbers of samples and of failed clips.
+
+    Raises:
+        TensorsimError: every sample failed.
+    """
+    failures = _failures(finished)
+    counts: Counter[tuple[str, str]] = Counter()
+    files: dict[str, str] = {}
+    for path in finished:
+        content = _read(path)
+        counts.update((row["part"], row["label"]) for row in content["rows"])
+        files |= content["files"]
+    _write_failures(out / "failures.csv", failures)
+    samples = sum(counts.values())
+    if samples == 0:
+        reason = failures[0]["reason"] if failures else "there are none"
+        raise TensorsimError(f"{out}: got no sample at all ({reason}), expected some")
+    _write_manifest(out, plan.recipe, finished)
+    draw_sheet(out, plan.recipe)
+    sizes = {name: (out / name).stat().st_size for name in files}
+    with complete_file(out / "README.md") as scratch:
+        scratch.write_text(card(plan, counts, len(failures), sum(sizes.values())), encoding="utf-8")
+    summary = {
+        "name": plan.recipe.name,
+        "recipe": plan.recipe.digest,
+        "labels": list(plan.labels),
+        "samples": samples,
+        "failures": len(failures),
+        "bytes": sum(sizes.values()),
+        "sha256": files,
+    }
+    write_json(out / "dataset.json", summary)
+    return samples, len(failures)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    with reading(path, "rows of a shard"):
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content
+
+
+def _failures(finished: Sequence[Path]) -> list[dict[str, str]]:
+    """Every clip that failed, once for each reason."""
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for path in finished:
+        for failure in _read(path)["failures"]:
+            found.setdefault(tuple(failure.values()), failure)
+    return sorted(found.values(), key=lambda failure: (failure["clip"], failure["reason"]))
+
+
+def _write_failures(path: Path, failures: Sequence[dict[str, str]]) -> None:
+    with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, ["clip", "path", "reason"])
+        writer.writeheader()
+        writer.writerows(failures)
+
+
+def _write_manifest(out: Path, recipe: DatasetRecipe, finished: Sequence[Path]) -> None:
+    """``manifest.parquet``, which holds the recipe as well, and ``manifest.csv``; shard by shard."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    names = columns(recipe)
+    schema = pa.schema(
+        [(name, kinds[kind]) for name, kind in names.items()],
+        metadata={"tensorsim.recipe": json.dumps(recipe.to_document())},
+    )
+    with (
+        complete_file(out / "manifest.parquet") as parquet,
+        complete_file(out / "manifest.csv") as table,
+        pq.ParquetWriter(parquet, schema) as writer,
+        table.open("w", newline="", encoding="utf-8") as file,
+    ):
+        lines = csv.DictWriter(file, list(names))
+        lines.writeheader()
+        for path in finished:
+            rows = _read(path)["rows"]
+            if rows:
+                writer.write_table(pa.Table.from_pylist(rows, schema))
+                lines.writerows(rows)
+
+
+def recipe_of(out: Path) -> DatasetRecipe:
+    """The recipe that the manifest of a data set holds.
+
+    Raises:
+        TensorsimError: no manifest there, or a damaged one.
+    """
+    import pyarrow.parquet as pq
+
+    path = out / "manifest.parquet"
+    if not path.is_file():
+        raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")
+    with reading(path, "a manifest"):
+        stored = json.loads(pq.read_schema(path).metadata[b"tensorsim.recipe"])
+    return DatasetRecipe.from_document(stored, str(path))
+
+
+def rows_of(out: Path, **wanted: str) -> Iterator[Row]:
+    """Rows of the manifest whose columns have these values, in the order of the samples.
+
+    Raises:
+        TensorsimError: no manifest there, or a damaged one.
+    """
+    import pyarrow.parquet as pq
+
+    path = out / "manifest.parquet"
+    if not path.is_file():
+        raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")
+    with reading(path, "a manifest"):
+        file = pq.ParquetFile(path)
+        for group in range(file.num_row_groups):
+            for row in file.read_row_group(group).to_pylist():
+                if all(row[name] == value for name, value in wanted.items()):
+                    yield row

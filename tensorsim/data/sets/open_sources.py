@@ -1,0 +1,23 @@
+"""From the sources that a recipe names to the clips that they have."""
+
+from tensorsim.data.sets.clips import ClipSource
+from tensorsim.data.sets.files import FileClips
+from tensorsim.data.sets.generated import GeneratedPeople
+from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig
+
+
+def open_source(recipe: DatasetRecipe, source: SourceConfig, number: int, cache: str | None) -> ClipSource:
+    """The clips of a source.
+
+    Args:
+        recipe: that the source belongs to.
+        source: its description.
+        number: its place in the recipe.
+        cache: folder of what is found in films; None finds it every time.
+
+    Raises:
+        TensorsimError: a folder or table that is not there or has no clips.
+    """
+    if source.kind == "generated":
+        return GeneratedPeople(recipe, source, number)
+    return FileClips(recipe, source, number, cache)

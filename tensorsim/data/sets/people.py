@@ -1,0 +1,117 @@
+"""The people of a file: read from motion and key points, found by networks in films, and kept."""
+
+import hashlib
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from tensorsim.config import SimulationConfig
+from tensorsim.data.layouts.movi import read_movi
+from tensorsim.data.layouts.ntu import read_ntu
+from tensorsim.data.motion_files import load_motion
+from tensorsim.data.sets.recipe import SourceConfig
+from tensorsim.data.skeletons import Motion
+from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
+from tensorsim.pipeline import VideoToPose
+from tensorsim.vision.smoothing.along_time import nearest_valid
+
+#: Files of captured motion by suffix; other files are key points (.json) or films.
+_MOTION = (".bvh", ".npz", ".skeleton", ".mat")
+
+
+def is_film(file: Path) -> bool:
+    """Whether networks have to find the people of a file."""
+    return file.suffix.lower() not in (*_MOTION, ".json") and not file.is_dir()
+
+
+class PeopleFinder:
+    """Reads or finds the people of files.
+
+    Args:
+        source: its ``fps`` and ``image_size`` serve where files do not tell them.
+        cache: folder for the people of films, by the hash of the film and of the networks; None keeps nothing.
+    """
+
+    def __init__(self, source: SourceConfig, cache: Path | None) -> None:
+        self.source, self.cache = source, cache
+
+    def motion(self, path: str, key: str) -> Motion:
+        """The people of a file; joints are finite everywhere.
+
+        Raises:
+            TensorsimError: a file that is missing or damaged, or a film in which nobody was found.
+        """
+        file = Path(path)
+        if not file.exists():
+            raise TensorsimError(f"{path}: no such file")
+        if is_film(file):
+            motion = self._of_film(file)
+        elif file.suffix.lower() in _MOTION:
+            motion = self._captured(file, key)
+        else:
+            motion = self._of_keypoints(file)
+        if not bool(motion.valid.any()):
+            raise TensorsimError(f"{path}: got nobody in it, expected at least one person")
+        somebody = motion.valid.any(dim=1)
+        motion = Motion(motion.joints[somebody], motion.valid[somebody], motion.fps)
+        # A person who is not there stays where they were seen last: splines run through these places.
+        nearest = nearest_valid(motion.valid)[..., None, None].expand(-1, -1, 14, 3)
+        return motion._replace(joints=motion.joints.gather(1, nearest))
+
+    def _captured(self, file: Path, key: str) -> Motion:
+        suffix = file.suffix.lower()
+        if suffix == ".skeleton":
+            return read_ntu(file)
+        if suffix == ".mat":
+            return read_movi(file, key)
+        return load_motion(file, key or None, self.source.fps)
+
+    def _of_keypoints(self, file: Path) -> Motion:
+        from tensorsim.sources import keypoint_source
+
+        stage = VideoToPose.from_config(SimulationConfig(), nn.Identity(), nn.Identity())
+        found = keypoint_source(file, stage, self.source.fps, self.source.image_size)
+        pose = found.pose(True)
+        return Motion(pose.joints[0], pose.valid[0], found.fps)
+
+    def _of_film(self, file: Path) -> Motion:
+        kept = None if self.cache is None else self.cache / f"{self._digest(file)}.npz"
+        if kept is not None and kept.is_file():
+            with np.load(kept) as arrays:
+                joints, valid = torch.from_numpy(arrays["joints"]), torch.from_numpy(arrays["valid"])
+                return Motion(joints, valid, float(arrays["fps"]))
+        motion = self._found(file)
+        if kept is not None:
+            with complete_file(kept) as scratch, scratch.open("wb") as target:
+                np.savez(target, joints=motion.joints.numpy(), valid=motion.valid.numpy(), fps=motion.fps)
+        return motion
+
+    def _found(self, file: Path) -> Motion:
+        from tensorsim.data.video import VideoReader
+        from tensorsim.streaming import pose_of_film
+
+        pose = pose_of_film(self.networks, VideoReader(file), torch.device("cpu"), quiet=True)
+        return Motion(pose.joints[0], pose.valid[0], VideoReader(file).fps)
+
+    @cached_property
+    def networks(self) -> VideoToPose:
+        """Detection, tracking, pose and lifting by the shipped networks."""
+        return VideoToPose.from_config(SimulationConfig())
+
+    @cached_property
+    def _of_networks(self) -> bytes:
+        from tensorsim.registry import locate
+
+        files = [locate(None, "RTMDet"), locate(None, "HRNet", "CPM")]
+        return b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
+
+    def _digest(self, file: Path) -> str:
+        content = hashlib.sha256(self._of_networks)
+        with file.open("rb") as source:
+            for block in iter(lambda: source.read(1 << 20), b""):
+                content.update(block)
+        return content.hexdigest()

@@ -1,0 +1,246 @@
+"""Reading data sets for training: by number, as a stream shared out to ranks and workers, or simulated on the fly."""
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from tensorsim.data.sets.manifest import recipe_of, rows_of
+from tensorsim.data.sets.outputs import MAPS, OutputConfig
+from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.recipe import PARTS, DatasetRecipe
+from tensorsim.data.sets.samples import sample_id
+from tensorsim.data.sets.stored import StoredArrays
+from tensorsim.data.sets.synthesis import synthesize
+from tensorsim.errors import TensorsimError
+
+#: Outputs that a classifier can look at.
+_PICTURES = ("picture", *MAPS)
+
+
+def share_of_worker() -> tuple[int, int]:
+    """Number of this worker among all workers of all ranks, and how many there are.
+
+    Ranks are those of ``torchrun``, workers those of a ``DataLoader``.
+    """
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    worker = get_worker_info()
+    if worker is None:
+        return rank, world
+    return rank * worker.num_workers + worker.id, world * worker.num_workers
+
+
+def as_picture(array: npt.NDArray[Any], outputs: OutputConfig) -> Tensor:
+    """A stored map or picture (H, W) as float32 in [0, 1]: 1 at the peak, 0 at the floor of its range."""
+    if array.dtype == np.uint8:
+        return torch.from_numpy(np.ascontiguousarray(array)).float() / 255
+    return (1 + torch.from_numpy(array.astype(np.float32)) / outputs.range_db).clamp(0.0, 1.0)
+
+
+def chosen_names(recipe: DatasetRecipe, output: str | None, radars: Sequence[str] | None) -> list[str]:
+    """Arrays to stack: one output of some radars.
+
+    Raises:
+        TensorsimError: an output that the recipe does not have, or that is no map, or an unknown radar.
+    """
+    there = [kind for kind in _PICTURES if kind in recipe.outputs.kinds]
+    if output is None and there:
+        output = there[0]
+    if output not in there:
+        raise TensorsimError(
+            f"MapDataset.output: got {output!r}, expected one of {', '.join(there) or 'no map, for there is none'}"
+        )
+    names = [view.name for view in recipe.radars]
+    for name in radars or ():
+        if name not in names:
+            raise TensorsimError(f"MapDataset.radars: got {name!r}, expected some of {', '.join(names)}")
+    return [f"{name}.{output}" for name in radars or names]
+
+
+class MapDataset(Dataset[dict[str, Any]]):
+    """Labelled maps of a data set that ``tensorsim dataset build`` made, by number.
+
+    Args:
+        folder: of the data set.
+        split: ``"train"``, ``"validation"`` or ``"test"``; None takes all.
+        output: which of its outputs; None takes pictures where there are any, else Doppler-time maps.
+        radars: whose maps are stacked as channels; None takes all.
+        labels: classes to use, in the order of their numbers; None takes all.
+
+    Samples: ``{"map": (C, H, W) float32 in [0, 1], "label": int, "id": str}``, 1 at the peak of the map.
+
+    Attributes:
+        labels: names of the classes.
+        targets: (N,) int64 class of every sample.
+
+    Raises:
+        TensorsimError: no data set there, an unknown part, output, radar or class, or no samples.
+
+    Example:
+        >>> train = ts.data.MapDataset("data", split="train")  # doctest: +SKIP
+        >>> loader = torch.utils.data.DataLoader(train, 32, shuffle=True)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        split: str | None = None,
+        output: str | None = None,
+        radars: Sequence[str] | None = None,
+        labels: Sequence[str] | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        self.recipe = recipe_of(self.folder)
+        if split not in (None, *PARTS):
+            raise TensorsimError(f"MapDataset.split: got {split!r}, expected one of {', '.join(PARTS)}")
+        self.names = chosen_names(self.recipe, output, radars)
+        rows = list(rows_of(self.folder, **({} if split is None else {"part": split})))
+        there = {row["class_index"]: row["label"] for row in rows_of(self.folder)}
+        known = [there[k] for k in sorted(there)]
+        unknown = [label for label in labels or () if label not in known]
+        if unknown:
+            raise TensorsimError(
+                f"MapDataset.labels: got {unknown[0]!r}, expected some of {', '.join(known)}"
+            )
+        self.labels = tuple(labels or known)
+        # Columns in place of rows: a million samples fit in memory.
+        kept = [row for row in rows if row["label"] in self.labels]
+        if not kept:
+            raise TensorsimError(f"{self.folder}: got no samples of the part {split}, expected some")
+        self.ids = [row["id"] for row in kept]
+        self.shards = np.array([row["shard"] for row in kept])
+        self.parts = np.array([row["part"] for row in kept])
+        self.targets = torch.tensor([self.labels.index(row["label"]) for row in kept])
+        self._read = StoredArrays(self.folder, self.recipe)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        label = int(self.targets[index])
+        row = {"id": self.ids[index], "shard": str(self.shards[index]), "part": str(self.parts[index])}
+        row["label"] = self.labels[label]
+        maps = [as_picture(self._read(row, name), self.recipe.outputs) for name in self.names]
+        return {"map": stacked(maps, self.names), "label": label, "id": self.ids[index]}
+
+    def class_weights(self) -> Tensor:
+        """(classes,) weights for a cross-entropy that counts every class alike; their mean over samples is 1."""
+        counts = torch.bincount(self.targets, minlength=len(self.labels)).float()
+        weights = torch.where(counts > 0, 1 / counts.clamp_min(1), torch.zeros_like(counts))
+        return weights * len(self) / (weights * counts).sum()
+
+
+def stacked(maps: Sequence[Tensor], names: Sequence[str]) -> Tensor:
+    """Maps (H, W) of several radars as channels (C, H, W).
+
+    Raises:
+        TensorsimError: maps of different sizes.
+    """
+    if len({map_.shape for map_ in maps}) > 1:
+        sizes = ", ".join(f"{name} {list(m.shape)}" for name, m in zip(names, maps, strict=True))
+        raise TensorsimError(
+            f"maps: got different sizes ({sizes}), expected one: choose radars, or set outputs.size"
+        )
+    return torch.stack(list(maps))
+
+
+def collate_maps(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Samples as a batch: maps (B, C, H, W), labels (B,); shorter maps are padded with the floor at their end."""
+    width = max(sample["map"].shape[-1] for sample in samples)
+    maps = [torch.nn.functional.pad(s["map"], (0, width - s["map"].shape[-1])) for s in samples]
+    return {
+        "map": torch.stack(maps),
+        "label": torch.tensor([sample["label"] for sample in samples]),
+        "id": [sample["id"] for sample in samples],
+    }
+
+
+class MapStream(IterableDataset[dict[str, Any]]):
+    """A data set shard by shard, shared out to ranks and workers; every sample comes once in an epoch.
+
+    Args:
+        maps: what to read.
+        shuffle: shards and the samples in them come in another order in every epoch.
+        seed: of the order.
+    """
+
+    def __init__(self, maps: MapDataset, shuffle: bool = True, seed: int = 0) -> None:
+        self.maps, self.shuffle, self.seed, self.epoch = maps, shuffle, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the order; call it before every epoch."""
+        self.epoch = epoch
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        generator = np.random.Generator(np.random.PCG64([self.seed, self.epoch]))
+        shards = np.unique(self.maps.shards)
+        if self.shuffle:
+            shards = generator.permutation(shards)
+        number, count = share_of_worker()
+        for shard in shards[number::count]:
+            places = np.flatnonzero(self.maps.shards == shard)
+            for place in generator.permutation(places) if self.shuffle else places:
+                yield self.maps[int(place)]
+
+
+class SimulatedMaps(IterableDataset[dict[str, Any]]):
+    """The samples of a recipe, simulated while they are asked for, with new variations in every round.
+
+    Nothing is stored. The first round has the very samples of the data set that the recipe describes; use several
+    workers of a ``DataLoader`` to simulate while the network trains.
+
+    Args:
+        recipe: as for :class:`MapDataset`.
+        split: part of it; None takes all.
+        rounds: number of rounds through its samples; None goes on for ever.
+        output, radars: see :class:`MapDataset`.
+
+    Samples: as those of :class:`MapDataset`. Clips that fail are left out.
+
+    Raises:
+        TensorsimError: an unknown part, output or radar, or a source that is not there.
+    """
+
+    def __init__(
+        self,
+        recipe: DatasetRecipe,
+        split: str | None = "train",
+        rounds: int | None = None,
+        output: str | None = None,
+        radars: Sequence[str] | None = None,
+    ) -> None:
+        if split not in (None, *PARTS):
+            raise TensorsimError(f"SimulatedMaps.split: got {split!r}, expected one of {', '.join(PARTS)}")
+        self.plan, self.split, self.rounds = Plan(recipe), split, rounds
+        self.names = chosen_names(recipe, output, radars)
+        self.labels = self.plan.labels
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        number, count = share_of_worker()
+        numbers = [n for n in range(len(self.plan)) if self.split in (None, self.plan.clip_of_sample(n)[0])]
+        done = 0
+        while numbers and (self.rounds is None or done < self.rounds):
+            for place in numbers[number::count]:
+                try:
+                    sample = self._sample(place, done)
+                except (TensorsimError, OSError):
+                    continue
+                yield sample
+            done += 1
+
+    def _sample(self, number: int, done: int) -> dict[str, Any]:
+        recipe = self.plan.recipe
+        part, clip, variation = self.plan.clip_of_sample(number)
+        drawn = self.plan.variation(clip, done * recipe.variations.count + variation)
+        made = synthesize(recipe, self.plan.scene(clip, part, drawn), drawn)
+        label = self.plan.labels.index(self.plan.clip(clip)[1].label)
+        maps = [as_picture(made.arrays[name], recipe.outputs) for name in self.names]
+        return {"map": stacked(maps, self.names), "label": label, "id": f"{sample_id(number)}-{done}"}

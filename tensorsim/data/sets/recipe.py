@@ -1,0 +1,286 @@
+"""The recipe of a data set: which people, varied how, seen by which radars, stored as what."""
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from tensorsim.config import ACTIVITIES, ProcessingConfig, SceneConfig, SimulationConfig
+from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
+from tensorsim.config.documents import from_document, to_document
+from tensorsim.config.yaml_files import read_yaml
+from tensorsim.data.sets.outputs import OutputConfig
+from tensorsim.data.sets.variations import VariationConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
+from tensorsim.motion.activities import activity_index
+from tensorsim.radar.presets import radar_scene
+
+SourceKind = Literal[
+    "generated", "films", "table", "keypoints", "motion", "ntu", "kinetics", "charades", "movi", "h36m"
+]
+SplitBy = Literal["person", "source", "table"]
+Format = Literal["webdataset", "hdf5", "mat", "png"]
+
+#: Parts of a data set, in the order of ``SplitConfig.shares``.
+PARTS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Where people and their labels come from.
+
+    Attributes:
+        kind: ``"generated"``: tensorsim's own generator; ``"films"``, ``"keypoints"`` and ``"motion"``: a folder with a
+            folder per class, of films, COCO key points (.json) or captured motion (.bvh, .npz); ``"table"``: a CSV or
+            Parquet table of such files; the others: the layouts of public sets, see ``tensorsim.data.layouts``.
+        path: folder or file; relative paths are relative to the working directory.
+        table: CSV or Parquet file that the layouts ``kinetics``, ``charades`` and ``movi`` need beside the folder.
+        classes: classes to use, in the order of their numbers; empty: all. For generated people these are activities.
+        people: number of generated people.
+        fps: frames per second of key points, and of motion files that do not tell it.
+        image_size: (height, width) of the pictures of key points, where the file does not tell it.
+
+    Raises:
+        TensorsimError: a field that the kind needs and does not have, or has and does not use.
+    """
+
+    kind: SourceKind = "generated"
+    path: str | None = None
+    table: str | None = None
+    classes: tuple[str, ...] = ()
+    people: int | None = None
+    fps: float | None = None
+    image_size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        require_choices(self, kind=SourceKind)
+        used = {"generated": {"people"}, "keypoints": {"path", "fps", "image_size"}}.get(
+            self.kind, {"path", "fps"}
+        )
+        with_table = ("kinetics", "charades", "movi")
+        used = used | {"table"} if self.kind in with_table else used
+        used = used | {"image_size"} if self.kind == "table" else used
+        for name in ("path", "table", "people", "fps", "image_size"):
+            if name not in used and getattr(self, name) is not None:
+                raise TensorsimError(
+                    f"SourceConfig.{name}: got one for the kind {self.kind!r}, expected none"
+                )
+        for name in ("path", "table", "people"):
+            needed = name in used and not (name == "table" and self.kind == "movi")
+            if needed and getattr(self, name) is None:
+                raise TensorsimError(
+                    f"SourceConfig.{name}: got none for the kind {self.kind!r}, expected one"
+                )
+        if len(set(self.classes)) < len(self.classes):
+            raise TensorsimError(f"SourceConfig.classes: got {list(self.classes)}, expected each class once")
+        if self.kind == "generated":
+            require_counts(self, "people")
+            names = tuple(ACTIVITIES[activity_index(name)] for name in self.classes) or ACTIVITIES
+            object.__setattr__(self, "classes", names)
+        if self.fps is not None:
+            require_positive("SourceConfig", fps=self.fps)
+
+
+@dataclass(frozen=True)
+class RadarView:
+    """A radar and its place. Every radar sees the same motion.
+
+    Attributes:
+        name: of its arrays in a sample.
+        preset: a preset of ``tensorsim.radar.presets`` or a YAML file, with its wall and floor.
+        x_m, y_m: place of the radar's origin on the floor.
+        yaw_deg: direction that it looks to, counter-clockwise seen from above; 0 is +y.
+
+    Raises:
+        TensorsimError: a name that cannot be part of a file name, a preset that is not there, a place that is not
+            finite.
+    """
+
+    name: str = "radar"
+    preset: str = "free-space"
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.name.replace("_", "").replace("-", "").isalnum():
+            raise TensorsimError(f"RadarView.name: got {self.name!r}, expected letters, digits, '-' and '_'")
+        if not all(is_finite(value) for value in (self.x_m, self.y_m, self.yaw_deg)):
+            raise TensorsimError(f"RadarView {self.name}: got {self}, expected finite numbers")
+
+
+@dataclass(frozen=True)
+class SplitConfig:
+    """How samples are split into parts; everybody is in one part only.
+
+    Attributes:
+        by: ``"person"``; ``"source"``, the films, files or generated people; ``"table"``, the column ``split``.
+        shares: of the people (or sources) in training, validation and test. A part with a share has at least one of
+            them if there are enough.
+
+    Raises:
+        TensorsimError: shares that are negative or do not add up to 1.
+    """
+
+    by: SplitBy = "person"
+    shares: tuple[float, ...] = (0.8, 0.1, 0.1)
+
+    def __post_init__(self) -> None:
+        require_choices(self, by=SplitBy)
+        if len(self.shares) != len(PARTS) or min(self.shares) < 0 or abs(sum(self.shares) - 1) > 1e-6:
+            raise TensorsimError(
+                f"SplitConfig.shares: got {list(self.shares)}, expected three numbers that add up to 1"
+            )
+
+
+@dataclass(frozen=True)
+class StorageConfig:
+    """Files of the data set.
+
+    Attributes:
+        format: ``"webdataset"``: tar shards; ``"hdf5"`` and ``"mat"``: the same shards as such files; ``"png"``: one
+            picture per sample and radar in a folder per part and class.
+        shard_samples: samples of a shard, which is also what a worker does at a time.
+
+    Raises:
+        TensorsimError: an unknown format or fewer than one sample.
+    """
+
+    format: Format = "webdataset"
+    shard_samples: int = 64
+
+    def __post_init__(self) -> None:
+        require_choices(self, format=Format)
+        require_counts(self, "shard_samples")
+
+
+#: Data sets need the echo near the people only, and half as many Doppler frames as a picture for the eye.
+_PROCESSING = ProcessingConfig(
+    engine="range-bins", near_bins=8, energy_stride=8, overlap=0.5, range_gate_m=(0.5, 10.0)
+)
+
+
+@dataclass(frozen=True)
+class DatasetRecipe:
+    """Everything that the samples of a data set depend on, beside the films and files that it names.
+
+    Attributes:
+        name: of the data set.
+        seed: of everything that is random.
+        duration_s: of every sample; of longer clips a part is drawn, shorter ones end with an empty scene.
+        motion_hz: rate at which the motion of people is put together.
+        sources: of people and labels.
+        variations: of every clip.
+        radars: that observe the scene.
+        scene: propagation and noise for all radars; its radar and wall come from ``radars``.
+        processing: signal to maps.
+        gate_people: outputs without a range axis are made of those range bins of ``processing.range_gate_m`` that people
+            reach in the sample: several times faster, and with the noise of these bins alone.
+        outputs: arrays of a sample.
+        split: into training, validation and test.
+        storage: files.
+
+    Raises:
+        TensorsimError: no source or radar, names of radars that repeat, or a scene with a radar or wall.
+
+    Example:
+        >>> recipe = DatasetRecipe(radars=(RadarView("front", "through-wall"),), duration_s=2.0)
+        >>> DatasetRecipe.from_document(recipe.to_document()) == recipe
+        True
+    """
+
+    name: str = "dataset"
+    seed: int = 0
+    duration_s: float = 4.0
+    motion_hz: float = 120.0
+    sources: tuple[SourceConfig, ...] = (SourceConfig(people=10),)
+    variations: VariationConfig = field(default_factory=VariationConfig)
+    radars: tuple[RadarView, ...] = (RadarView(),)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    processing: ProcessingConfig = _PROCESSING
+    gate_people: bool = True
+    outputs: OutputConfig = field(default_factory=OutputConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
+    storage: StorageConfig = field(default_factory=StorageConfig)
+
+    def __post_init__(self) -> None:
+        require_positive("DatasetRecipe", duration_s=self.duration_s, motion_hz=self.motion_hz)
+        if not 0 <= self.seed < 2**32:
+            raise TensorsimError(
+                f"DatasetRecipe.seed: got {self.seed}, expected an integer from 0 to 2^32 - 1"
+            )
+        if not self.sources or not self.radars:
+            raise TensorsimError("DatasetRecipe: got no source or no radar, expected at least one of each")
+        names = [view.name for view in self.radars]
+        if len(set(names)) < len(names):
+            raise TensorsimError(f"DatasetRecipe.radars: got the names {names}, expected different ones")
+        if self.scene != replace(self.scene, radar=SceneConfig().radar, wall=None):
+            raise TensorsimError("DatasetRecipe.scene: got a radar or a wall, expected them in radars")
+        if self.storage.format == "png" and set(self.outputs.kinds) - {"picture"}:
+            raise TensorsimError(
+                f"DatasetRecipe.outputs: got {', '.join(self.outputs.kinds)} for the format png, expected picture"
+            )
+        if round(self.duration_s * self.motion_hz) < 2:
+            raise TensorsimError(
+                f"DatasetRecipe.duration_s: got {self.duration_s}, expected at least two moments of motion"
+            )
+        for view in self.radars:
+            self._check_view(view)
+
+    def _check_view(self, view: RadarView) -> None:
+        radar = self.simulation(view).scene.radar
+        if radar.has_array != self.outputs.needs_array:
+            raise TensorsimError(
+                f"DatasetRecipe.radars: {view.preset} is {'an' if radar.has_array else 'no'} array, the outputs "
+                f"{', '.join(self.outputs.kinds)} need {'one' if self.outputs.needs_array else 'one antenna pair'}"
+            )
+
+    def simulation(self, view: RadarView) -> SimulationConfig:
+        """The configuration of one of the radars, before variations."""
+        preset = radar_scene(view.preset)
+        floor = self.scene.floor if preset.floor is None else preset.floor
+        scene = replace(self.scene, radar=preset.radar, wall=preset.wall, floor=floor)
+        return SimulationConfig(scene=scene, processing=self.processing, seed=self.seed)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the recipe, which tells data sets apart."""
+        text = json.dumps(self.to_document(), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any], where: str = "recipe") -> "DatasetRecipe":
+        """The recipe of a mapping; what it does not name keeps its default.
+
+        Raises:
+            TensorsimError: unknown keys, or values that the recipe refuses.
+        """
+        given = document.get("processing")
+        if isinstance(given, dict):
+            document = document | {"processing": to_document(_PROCESSING) | given}
+        recipe: DatasetRecipe = from_document(where, cls, document)
+        return recipe
+
+    def to_document(self) -> dict[str, Any]:
+        """Mappings, lists, numbers and strings from which :meth:`from_document` makes the same."""
+        document: dict[str, Any] = to_document(self)
+        return document
+
+    @classmethod
+    def from_yaml(cls, path: str | os.PathLike[str]) -> "DatasetRecipe":
+        """The recipe of a YAML file, as ``tensorsim dataset example`` prints one.
+
+        Raises:
+            TensorsimError: no such file, not YAML, unknown keys, or values that the recipe refuses.
+        """
+        return cls.from_document(read_yaml(path), str(path))
+
+    def to_yaml(self, path: str | os.PathLike[str]) -> None:
+        """Write a file from which :meth:`from_yaml` reads the same."""
+        import yaml
+
+        with complete_file(Path(path)) as scratch:
+            scratch.write_text(yaml.safe_dump(self.to_document(), sort_keys=False), encoding="utf-8")

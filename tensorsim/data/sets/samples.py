@@ -1,0 +1,105 @@
+"""One sample of a data set as it is stored: arrays, the row of the manifest, and the hash of both."""
+
+import hashlib
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.recipe import DatasetRecipe
+from tensorsim.data.sets.synthesis import peak_db, synthesize
+from tensorsim.data.sets.variations import Variation
+
+
+class Sample(NamedTuple):
+    """A sample.
+
+    Attributes:
+        arrays: by name, ``RADAR.OUTPUT``.
+        row: of the manifest.
+    """
+
+    arrays: dict[str, npt.NDArray[Any]]
+    row: dict[str, Any]
+
+
+#: Columns of the manifest before those of the variation, and after them.
+FIRST_COLUMNS: dict[str, type] = {
+    "id": str, "part": str, "shard": str, "class_index": int, "label": str, "person": str, "origin": str, "clip": str,
+    "clip_index": int, "variation": int,
+}  # fmt: skip
+LAST_COLUMNS: dict[str, type] = {"people": int, "warnings": str, "sha256": str}
+VARIATION_COLUMNS: dict[str, type] = {
+    "seed": int, "height_m": float, "distance_m": float, "side_m": float, "heading_deg": float, "mirrored": bool,
+    "speed": float, "start": float, "companions": str, "body": str, "snr_db": float, "sway": bool, "vital_signs": bool,
+    "wall_permittivity": float, "wall_thickness_m": float,
+}  # fmt: skip
+
+
+def columns(recipe: DatasetRecipe) -> dict[str, type]:
+    """Names and types of the columns of the manifest of a recipe."""
+    peaks = {f"{view.name}.{kind}.peak_db": float for view in recipe.radars for kind in recipe.outputs.kinds}
+    return FIRST_COLUMNS | VARIATION_COLUMNS | LAST_COLUMNS | peaks
+
+
+def sample_id(number: int) -> str:
+    """The name of sample ``number``."""
+    return f"{number:08d}"
+
+
+def content_hash(arrays: dict[str, npt.NDArray[Any]], label: int) -> str:
+    """SHA-256 of the arrays of a sample and its class, whatever files they are stored in."""
+    digest = hashlib.sha256(str(label).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def make_sample(plan: Plan, number: int, shard: str) -> Sample:
+    """Sample ``number`` of a plan.
+
+    Raises:
+        TensorsimError: people that cannot be found, or motion that a radar cannot follow.
+    """
+    part, clip, count = plan.clip_of_sample(number)
+    named = {"id": sample_id(number), "part": part, "shard": shard, "clip_index": clip, "variation": count}
+    return _sample(plan, named, plan.variation(clip, count))
+
+
+def sample_of_row(plan: Plan, row: dict[str, Any]) -> Sample:
+    """The sample of a row of the manifest, made again.
+
+    Raises:
+        TensorsimError: see :func:`make_sample`.
+    """
+    named = {name: row[name] for name in ("id", "part", "shard", "clip_index", "variation")}
+    return _sample(plan, named, Variation.of_row(row))
+
+
+def _sample(plan: Plan, named: dict[str, Any], variation: Variation) -> Sample:
+    there = plan.clip(named["clip_index"])[1]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # sums over several threads are not the same to the last bit
+    try:
+        scene = plan.scene(named["clip_index"], named["part"], variation)
+        made = synthesize(plan.recipe, scene, variation)
+    finally:
+        torch.set_num_threads(threads)
+    label = plan.labels.index(there.label)
+    row = named | variation.row() | {
+        "class_index": label,
+        "label": there.label,
+        "person": there.person,
+        "origin": there.origin,
+        "clip": there.name,
+        "people": scene.joints.shape[0],
+        "warnings": " | ".join(made.warnings),
+        "sha256": content_hash(made.arrays, label),
+    }  # fmt: skip
+    peaks = {f"{name}.peak_db": peak_db(peak) for name, peak in made.peaks.items()}
+    order = columns(plan.recipe)
+    return Sample(made.arrays, {name: (row | peaks)[name] for name in order})

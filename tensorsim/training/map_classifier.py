@@ -1,0 +1,226 @@
+"""The recipe of a classifier of your own classes: cross-entropy on a data set that ``tensorsim dataset build`` made."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.data import DataLoader
+
+from tensorsim.data.sets.reading import MapDataset, collate_maps
+from tensorsim.data.sets.transforms import RandomShift, SpecAugment
+from tensorsim.errors import TensorsimError
+from tensorsim.recognition.labels import LabelSet
+from tensorsim.training.classifier import LEARNING_RATE, NETWORKS
+from tensorsim.training.loop import Batch, Recipe
+from tensorsim.weights import load_state_dict
+
+
+class PictureToLabel(nn.Module):
+    """Maps of a data set to logits: resized to the pictures that the network takes.
+
+    Args:
+        network: pictures (B, C, size, size) in [0, 1] -> logits (B, classes).
+        size: height and width.
+
+    Shapes: maps (B, C, H, W) in [0, 1] -> (B, classes). Differentiable.
+    """
+
+    def __init__(self, network: nn.Module, size: int) -> None:
+        super().__init__()
+        self.network, self.size = network, size
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Maps (B, C, H, W) to logits (B, classes)."""
+        return self.network(F.interpolate(maps, [self.size, self.size], mode="bilinear", antialias=False))
+
+
+def transfer(net: nn.Module, weights: dict[str, Tensor]) -> list[str]:
+    """Copy the tensors that fit into a network; returns the names of those that stay as they were.
+
+    A network for other classes keeps all but its last layer.
+
+    Raises:
+        TensorsimError: less than half of its numbers fit.
+    """
+    own = net.state_dict()
+    fitting = {k: v for k, v in weights.items() if k in own and v.shape == own[k].shape}
+    if sum(own[k].numel() for k in fitting) < 0.5 * sum(v.numel() for v in own.values()):
+        raise TensorsimError(
+            "--init: got weights of another network, expected those of the one that is trained"
+        )
+    net.load_state_dict(own | fitting)
+    return [name for name in own if name not in fitting]
+
+
+class MapRecipe(Recipe):
+    """Adam, coupled L2 1e-4 on weights, a tenth of the rate after half of the steps, as the shipped classifiers have.
+
+    Every class counts alike, whatever its number of samples. Training maps are moved a little in speed and time, and
+    masked by SpecAugment.
+
+    Args:
+        folder: of the data set, with a part for validation.
+        network: a name of ``tensorsim.training.classifier.NETWORKS``.
+        labels: classes to train on; None: all.
+        output, radars: see :class:`~tensorsim.data.MapDataset`.
+        size: height and width of the network's pictures; None takes that of its authors.
+        init: weights to start from, of the same network; layers of another shape start anew.
+        seed: of weights, order and augmentation.
+        learning_rate: of the first half.
+        masks: largest parts of rows and columns that are masked.
+
+    Raises:
+        TensorsimError: no such data set, or one without a part for training or validation; see :class:`MapDataset`.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        network: str = "spgnet",
+        labels: Sequence[str] | None = None,
+        output: str | None = None,
+        radars: Sequence[str] | None = None,
+        size: int | None = None,
+        init: Path | None = None,
+        seed: int = 0,
+        learning_rate: float = LEARNING_RATE,
+        masks: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        if network not in NETWORKS:
+            raise TensorsimError(f"network: got {network!r}, expected one of {', '.join(NETWORKS)}")
+        self.training = MapDataset(folder, "train", output, radars, labels)
+        self.validation = MapDataset(folder, "validation", output, radars, self.training.labels)
+        self.seed, self.labels = seed, LabelSet(self.training.labels)
+        kind, usual = NETWORKS[network]
+        self.size = usual if size is None else size
+        torch.manual_seed(seed)
+        net = PictureToLabel(kind(len(self.labels), len(self.training.names)), self.size)
+        self.augment = nn.Sequential(RandomShift(2, 4), SpecAugment(*masks)).train()
+        self.weights = self.training.class_weights()
+        self.learning_rate = learning_rate
+        settings: dict[str, Any] = {
+            "data": self.training.recipe.digest, "network": network, "labels": list(self.labels), "size": self.size,
+            "maps": list(self.training.names), "seed": seed, "init": None if init is None else str(init),
+            "learning_rate": learning_rate, "masks": list(masks),
+        }  # fmt: skip
+        super().__init__(net, settings, self._metadata(kind.__name__))
+        some = torch.stack([self.training[k]["map"].mean() for k in range(min(200, len(self.training)))])
+        net.network.get_buffer("mean").fill_(float(some.mean()))
+        if init is not None:
+            # The weight files of recognisers hold the network alone.
+            found = load_state_dict(init)
+            prefixed = {k if k.startswith("network.") else f"network.{k}": v for k, v in found.items()}
+            self.new_layers = transfer(net, prefixed)
+
+    def _metadata(self, network: str) -> dict[str, str]:
+        outputs = self.training.recipe.outputs
+        return {
+            "network": network,
+            "maps": ",".join(self.training.names),
+            "map_size": str(self.size),
+            "class_names": self.labels.to_text(),
+            "speed_m_s": repr(outputs.picture_speed_m_s),
+            "range_db": repr(outputs.picture_range_db),
+        }
+
+    @functools.lru_cache(maxsize=2)  # noqa: B019  # two epochs, of the one recipe of a run
+    def order(self, epoch: int) -> Tensor:
+        """The order of the training samples in an epoch."""
+        generator = torch.Generator().manual_seed(self.seed * 7919 + epoch)
+        return torch.randperm(len(self.training), generator=generator)
+
+    def sample(self, index: int) -> dict[str, Any]:
+        """Map (C, H, W), label and the seed of its augmentation."""
+        epoch, place = divmod(index, len(self.training))
+        return self.training[int(self.order(epoch)[place])]
+
+    def collate(self, samples: list[dict[str, Any]]) -> Batch:
+        """Maps and labels of samples."""
+        batch = collate_maps(samples)
+        return {"map": batch["map"], "label": batch["label"]}
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Cross-entropy over augmented maps, and accuracy."""
+        logits = net(self.augment(batch["map"])).float()
+        accuracy = (logits.argmax(-1) == batch["label"]).float().mean()
+        return {
+            "loss": F.cross_entropy(logits, batch["label"], self.weights.to(logits)),
+            "accuracy": accuracy,
+        }
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        """Adam; no L2 on biases and normalisation."""
+        weights = [p for p in self.net.parameters() if p.dim() > 1]
+        rest = [p for p in self.net.parameters() if p.dim() <= 1]
+        groups = [{"params": weights, "weight_decay": 1e-4}, {"params": rest, "weight_decay": 0.0}]
+        return torch.optim.Adam(groups, lr=self.learning_rate)
+
+    def rate(self, step: int, steps: int) -> float:
+        """1, and 0.1 in the second half."""
+        return 1.0 if 2 * step < steps else 0.1
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Accuracy and mean loss; the score is the negative loss."""
+        logits = logits_of(net, self.validation)
+        loss = float(F.cross_entropy(logits, self.validation.targets))
+        accuracy = float((logits.argmax(-1) == self.validation.targets).float().mean())
+        return {"score": -loss, "loss": loss, "accuracy": accuracy}
+
+
+@torch.no_grad()
+def logits_of(net: nn.Module, maps: MapDataset, batch: int = 64) -> Tensor:
+    """Logits (N, classes) of all samples, in their order, on the CPU."""
+    device = next(net.parameters()).device
+    loader: DataLoader[dict[str, Any]] = DataLoader(maps, batch, collate_fn=collate_maps)
+    return torch.cat([net(part["map"].to(device)).float().cpu() for part in loader])
+
+
+def confusion_table(logits: Tensor, maps: MapDataset) -> Tensor:
+    """Counts (classes, classes): row the true class, column the predicted one."""
+    classes = len(maps.labels)
+    return torch.bincount(maps.targets * classes + logits.argmax(-1), minlength=classes**2).view(
+        classes, classes
+    )
+
+
+def confusion_markdown(table: Tensor, labels: Sequence[str]) -> str:
+    """A confusion matrix as a table: rows are true, columns predicted."""
+    lines = ["| true \\ predicted | " + " | ".join(labels) + " |", "|---|" + "---|" * len(labels)]
+    for label, row in zip(labels, table.tolist(), strict=True):
+        lines.append(f"| {label} | " + " | ".join(str(count) for count in row) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def write_outcome(recipe: MapRecipe, best: Path) -> None:
+    """Write what the best weights do beside them: confusion matrix, and the network as TorchScript and ONNX.
+
+    Where pictures of one radar were trained on at their own size, ``recognizer.safetensors`` is for
+    :class:`~tensorsim.recognition.ActivityRecognizer` and ``tensorsim simulate --classifier``.
+    """
+    from tensorsim.export import to_onnx, to_torchscript
+    from tensorsim.files import complete_file
+    from tensorsim.weights import load_strict, save_weights
+
+    folder, net = best.parent, recipe.net
+    assert isinstance(net, PictureToLabel)
+    load_strict(net, load_state_dict(best), best)
+    net = net.cpu().eval()
+    maps = recipe.validation
+    table = confusion_markdown(confusion_table(logits_of(net, maps), maps), list(recipe.labels))
+    with complete_file(folder / "confusion.md") as scratch:
+        scratch.write_text(f"Part validation, {len(maps)} samples.\n\n{table}", encoding="utf-8")
+    print(table, end="")
+    to_torchscript(net, folder / "picture_to_label.pt")
+    to_onnx(net, folder / "picture_to_label.onnx", (maps[0]["map"][None],), {0: {0: "batch"}})
+    outputs = maps.recipe.outputs
+    if maps.names[0].endswith(".picture") and len(maps.names) == 1 and outputs.picture_size == recipe.size:
+        stated = {k: v for k, v in recipe.metadata.items() if k not in ("maps", "map_size")}
+        save_weights(
+            net.network,
+            folder / "recognizer.safetensors",
+            stated | {"inputs": "doppler", "size": str(recipe.size)},
+        )

@@ -1,0 +1,259 @@
+"""Building: the same bytes every time, whole or not at all, and everything listed."""
+
+import csv
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tensorsim import cli
+from tensorsim.data.sets.again import sample_again
+from tensorsim.data.sets.build import build_dataset, plan_of
+from tensorsim.data.sets.engines import Processes, RayCluster
+from tensorsim.data.sets.manifest import recipe_of, rows_of
+from tensorsim.data.sets.outputs import OutputConfig
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, StorageConfig
+from tensorsim.data.sets.samples import content_hash, make_sample
+from tensorsim.data.sets.shards import write_shard
+from tensorsim.data.sets.stored import StoredArrays
+from tensorsim.errors import TensorsimError
+from tests.data.sets.recipes import small_recipe
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Everything in the folder of a data set but for what only one run has."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".people" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def recipe() -> DatasetRecipe:
+    return small_recipe()
+
+
+@pytest.fixture(scope="module")
+def built(recipe: DatasetRecipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("built") / "set"
+    assert build_dataset(recipe, folder, quiet=True) == (4, 0, 4)
+    return folder
+
+
+def test_what_is_in_the_folder(built: Path, recipe: DatasetRecipe) -> None:
+    names = {path.name for path in built.iterdir()} - {".rows"}
+    files = {
+        "README.md",
+        "contact_sheet.png",
+        "dataset.json",
+        "failures.csv",
+        "manifest.csv",
+        "manifest.parquet",
+    }
+    assert names == files | {"recipe.yaml", "shards"}
+    rows = list(rows_of(built))
+    assert [row["id"] for row in rows] == ["00000000", "00000001", "00000002", "00000003"]
+    with (built / "manifest.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["sha256"] for row in table] == [row["sha256"] for row in rows]
+    assert {row["person"] for row in rows_of(built, part="train")}.isdisjoint(
+        row["person"] for row in rows_of(built, part="validation")
+    )
+    assert recipe_of(built) == recipe
+    summary = json.loads((built / "dataset.json").read_text())
+    assert summary["labels"] == ["S8 Walking", "S5 Sitting Down"]
+    assert "| S8 Walking | 1 | 1 | 0 |" in (built / "README.md").read_text()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_webdataset_reads_the_shards(built: Path) -> None:
+    import webdataset
+
+    urls = [str(path) for path in sorted((built / "shards").glob("*.tar"))]
+    samples = list(webdataset.WebDataset(urls, shardshuffle=False, empty_check=False).decode())
+    gc.collect()  # it leaves its files open
+    rows = {row["id"]: row for row in rows_of(built)}
+    assert [sample["__key__"] for sample in samples] == list(rows)
+    for sample in samples:
+        row = rows[sample["__key__"]]
+        assert sample["cls"] == row["class_index"]
+        assert sample["json"] == row
+        array = sample["front.doppler_time.npy"]
+        assert (array.dtype, array.shape) == (np.uint8, (256, 17))
+        assert content_hash({"front.doppler_time": array}, row["class_index"]) == row["sha256"]
+
+
+@pytest.mark.parametrize("storage", ["hdf5", "mat", "webdataset"])
+def test_every_format_holds_the_same_arrays(storage: Any, tmp_path: Path) -> None:
+    kinds = ("doppler_time", "ridges", "joints")
+    recipe = small_recipe(storage=StorageConfig(storage), outputs=OutputConfig(kinds=kinds, dtype="float16"))
+    plan = plan_of(json.dumps(recipe.to_document(), sort_keys=True), "")
+    samples = [make_sample(plan, number, "train-000000") for number in (0, 1)]
+    first, second = (write_shard(tmp_path / name, recipe.storage, "train-000000", samples) for name in "ab")
+    assert first == second
+    read = StoredArrays(tmp_path / "a", recipe)
+    for sample in samples:
+        arrays = {name: read(sample.row, name).astype(array.dtype) for name, array in sample.arrays.items()}
+        assert content_hash(arrays, sample.row["class_index"]) == sample.row["sha256"]
+
+
+def test_pictures_in_folders_of_classes(tmp_path: Path) -> None:
+    recipe = small_recipe(
+        storage=StorageConfig("png", 3), outputs=OutputConfig(kinds=("picture",), picture_size=32)
+    )
+    build_dataset(recipe, tmp_path / "set", quiet=True)
+    found = sorted(str(path.relative_to(tmp_path / "set")) for path in (tmp_path / "set").rglob("0*.png"))
+    assert len(found) == 4
+    assert found[0].startswith("train/S5_Sitting_Down/0000000")
+    read = StoredArrays(tmp_path / "set", recipe)
+    for row in rows_of(tmp_path / "set"):
+        assert (
+            content_hash({"front.picture": read(row, "front.picture")}, row["class_index"]) == row["sha256"]
+        )
+
+
+class Interrupted:
+    """An engine that does jobs in another order and is interrupted after some."""
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+
+    def run(self, work: Any, jobs: Iterable[Any]) -> Iterator[int]:
+        for number, job in enumerate(reversed(list(jobs))):
+            if number == self.jobs:
+                raise KeyboardInterrupt
+            yield work(job)
+
+
+def test_an_interrupted_run_goes_on_to_the_same_files(
+    built: Path, recipe: DatasetRecipe, tmp_path: Path
+) -> None:
+    folder = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        build_dataset(recipe, folder, Interrupted(1), quiet=True)
+    assert not (folder / "dataset.json").exists()
+    (folder / "shards" / ".train-000000.tar.1.tmp").write_bytes(b"half")
+    assert build_dataset(recipe, folder, quiet=True) == (4, 0, 2)
+    assert contents(folder) == contents(built)
+    assert build_dataset(recipe, folder, quiet=True) == (4, 0, 0)
+
+
+def test_what_is_there_is_not_overwritten(built: Path, tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match=r"first difference: seed 0 there, 5 here"):
+        build_dataset(small_recipe(seed=5), built, quiet=True)
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(TensorsimError, match="a folder with other files"):
+        build_dataset(small_recipe(), tmp_path, quiet=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_the_manifest_alone_makes_a_sample_again(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "manifest.parquet").write_bytes((built / "manifest.parquet").read_bytes())
+    cli.main(["dataset", "sample", str(tmp_path), "00000002", "--out", str(tmp_path / "again")])
+    assert "the same to the bit" in capsys.readouterr().out
+    row = next(rows_of(built, id="00000002"))
+    again = np.load(tmp_path / "again" / "00000002.front.doppler_time.npy")
+    assert (again == StoredArrays(built, recipe_of(built))(row, "front.doppler_time")).all()
+    with pytest.raises(TensorsimError, match="got no sample '7', expected an id such as 00000003"):
+        sample_again(tmp_path, "7")
+
+
+def test_a_row_that_was_changed_is_noticed(built: Path, tmp_path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(built / "manifest.parquet")
+    place = table.schema.get_field_index("snr_db")
+    pq.write_table(table.set_column(place, "snr_db", table["snr_db"].combine_chunks().fill_null(0).cast("double")),
+                   tmp_path / "manifest.parquet")  # fmt: skip
+    assert sample_again(tmp_path, "00000000").row["id"] == "00000000"
+    import pyarrow.compute as pc
+
+    louder = table.set_column(place, "snr_db", pc.subtract(table["snr_db"], 20.0))
+    pq.write_table(louder, tmp_path / "manifest.parquet")
+    with pytest.raises(TensorsimError, match="got other arrays for 00000000"):
+        sample_again(tmp_path, "00000000")
+
+
+def test_samples_do_not_depend_on_one_another(built: Path, recipe: DatasetRecipe) -> None:
+    plan = plan_of(json.dumps(recipe.to_document(), sort_keys=True), "")
+    rows = list(rows_of(built))
+    for number in (3, 0):
+        assert make_sample(plan, number, rows[number]["shard"]).row == rows[number]
+
+
+def test_three_radars_in_one_sample(tmp_path: Path) -> None:
+    views = (RadarView("front", "through-wall"), RadarView("left", "through-wall", -3.0, 3.5, -90.0))
+    build_dataset(small_recipe(radars=views), tmp_path / "set", quiet=True)
+    row = next(rows_of(tmp_path / "set"))
+    read = StoredArrays(tmp_path / "set", recipe_of(tmp_path / "set"))
+    front, left = (read(row, f"{name}.doppler_time") for name in ("front", "left"))
+    assert front.shape == left.shape
+    assert (front != left).mean() > 0.2
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_bytes(built: Path, recipe: DatasetRecipe, tmp_path: Path) -> None:
+    build_dataset(recipe, tmp_path / "set", Processes(2), quiet=True)
+    assert contents(tmp_path / "set") == contents(built)
+
+
+def die_once(marker: str) -> int:
+    """A job whose first worker dies as if it were killed."""
+    path = Path(marker)
+    if path.name.startswith("deadly") and not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 1
+
+
+def die(_: str) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return 1
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
+    jobs = [str(tmp_path / name) for name in ("a", "deadly", "b")]
+    assert sum(Processes(2).run(die_once, jobs)) == 3
+    with pytest.raises(TensorsimError, match="got 3 processes that died in a row"):
+        list(Processes(1).run(die, ["x"]))
+
+
+@pytest.mark.slow
+def test_three_kills_at_random_moments_leave_no_trace(tmp_path: Path) -> None:
+    recipe = small_recipe(storage=StorageConfig(shard_samples=1))
+    recipe.to_yaml(tmp_path / "r.yaml")
+    build_dataset(recipe, tmp_path / "whole", quiet=True)
+    command = [sys.executable, "-c", "from tensorsim.cli import main; main()", "dataset", "build",
+               str(tmp_path / "r.yaml"), "--out", str(tmp_path / "set"), "--quiet"]  # fmt: skip
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
+    moments = np.random.default_rng(int(os.environ.get("KILL_SEED", "0"))).uniform(0.0, 0.6, 3)
+    for wait in moments:
+        run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+        while run.poll() is None and not (tmp_path / "set" / "recipe.yaml").exists():
+            time.sleep(0.01)
+        time.sleep(float(wait))
+        run.kill()
+        run.wait()
+    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Ray
+def test_ray_makes_the_same_bytes(built: Path, recipe: DatasetRecipe, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    build_dataset(recipe, tmp_path / "set", RayCluster(workers=1), quiet=True)
+    assert contents(tmp_path / "set") == contents(built)

@@ -1,0 +1,263 @@
+"""Recipes: what a file may say, what follows from it, and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim import cli
+from tensorsim.config import SceneConfig, WallConfig
+from tensorsim.data.sets.example import EXAMPLE
+from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
+from tensorsim.data.sets.plan import Plan, shared_out
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig
+from tensorsim.data.sets.scene import Scene, kept_inside, part_of, seen_from, varied
+from tensorsim.data.sets.synthesis import people_gate, synthesize, view_config
+from tensorsim.data.sets.variations import Variation, VariationConfig, draw
+from tensorsim.data.skeletons import Motion
+from tensorsim.errors import TensorsimError
+from tensorsim.motion import ActivityGenerator
+from tensorsim.pipeline import PoseToDoppler
+from tests.data.sets.recipes import small_recipe
+
+
+def test_the_example_is_two_classes_of_eight_samples(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    cli.main(["dataset", "example"])
+    (tmp_path / "r.yaml").write_text(capsys.readouterr().out)
+    recipe = DatasetRecipe.from_yaml(tmp_path / "r.yaml")
+    plan = Plan(recipe)
+    assert (len(plan), len(plan.labels), recipe.storage.format) == (8, 2, "webdataset")
+    assert all(line.lstrip().startswith("#") or "#" not in line or "  #" in line or " #" in line
+               for line in EXAMPLE.splitlines())  # fmt: skip
+
+
+def test_yaml_and_back(tmp_path: Path) -> None:
+    recipe = small_recipe(variations=VariationConfig(snr_db=None, people=(1, 3), bodies=("joints", "limbs")))
+    recipe.to_yaml(tmp_path / "r.yaml")
+    assert DatasetRecipe.from_yaml(tmp_path / "r.yaml") == recipe
+    assert DatasetRecipe.from_yaml(tmp_path / "r.yaml").digest == recipe.digest
+    assert small_recipe(seed=1).digest != recipe.digest
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sorces: []", "got the key 'sorces'.*perhaps 'sources'"),
+        ("sources: [{kind: generated}]", "SourceConfig.people: got none"),
+        ("sources: [{kind: films, path: a, people: 3}]", "SourceConfig.people: got one for the kind 'films'"),
+        ("sources: [{people: 1, classes: [flying]}]", "activity: got 'flying'"),
+        ("radars: [{preset: nothing}]", "got 'nothing', which is no file"),
+        ("radars: [{}, {}]", "got the names"),
+        ("radars: [{name: a/b}]", "expected letters, digits"),
+        ("radars: [{preset: ti-awr1843-array}]", "need one antenna pair"),
+        ("outputs: {kinds: [point_cloud]}", "is no array"),
+        ("outputs: {kinds: [doppler]}", "OutputConfig.kinds: got"),
+        ("outputs: {kinds: [point_cloud, ridges]}", "outputs of an array"),
+        ("outputs: {size: [3]}", "OutputConfig.size"),
+        ("storage: {format: png}", "for the format png, expected picture"),
+        ("storage: {shard_samples: 0}", "shard_samples: got 0"),
+        ("split: {shares: [0.5, 0.4]}", "expected three numbers"),
+        ("variations: {distance_m: [5, 2]}", "VariationConfig.distance_m: got"),
+        ("variations: {mirror: 2}", "a probability"),
+        ("variations: {bodies: [stick]}", "VariationConfig.bodies"),
+        ("scene: {wall: {}}", "got a radar or a wall, expected them in radars"),
+        ("seed: -1", "DatasetRecipe.seed"),
+        ("duration_s: 0.001", "at least two moments"),
+    ],
+)
+def test_what_is_refused_says_where(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "r.yaml").write_text(text)
+    with pytest.raises(TensorsimError, match=message) as refused:
+        DatasetRecipe.from_yaml(tmp_path / "r.yaml")
+    assert "\n" not in str(refused.value)
+    assert str(tmp_path / "r.yaml") in str(refused.value)
+
+
+def test_draws_follow_from_the_seed_and_not_from_other_ranges() -> None:
+    config = VariationConfig(people=(1, 3))
+    one = draw(config, 7)
+    assert one == draw(config, 7)
+    assert one != draw(config, 8)
+    other = draw(replace(config, height_m=(1.0, 1.1)), 7)
+    assert replace(other, height_m=one.height_m) == one
+    assert Variation.of_row(one.row() | {"more": 1}) == one
+    drawn = [draw(config, k) for k in range(400)]
+    assert {len(list(filter(None, v.companions.split(",")))) for v in drawn} == {0, 1, 2}
+    assert 0.4 < np.mean([v.mirrored for v in drawn]) < 0.6
+    heights = [v.height_m for v in drawn if v.height_m is not None]
+    assert min(heights) >= 1.55
+    assert max(heights) <= 1.9
+    assert max(heights) - min(heights) > 0.3
+
+
+def test_shares_of_groups() -> None:
+    part = shared_out([str(k) for k in range(1000)], (0.8, 0.1, 0.1), 0)
+    assert np.bincount(part).tolist() == [800, 100, 100]
+    assert np.bincount(shared_out(list("abcd"), (0.8, 0.1, 0.1), 0)).tolist() == [2, 1, 1]
+    assert shared_out(["a"], (0.5, 0.5, 0.0), 0).tolist() == [0]
+    named = dict(zip("abcdef", shared_out(list("abcdef"), (0.5, 0.5, 0.0), 3).tolist(), strict=True))
+    other = dict(zip("fedcba", shared_out(list("fedcba"), (0.5, 0.5, 0.0), 3).tolist(), strict=True))
+    assert named == other
+
+
+def test_nobody_is_in_two_parts_not_even_as_a_companion() -> None:
+    recipe = small_recipe(
+        sources=(SourceConfig(classes=("walking",), people=12), SourceConfig(classes=("kicking",), people=3)),
+        variations=VariationConfig(count=3, people=(2, 3)),
+    )
+    plan = Plan(recipe)
+    assert len(plan) == 45
+    part_of_person: dict[str, set[str]] = {}
+    seen = set()
+    for number in range(len(plan)):
+        part, clip, count = plan.clip_of_sample(number)
+        seen.add((clip, count))
+        person = plan.clip(clip)[1].person
+        part_of_person.setdefault(person, set()).add(part)
+        for word in plan.variation(clip, count).companions.split(","):
+            part_of_person.setdefault(plan._companion(person, part, int(word))[1].person, set()).add(part)
+    assert len(seen) == 45
+    assert all(len(parts) == 1 for parts in part_of_person.values())
+    assert [shard.stop - shard.first for shard in plan.shards][:3] == [2, 2, 2]
+
+
+def test_maps_in_bytes_and_half_floats() -> None:
+    magnitude = torch.rand(20, 30) + 1e-3
+    stored = stored_map(magnitude, OutputConfig(rate_hz=None), 1.0)
+    below = 20 * np.log10(magnitude.double().numpy() / float(magnitude.max()))
+    assert np.abs(stored.array / 255.0 * 60 - 60 - below.clip(-60, 0)).max() <= 60 / 255 / 2 + 1e-6
+    assert stored.peak == pytest.approx(float(magnitude.max()))
+    half = stored_map(magnitude, OutputConfig(dtype="float16", rate_hz=None), 1.0).array
+    assert half.dtype == np.float16
+    assert np.abs(half.astype(np.float64) - below).max() < 0.05
+    assert not in_decibels(torch.zeros(2, 2), OutputConfig()).array.any()
+
+
+def test_cells_average_power() -> None:
+    power = torch.rand(12, 30, dtype=torch.float64)
+    assert torch.allclose(resized(power, 6, 10), power.reshape(6, 2, 10, 3).mean((1, 3)))
+    magnitude = power.sqrt()
+    by_rate = stored_map(magnitude, OutputConfig(dtype="float16", rate_hz=10.0), 1.0).array
+    by_size = stored_map(magnitude, OutputConfig(dtype="float16", size=(12, 10)), 1.0).array
+    assert (by_rate == by_size).all()
+
+
+def test_signals_keep_their_phase() -> None:
+    signal = torch.randn(4, 5, dtype=torch.complex64)
+    stored = stored_signal(signal)
+    back = torch.view_as_complex(torch.from_numpy(stored.array.astype(np.float32))) * stored.peak
+    assert float((back - signal).abs().max()) < 2e-3 * float(signal.abs().max())
+
+
+def test_a_radar_at_another_place_sees_what_one_at_the_origin_sees_of_moved_people() -> None:
+    joints = torch.randn(2, 5, 14, 3, dtype=torch.float64) + torch.tensor([0.0, 4.0, 1.0])
+    # From the left, looking to the right: what is far in x is far away, what is near in y is to the right.
+    seen = seen_from(joints, -3.0, 4.0, -90.0)
+    expected = torch.stack([4.0 - joints[..., 1], joints[..., 0] + 3.0, joints[..., 2]], dim=-1)
+    assert torch.allclose(seen, expected)
+
+
+def walk(seconds: float = 2.0) -> Motion:
+    motion = ActivityGenerator().generate("walking", seed=3, duration_s=seconds, rate_hz=30.0)
+    return Motion(motion.joints.float(), motion.valid, 30.0)
+
+
+def test_variations_of_recorded_motion() -> None:
+    from tensorsim.body.skeleton import body_height
+
+    plain = draw(VariationConfig(heading_deg=(0.0, 0.0), mirror=0.0, side_m=(0.0, 0.0)), 1)
+    motion = walk()
+    changed = varied(motion, replace(plain, height_m=1.5, distance_m=3.0, speed=2.0))
+    assert float(body_height(changed.joints[0]).median()) == pytest.approx(1.5, abs=1e-3)
+    assert changed.joints[0, 0, (8, 11), 1].mean() == pytest.approx(3.0, abs=1e-6)
+    assert changed.fps == 60.0
+    turned = varied(motion, replace(plain, height_m=None, distance_m=3.0, heading_deg=90.0))
+    still = varied(motion, replace(plain, height_m=None, distance_m=3.0))
+    way, usual = (m.joints[0, -1, 8, :2] - m.joints[0, 0, 8, :2] for m in (turned, still))
+    assert torch.allclose(way, torch.stack([-usual[1], usual[0]]), atol=1e-6)
+    mirrored = varied(motion, replace(plain, height_m=None, distance_m=3.0, mirrored=True))
+    assert torch.allclose(
+        mirrored.joints[0, 0, 4], still.joints[0, 0, 7] * torch.tensor([-1.0, 1, 1]), atol=1e-6
+    )
+
+
+def test_a_short_motion_ends_with_nobody_and_a_long_one_is_cut() -> None:
+    short = part_of(walk(0.5), 1.0, 60.0, 0.3)
+    assert short.joints.shape == (1, 60, 14, 3)
+    assert short.valid[0].tolist() == [True] * 30 + [False] * 30 or int(short.valid.sum()) in (29, 30, 31)
+    first, last = part_of(walk(), 1.0, 60.0, 0.0), part_of(walk(), 1.0, 60.0, 1.0)
+    assert bool(first.valid.all())
+    assert not torch.allclose(first.joints, last.joints)
+
+
+def test_people_are_kept_inside_by_the_least_move() -> None:
+    scene = part_of(walk(), 1.0, 60.0, 0.0)
+    near = scene._replace(joints=scene.joints - torch.tensor([0.0, 5.0, 0.0]))
+    kept = kept_inside(near, VariationConfig(keep_m=(1.5, 7.0)))
+    y = kept.joints[..., (8, 11), 1].mean(-1)
+    assert float(y.min()) == pytest.approx(1.5, abs=1e-4)
+    assert kept_inside(kept, VariationConfig(keep_m=(1.5, 7.0))).joints.equal(kept.joints)
+
+
+def test_a_sample_is_the_map_of_the_stages() -> None:
+    recipe = small_recipe(
+        outputs=OutputConfig(kinds=("doppler_time", "joints"), dtype="float16", rate_hz=None)
+    )
+    recipe = replace(
+        recipe, variations=replace(recipe.variations, snr_db=None), scene=replace(recipe.scene, snr_db=None)
+    )
+    plan = Plan(recipe)
+    variation = plan.variation(0, 0)
+    scene = plan.scene(0, "train", variation)
+    made = synthesize(recipe, scene, variation)
+    stage = PoseToDoppler.from_config(view_config(recipe, recipe.radars[0], variation))
+    maps = stage(scene.joints[None], scene.valid[None], scene.fps)
+    expected = 20 * (maps.doppler_time[0] / maps.doppler_time.max()).clamp_min(1e-10).log10()
+    assert np.abs(made.arrays["front.doppler_time"] - expected.detach().numpy()).max() < 0.2
+    assert (made.arrays["front.joints"] == scene.joints.numpy()).all()
+
+
+def test_the_gate_holds_everything_that_people_reflect() -> None:
+    recipe = small_recipe(outputs=OutputConfig(dtype="float16", rate_hz=None))
+    recipe = replace(
+        recipe, variations=replace(recipe.variations, snr_db=None), scene=SceneConfig(snr_db=None)
+    )
+    plan = Plan(recipe)
+    for clip in range(4):
+        variation = plan.variation(clip, 0)
+        scene = plan.scene(clip, "train", variation)
+        gated, whole = (
+            synthesize(replace(recipe, gate_people=gate), scene, variation) for gate in (True, False)
+        )
+        near, far = people_gate(view_config(recipe, recipe.radars[0], variation), scene)
+        assert 0.5 <= near < far < 10.0
+        power, expected = (10 ** (m.arrays["front.doppler_time"].astype(float) / 10) for m in (gated, whole))
+        assert np.abs(power - expected).sum() / expected.sum() < 0.01
+
+
+def test_walls_snr_and_bodies_vary() -> None:
+    recipe = small_recipe()
+    variation = replace(
+        draw(recipe.variations, 0),
+        wall_permittivity=4.0,
+        wall_thickness_m=0.1,
+        body="limbs",
+        snr_db=12.0,
+        sway=True,
+    )
+    scene = view_config(recipe, recipe.radars[0], variation).scene
+    assert scene.wall == WallConfig((-0.1, 0.05, 1.5), (5.0, 0.1, 2.5), 4.0)
+    assert (scene.body, scene.snr_db, scene.sway) == ("limbs", 12.0, True)
+
+
+def test_one_noise_for_each_radar() -> None:
+    recipe = small_recipe(radars=(RadarView("a", "through-wall"), RadarView("b", "through-wall")))
+    plan = Plan(recipe)
+    variation = replace(plan.variation(0, 0), snr_db=0.0)
+    scene = plan.scene(0, "train", variation)
+    made = synthesize(recipe, Scene(*scene), variation)
+    assert (made.arrays["a.doppler_time"] != made.arrays["b.doppler_time"]).any()
