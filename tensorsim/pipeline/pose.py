@@ -20,6 +20,7 @@ from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
+from tensorsim.vision.smoothing.sides import SteadySides
 from tensorsim.vision.tracking.tracker import GNNTracker
 
 
@@ -96,6 +97,7 @@ class VideoToPose(nn.Module):
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
         self.metric_pose = metric_pose
+        self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.keypoint_threshold = keypoint_threshold
@@ -174,7 +176,7 @@ class VideoToPose(nn.Module):
         if isinstance(lifter, TemporalLifter):
             other.temporal = lifter.seen_by(camera)
         else:
-            other.lifter = lifter.tilted(camera.pitch_rad)
+            other.lifter = lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
@@ -305,6 +307,7 @@ class VideoToPose(nn.Module):
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
+        keypoints, scores = self.sides(keypoints, scores, tracks.valid, fps)
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         # Joints below the threshold have no weight in the match: the network guesses what it cannot see.
         reliable = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
