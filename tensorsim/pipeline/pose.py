@@ -8,10 +8,9 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
-from tensorsim.pipeline.networks import pretrained_lifter, pretrained_pose, top_down
+from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
-from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -127,7 +126,7 @@ class VideoToPose(nn.Module):
         """
         tracking, people, smoothing = config.tracking, config.pose, config.smoothing
         if detector is None:
-            detector = RTMDet.from_pretrained(tracking.detector)
+            detector = pretrained_detector(tracking.detector)
         if pose is None:
             pose = pretrained_pose(people.network, people.flip_test)
         return cls(
