@@ -18,10 +18,13 @@ from tensorsim.config import (
     JOINT_RCS_M2,
     JOINTS,
     CameraConfig,
+    ClutterConfig,
     FloorConfig,
+    InterferenceConfig,
     PoseConfig,
     ProcessingConfig,
     RadarConfig,
+    ReceiverConfig,
     SceneConfig,
     SimulationConfig,
     SmoothingConfig,
@@ -29,6 +32,7 @@ from tensorsim.config import (
     WallConfig,
 )
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.live import LiveSimulator
 from tensorsim.paper import table as _paper_table
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
@@ -42,14 +46,18 @@ __all__ = [
     "JOINTS",
     "JOINT_RCS_M2",
     "CameraConfig",
+    "ClutterConfig",
     "Detections",
     "FloorConfig",
+    "InterferenceConfig",
+    "LiveSimulator",
     "Pose",
     "PoseConfig",
     "PoseToDoppler",
     "ProcessingConfig",
     "RadarConfig",
     "RadarMaps",
+    "ReceiverConfig",
     "Recognition",
     "SceneConfig",
     "Simulation",

@@ -42,6 +42,7 @@ RANGES: dict[str, Range] = {
     "samples per chirp": Range(2, 65_536, "samples"),
     "antennas": Range(1, 64, "antennas"),
     "gain": Range(-100.0, 100.0, "dB"),
+    "bits of a converter": Range(1, 24, "bits"),
     "ratio of powers": Range(-200.0, 300.0, "dB"),
     # matter
     "relative permittivity": Range(1.0, 1000.0, "times that of vacuum"),

@@ -43,3 +43,31 @@ def test_the_table_is_in_the_docstring_of_the_package() -> None:
     for row in ROWS:
         for text in row:
             assert text in (tensorsim.__doc__ or "")
+
+
+#: Functions of one formula, which the API reference shows as mathematics.
+FORMULAS = (
+    "tensorsim.radar.radar_equation_amplitude",
+    "tensorsim.radar.intermediate_frequency",
+    "tensorsim.radar.synthesis.wall.slab_coefficients",
+    "tensorsim.radar.synthesis.wall.fresnel",
+    "tensorsim.radar.synthesis.wall.paper_transmission",
+    "tensorsim.radar.two_way_wall_transmission",
+    "tensorsim.radar.mirror_delays",
+    "tensorsim.radar.ReceiverNoise",
+    "tensorsim.radar.range_profile",
+    "tensorsim.radar.two_pulse_canceller",
+    "tensorsim.radar.doppler_time_map",
+    "tensorsim.vision.lifting.metric_pose.accumulated_displacement",
+    "tensorsim.vision.smoothing.kalman.constant_velocity_predict",
+    "tensorsim.vision.smoothing.kalman.kalman_update",
+)
+
+
+@pytest.mark.parametrize("path", FORMULAS)
+def test_formulas_are_mathematics_in_the_reference(path: str) -> None:
+    """A display formula, in rows of the table."""
+    text = found(path).__doc__
+    assert text.count("$$") >= 2
+    assert text.count("$$") % 2 == 0
+    assert path in {row.function for row in ROWS}

@@ -37,8 +37,9 @@ class EvaluateDenoiser:
     def run(self) -> None:
         """Do it."""
         from tensorsim.enhance.dncnn import MapDenoiser
+        from tensorsim.enhance.ksvd import KSVD
         from tensorsim.enhance.perona_malik import PeronaMalik
-        from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, KSVDMaps, compare
+        from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, compare
 
         check_seed(self.seed)
         counts = {"--clips": self.clips, "--scenes": len(self.scenes), "--snr": len(self.snr)}
@@ -53,7 +54,7 @@ class EvaluateDenoiser:
         rivals |= {str(path): MapDenoiser.from_pretrained(path) for path in (self.weights, *self.against)}
         rivals["Perona-Malik"] = MapDenoiser(PeronaMalik())
         if self.ksvd:
-            rivals["K-SVD"] = KSVDMaps()
+            rivals["K-SVD"] = KSVD()
         rows = compare(rivals, self.scenes, self.snr, self.clips, self.seed, self.quiet)
         print(
             f"{'scene':13s} {'map':30s} {'SNR':>4s} {'denoiser':24s}" + "".join(f"{c:>18s}" for c in COLUMNS)

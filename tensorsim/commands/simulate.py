@@ -39,6 +39,7 @@ _MEANT_FOR = {
     "calibrate": ("video",),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
+    "lifter": ("video", "keypoints"),
     "library": ("video", "keypoints"),
     "image_size": ("keypoints",),
     "clip": ("motion",),
@@ -50,7 +51,7 @@ _MEANT_FOR = {
 class Simulate(NetworkOptions, RadarOptions):
     """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
 
-    Writes maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
+    Writes report.html, maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
     """
 
     source: tyro.conf.Positional[Path]
@@ -70,8 +71,11 @@ class Simulate(NetworkOptions, RadarOptions):
     """Estimate tilt, height and field of view of the camera from the people of the film."""
     position: Literal["camera", "paper"] | None = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
+    lifter: Literal["temporal", "nearest"] | None = None
+    """How key points become 3D: by a network that sees a window of time, or from the nearest poses of a library.
+    Default: nearest."""
     library: Path | None = None
-    """Pool of poses for the lifting to 3D, as `tensorsim library build` writes it. Default: the shipped one."""
+    """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -111,18 +115,28 @@ class Simulate(NetworkOptions, RadarOptions):
         with collected_warnings() as messages, torch.inference_mode():
             recognizer = load_recognizer(config)
             source, config = self._source(kind, config, device)
-            length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
-            config = at_display_rate(config, length_s)
+            config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps = results.simulate(source, stage, folder, config, device, self.quiet)
+                pose, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
                 somebody = bool(pose.valid.any())
                 done = Run(
-                    config, stage, recognizer, pose, maps, source.fps, self.source.name, somebody, device
+                    config,
+                    stage,
+                    recognizer,
+                    pose,
+                    maps,
+                    source.fps,
+                    self.source.name,
+                    somebody,
+                    device,
+                    film,
                 )
                 label = self.write_results(folder, done)
                 summary = label | results.summary_of(source, config, pose, maps)
-                results.write_summary(folder, summary | {"options": self.described(), "warnings": messages})
+                summary |= {"options": self.described(), "warnings": messages}
+                self.write_report(folder, done, summary)
+                results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""
@@ -137,6 +151,7 @@ class Simulate(NetworkOptions, RadarOptions):
             ("pose__initial_distance_m", self.initial_distance),
             ("pose__camera__horizontal_fov_rad", camera_fov),
             ("pose__position", self.position),
+            ("pose__lifter", self.lifter if self.library is None or self.lifter is not None else "nearest"),
             ("pose__library", None if self.library is None else str(self.library)),
         ):
             if value is not None:

@@ -10,6 +10,7 @@ from tensorsim.config.names import ACTIVITIES, COCO_KEYPOINTS, JOINT_RCS_M2, JOI
 from tensorsim.config.people import PoseConfig, SmoothingConfig, TrackerConfig
 from tensorsim.config.processing import ProcessingConfig
 from tensorsim.config.radar import SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.scene import SceneConfig
 from tensorsim.config.simulation import SimulationConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
@@ -21,10 +22,13 @@ __all__ = [
     "JOINT_RCS_M2",
     "SPEED_OF_LIGHT_M_S",
     "CameraConfig",
+    "ClutterConfig",
     "FloorConfig",
+    "InterferenceConfig",
     "PoseConfig",
     "ProcessingConfig",
     "RadarConfig",
+    "ReceiverConfig",
     "SceneConfig",
     "SimulationConfig",
     "SmoothingConfig",

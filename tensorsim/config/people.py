@@ -8,6 +8,7 @@ from tensorsim.config.checks import require_choices, require_counts, require_pos
 from tensorsim.errors import TensorsimError
 
 Position = Literal["camera", "paper"]
+Lifting = Literal["temporal", "nearest"]
 Resampling = Literal["spline", "linear"]
 SmoothingMode = Literal["rts", "forward"]
 
@@ -87,7 +88,9 @@ class PoseConfig:
         calibrate: estimate tilt, height and field of view of the camera from the people of a film, in place of
             ``camera``; see :class:`tensorsim.vision.CameraCalibrator`.
         position: ``"camera"`` (pinhole camera) or ``"paper"`` (increments of pixels times metres per pixel).
-        library: file of the pose library; None is the shipped one.
+        lifter: ``"nearest"`` (nearest poses of a library) or ``"temporal"`` (a network that sees a window of time).
+        lifter_weights: name or file of the temporal lifter's weights; None is the shipped network.
+        library: file of the pose library of the nearest lifter; None is the shipped one.
         neighbours: poses of the library that are averaged per frame; 1 is the paper's nearest match.
         temporal: weight of the change between frames in the choice of poses; 0 matches each frame alone.
         fewest_joints: joints of the 14 that a frame needs to count.
@@ -106,6 +109,8 @@ class PoseConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     calibrate: bool = False
     position: Position = "camera"
+    lifter: Lifting = "nearest"
+    lifter_weights: str | None = None
     library: str | None = None
     neighbours: int = 32
     temporal: float = 1.0
@@ -113,8 +118,17 @@ class PoseConfig:
     people: str = "all"
 
     def __post_init__(self) -> None:
-        require_choices(self, position=Position)
+        require_choices(self, position=Position, lifter=Lifting)
         require_counts(self, "neighbours", "fewest_joints")
+        if self.lifter == "temporal" and self.library is not None:
+            raise TensorsimError(
+                f"PoseConfig.library: got {self.library!r} with the temporal lifter, expected it with lifter='nearest'"
+            )
+        if self.lifter == "nearest" and self.lifter_weights is not None:
+            raise TensorsimError(
+                f"PoseConfig.lifter_weights: got {self.lifter_weights!r} with the nearest lifter, expected it with "
+                "lifter='temporal'"
+            )
         if self.people not in ("all", "moving", "nearest") and not self.people.isdecimal():
             raise TensorsimError(
                 f"PoseConfig.people: got {self.people!r}, expected 'all', 'moving', 'nearest' or a number from 1"

@@ -23,7 +23,9 @@ class ProcessingConfig:
         overlap: shared part of neighbouring STFT windows (panel: overlap, 0.9).
         integration: sum over range bins, see :class:`tensorsim.radar.DopplerTimeMap`.
         ridge_count: ridges of the Doppler-time map (panel: 3).
-        denoiser: name or file of DnCNN weights that clean the maps (panel: denoiser on/off); None is off.
+        denoiser: what cleans the maps (panel: denoiser on/off): ``"none"``, ``"perona-malik"``, ``"ksvd"``,
+            ``"dncnn"``, or DnCNN weights by name or file, see :func:`tensorsim.enhance.choice.map_denoiser`; None
+            is off.
         display_rate_hz: columns per second of the range-time maps; None keeps every pulse.
         engine: ``"time"`` synthesises the signal and transforms it; ``"range-bins"`` computes the range bins in
             closed form.

@@ -1,10 +1,11 @@
-"""What the radar looks at: the radar itself, wall, floor, propagation paths, scatterers of the body, noise."""
+"""What the radar looks at: the radar itself, wall, floor, propagation paths, scatterers of the body, receiver."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
 from tensorsim.config.checks import is_finite, require_choices, require_positive
 from tensorsim.config.radar import RadarConfig
+from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.limits import check_range
@@ -29,6 +30,7 @@ class SceneConfig:
         leakage: direct signal from transmitter to receiver (panel: isolation).
         wall_echo: static specular reflection of the wall.
         wall_paths: bounces inside the wall, complete to first order (``"series"``) or as in the paper.
+        wall_attenuation: False lets echoes through the wall keep their power; their delay stays.
         incidence: ``"normal"``, ``"oblique"`` (refraction, Fresnel) or ``"airy"`` (closed slab per frequency).
         polarization: ``"te"`` or ``"tm"`` at the wall.
         bounces: largest number of pairs of bounces inside the wall on each leg.
@@ -38,6 +40,9 @@ class SceneConfig:
             (``"surface"``, :class:`tensorsim.motion.BodyScatterers`).
         sway: people sway while they stand, see :class:`tensorsim.motion.PosturalSway`.
         vital_signs: people breathe and their hearts beat, see :class:`tensorsim.motion.VitalSigns`.
+        clutter: furniture and walls of a room; None is an empty one.
+        interference: another radar that is heard; None is none.
+        receiver: imperfections of the receiver.
         snr_db: signal-to-noise ratio per IF sample in dB (panel: SNR, 50 dB); None is free of noise.
         noise_reference: signal power that ``snr_db`` refers to, see :class:`tensorsim.radar.ReceiverNoise`.
         noise_figure_db: noise figure of the receiver for ``noise_reference="absolute"``.
@@ -55,6 +60,7 @@ class SceneConfig:
     leakage: bool = False
     wall_echo: bool = False
     wall_paths: WallPaths = "series"
+    wall_attenuation: bool = True
     incidence: Incidence = "normal"
     polarization: Polarization = "te"
     bounces: int = 1
@@ -62,15 +68,25 @@ class SceneConfig:
     body: Body = "joints"
     sway: bool = False
     vital_signs: bool = False
+    clutter: ClutterConfig | None = None
+    interference: InterferenceConfig | None = None
+    receiver: ReceiverConfig = field(default_factory=ReceiverConfig)
     snr_db: float | None = 50.0
     noise_reference: NoiseReference = "echo"
     noise_figure_db: float = 10.0
     transmit_power_w: float = 0.01
 
     def __post_init__(self) -> None:
-        for name, kind in (("radar", RadarConfig), ("wall", WallConfig), ("floor", FloorConfig)):
+        for name, kind in (
+            ("radar", RadarConfig),
+            ("wall", WallConfig),
+            ("floor", FloorConfig),
+            ("clutter", ClutterConfig),
+            ("interference", InterferenceConfig),
+            ("receiver", ReceiverConfig),
+        ):
             part = getattr(self, name)
-            if not (isinstance(part, kind) or (part is None and name != "radar")):
+            if not (isinstance(part, kind) or (part is None and name not in ("radar", "receiver"))):
                 raise TensorsimError(f"SceneConfig.{name}: got {part!r}, expected a {kind.__name__}")
         require_choices(
             self,
@@ -86,6 +102,8 @@ class SceneConfig:
             raise TensorsimError(
                 f"SceneConfig.paths: got names of paths and {', '.join(switched)}, expected one or the other"
             )
+        if not self.wall_attenuation and self.wall is None:
+            raise TensorsimError("SceneConfig.wall_attenuation: got False without a wall, expected a wall")
         if self.bounces < 0:
             raise TensorsimError(f"SceneConfig.bounces: got {self.bounces}, expected at least 0")
         if self.snr_db is not None and not is_finite(self.snr_db):
@@ -100,3 +118,19 @@ class SceneConfig:
         if self.multipath is None:
             return self.wall is not None and self.paths is None
         return self.multipath
+
+    @property
+    def sampled_effects(self) -> tuple[str, ...]:
+        """Names of the effects that act on samples of the intermediate frequency."""
+        return self.receiver.effects + ("interference",) * (self.interference is not None)
+
+    def check_engine(self, engine: str) -> None:
+        """Refuse the engine ``"range-bins"``, which computes no samples, for effects that act on them.
+
+        Raises:
+            TensorsimError: such a combination.
+        """
+        if engine != "time" and self.sampled_effects:
+            raise TensorsimError(
+                f"engine: got {engine!r} with {', '.join(self.sampled_effects)}, which act on samples; expected 'time'"
+            )

@@ -9,6 +9,7 @@ from tensorsim.config.documents import from_document, suggestion, to_document
 from tensorsim.config.people import PANEL_DISTANCES_M, PoseConfig, SmoothingConfig, TrackerConfig
 from tensorsim.config.processing import ProcessingConfig
 from tensorsim.config.radar import RadarConfig
+from tensorsim.config.receiver import ReceiverConfig
 from tensorsim.config.scene import SceneConfig
 from tensorsim.config.surroundings import WallConfig
 from tensorsim.errors import TensorsimError
@@ -26,7 +27,7 @@ class SimulationConfig:
         pose: key points to joints in the world.
         smoothing: smoothing and interpolation along time.
         classifier: name or file of the activity classifier; None is the shipped one, ``"none"`` gives no label.
-        seed: of the receiver noise.
+        seed: of the receiver noise, and of everything else that is random.
 
     Example:
         >>> config = SimulationConfig.through_wall().replace(seed=3)
@@ -54,6 +55,7 @@ class SimulationConfig:
                 raise TensorsimError(
                     f"SimulationConfig.{name}: got {getattr(self, name)!r}, expected a {kind.__name__}"
                 )
+        self.scene.check_engine(self.processing.engine)
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
             raise TensorsimError(
                 f"SimulationConfig.seed: got {self.seed!r}, expected an integer from 0 to 2^32 - 1"
@@ -76,7 +78,8 @@ class SimulationConfig:
         Rectangular range window; STFT of the sum of range bins' magnitudes; only ``T1^2`` of the bounces in the wall,
         and the propagation phase of the wall counted twice; noise relative to the total power; metres per pixel from
         the frame at hand, position by increments, each frame matched alone to its nearest pose; a Kalman filter
-        without smoothing, straight lines between frames and a Savitzky-Golay filter over a quarter of a second.
+        without smoothing, straight lines between frames and a Savitzky-Golay filter over a quarter of a second. Bodies
+        that neither sway nor breathe, an empty room, and an ideal receiver.
 
         Args:
             base: gives radar, wall, people and networks; None is the free-space scene of the panel.
@@ -85,12 +88,18 @@ class SimulationConfig:
         return base.replace(
             scene__wall_paths="paper",
             scene__body="joints",
+            scene__sway=False,
+            scene__vital_signs=False,
+            scene__clutter=None,
+            scene__interference=None,
+            scene__receiver=ReceiverConfig(),
             scene__noise_reference="total",
             processing__range_window=None,
             processing__mti="two-pulse",
             processing__integration="paper",
             tracking__measurement_noise=0.01,
             pose__position="paper",
+            pose__lifter="nearest",
             pose__neighbours=1,
             pose__temporal=0.0,
             pose__initial_distance_m=base.pose.initial_distance_m or PANEL_DISTANCES_M,

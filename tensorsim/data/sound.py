@@ -49,13 +49,13 @@ def slow_time_signal(
         (M,) complex, conjugated so that positive frequencies approach, as in the Doppler-time map; a two-pulse
         canceller leaves one pulse fewer than ``pulses``.
     """
-    samples = simulator.radar.samples_per_chirp
+    samples, bins = simulator.radar.samples_per_chirp, simulator.range_profile.range_m.shape[0]
     parts = []
-    for start in range(0, pulses, simulator.pulse_chunk):
-        positions, rcs = source(start, min(start + simulator.pulse_chunk, pulses))
+    for start in range(0, pulses, simulator.recorder.pulse_chunk):
+        positions, rcs = source(start, min(start + simulator.recorder.pulse_chunk, pulses))
         rcs = rcs.expand(positions.shape[:-1])
-        profiles = simulator.engine(positions[None], rcs[None])[0]
-        parts.append(coherent_sum(profiles, samples)[0])
+        profiles = simulator.recorder.engine(positions[None], rcs[None], start)[0]
+        parts.append(coherent_sum(profiles[..., :bins], samples)[0])  # of an array, its first channel
     # The indicator is linear along the pulses and the same in each range bin, so it may follow the sum over range.
     return simulator.mti(torch.cat(parts))[:, 0].conj().resolve_conj()
 

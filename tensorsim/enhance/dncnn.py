@@ -29,7 +29,7 @@ MAX_DEPTH, MAX_CHANNELS = 200, 640
 
 
 class DnCNN(nn.Module):
-    """Noisy images in [0, 1] -> clean images ``x - Q(x)``; the network Q predicts the noise (residual learning).
+    """Noisy images in [0, 1] -> clean images $x - Q(x)$; the network $Q$ predicts the noise (residual learning).
 
     ``depth`` convolutions of 3x3, all but the first and the last with batch normalisation. The state dict has the
     names of the authors' PyTorch code: ``model.{3i-1}`` and ``model.{3i}`` for convolution i and its normalisation,

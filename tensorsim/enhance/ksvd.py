@@ -5,12 +5,14 @@ Transactions on Image Processing 15 (2006). The dictionary is learned by scikit-
 2009) instead of K-SVD: the same objective, minimised one patch after another.
 """
 
+import importlib.util
 import math
+import warnings
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_rank
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_rank
 
 
 def noise_deviation(image: Tensor) -> float:
@@ -108,10 +110,42 @@ def ksvd_denoise(
     busy = (centred**2).sum(1) > tolerance
     found = torch.zeros_like(patches)
     if busy.any():
-        codes = sparse_encode(centred[busy], dictionary, algorithm="omp", alpha=tolerance)
+        with warnings.catch_warnings():
+            # Where atoms are nearly alike the pursuit ends early, with the best fit so far.
+            warnings.filterwarnings("ignore", "Orthogonal matching pursuit ended", RuntimeWarning)
+            codes = sparse_encode(centred[busy], dictionary, algorithm="omp", alpha=tolerance)
         found[torch.from_numpy(busy)] = torch.from_numpy(codes @ dictionary)
     weight = 0.118 / sigma
     size = (int(noisy.shape[0]), int(noisy.shape[1]))
     total = fold((found + means).T[None], size, side)[0, 0]
     count = fold(torch.ones_like(found).T[None], size, side)[0, 0]
     return ((weight * noisy + total) / (weight + count)).to(image)
+
+
+class KSVD(nn.Module):
+    """:func:`ksvd_denoise` of magnitude maps (..., H, W), each scaled to [0, 1] and back; for comparison.
+
+    Runs scikit-learn, so it does not script and has no gradient. Takes minutes for a map of 32 000 columns.
+
+    Raises:
+        TensorsimError: scikit-learn missing; maps smaller than a patch, NaN.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        if importlib.util.find_spec("sklearn") is None:
+            raise TensorsimError("KSVD: scikit-learn is not installed; install tensorsim[train]")
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Maps (..., H, W) to maps of the same shape, not negative."""
+        check_floating(maps, "KSVD")
+        check_min_rank(maps, 2, "KSVD", "(..., H, W)")
+        flat = maps.reshape(-1, maps.shape[-2], maps.shape[-1])
+        return torch.stack([self._clean(one) for one in flat]).reshape(maps.shape)
+
+    @staticmethod
+    def _clean(one: Tensor) -> Tensor:
+        low, high = one.amin(), one.amax()
+        if not bool(high > low):
+            return one.clone()
+        return ksvd_denoise((one - low) / (high - low)).clamp_min(0.0) * (high - low) + low

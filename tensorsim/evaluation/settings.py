@@ -7,17 +7,18 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
-from tensorsim.config import ProcessingConfig, SceneConfig, SimulationConfig
+from tensorsim.config import PoseConfig, ProcessingConfig, SceneConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import Clip
 from tensorsim.evaluation.films import CAMERA, FPS, Filmed, Observed, project, true_keypoints
 from tensorsim.evaluation.scores import Maps
 from tensorsim.motion.scatterers import visibility_fade
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.pipeline.networks import pretrained_lifter
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.bone_fit import BoneFit
-from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
 #: Columns per second of range-time maps that have more pulses than that.
@@ -116,12 +117,13 @@ class Pipelines:
 
     Args:
         scenes: by name.
+        lifter: the lifter of settings that are not the paper's; None is the default one.
     """
 
-    def __init__(self, scenes: dict[str, SceneConfig]) -> None:
+    def __init__(self, scenes: dict[str, SceneConfig], lifter: PoseConfig | None = None) -> None:
         self.scenes = scenes
         self.lifters = {
-            paper: NearestPoseLifter(neighbours=config.pose.neighbours, temporal=config.pose.temporal).eval()
+            paper: pretrained_lifter(config.pose if paper or lifter is None else lifter)
             for paper, config in CONFIGS.items()
         }
         self.radars = {
@@ -230,6 +232,8 @@ class Pipelines:
         if setting.true_stage == "position":
             place = _TruePosition(place, truth)
         lifter: nn.Module = self.lifters[setting.paper]
+        if isinstance(lifter, TemporalLifter):
+            lifter = lifter.seen_by(CAMERA, (clip.height_m,))
         if setting.true_stage == "lifting":
             lifter = _TrueLifter(true_lifting(clip))
         fit: nn.Module | None = None

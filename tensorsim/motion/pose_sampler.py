@@ -5,6 +5,7 @@ The shipped pose library is made of it and of the activities (``tensorsim librar
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -234,6 +235,22 @@ _FAMILIES: tuple[tuple[Callable[[_Draw], BodyPose], float], ...] = (
 )
 
 
+#: Number of families that :func:`sample_angles` knows.
+FAMILIES = len(_FAMILIES)
+
+
+def sample_angles(family: int, count: int, generator: torch.Generator) -> BodyPose:
+    """Joint angles (count,) of random poses of one family, 0 to ``FAMILIES - 1``."""
+    draw = _Draw(count, generator)
+    pose = _FAMILIES[family][0](draw)
+    return pose._replace(
+        trunk=pose.trunk + draw.jitter(3.0, 3),
+        head=pose.head + draw.jitter(10.0, 2),
+        hip=pose.hip + draw.jitter(1.5, 2, 2),
+        shoulder=pose.shoulder + draw.jitter(2.0, 2, 3),
+    )
+
+
 def sample_poses(count: int, seed: int = 0, limb_deviation: float = 0.0) -> Tensor:
     """Random human poses: gait phases, standing, reaching, punching, kicking, sitting, falling, jumping.
 
@@ -253,15 +270,9 @@ def sample_poses(count: int, seed: int = 0, limb_deviation: float = 0.0) -> Tens
         edges.append(edges[-1] + 1 + int(share * (count - len(_FAMILIES))))
     edges[-1] = count
     poses = []
-    for (family, _), start, stop in zip(_FAMILIES, edges[:-1], edges[1:], strict=True):
+    for family, (start, stop) in enumerate(pairwise(edges)):
+        pose = sample_angles(family, stop - start, generator)
         draw = _Draw(stop - start, generator)
-        pose = family(draw)
-        pose = pose._replace(
-            trunk=pose.trunk + draw.jitter(3.0, 3),
-            head=pose.head + draw.jitter(10.0, 2),
-            hip=pose.hip + draw.jitter(1.5, 2, 2),
-            shoulder=pose.shoulder + draw.jitter(2.0, 2, 3),
-        )
         limbs = (1 + draw.deviation(limb_deviation)).unbind(-1)
         body = Proportions(*(mean * limb for mean, limb in zip(Proportions(), limbs, strict=True)))
         poses.append(mirrored_half(forward_kinematics(pose, proportions=body)))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import SimulationConfig
-from tensorsim.enhance.dncnn import MapDenoiser
+from tensorsim.enhance.choice import map_denoiser
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.body_scatterers import BodyScatterers
@@ -105,10 +105,10 @@ class PoseToDoppler(nn.Module):
             small_motions.append(PosturalSway(prf_hz, seed=config.seed))
         if scene.vital_signs:
             small_motions.append(VitalSigns(prf_hz, seed=config.seed))
-        denoiser = None if processing.denoiser is None else MapDenoiser.from_pretrained(processing.denoiser)
+        denoiser = map_denoiser(processing.denoiser)
         people = len(config.pose.person_weight_kg)
         return cls(
-            RadarSimulator(scene, processing=processing),
+            RadarSimulator(scene, processing=processing, seed=config.seed),
             PoseResampler(prf_hz, method=smoothing.resampling),
             pulse_smoother,
             bodies[scene.body](),

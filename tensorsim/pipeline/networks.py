@@ -5,7 +5,11 @@ from pathlib import Path
 
 from torch import nn
 
+from tensorsim.config import PoseConfig
 from tensorsim.protocols import check_part, is_pose_estimator
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
@@ -36,3 +40,19 @@ def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: boo
     else:
         network = HRNet.from_pretrained(source)
     return TopDownPose(network, flip_test=flip_test)
+
+
+def pretrained_lifter(people: PoseConfig) -> NearestPoseLifter | TemporalLifter:
+    """The lifter that a configuration describes, for its camera and the heights of its people.
+
+    Raises:
+        TensorsimError: weights or a library that are not there.
+    """
+    if people.lifter == "temporal":
+        return TemporalLifter.from_pretrained(
+            people.lifter_weights, people.camera, people.person_height_m, people.keypoint_threshold
+        )
+    library = None if people.library is None else load_pose_library(people.library)
+    return NearestPoseLifter(
+        library, neighbours=people.neighbours, temporal=people.temporal, pitch_rad=people.camera.pitch_rad
+    ).eval()

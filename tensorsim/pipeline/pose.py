@@ -8,14 +8,15 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
-from tensorsim.pipeline.networks import pretrained_pose, top_down
+from tensorsim.pipeline.networks import pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
-from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps
+from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
@@ -81,7 +82,9 @@ class VideoToPose(nn.Module):
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
         if lifter is None:
             lifter = NearestPoseLifter(pitch_rad=0.0 if camera is None else camera.pitch_rad)
-        self.lifter = check_part(lifter, "lifter")
+        # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
+        self.temporal = lifter if isinstance(lifter, TemporalLifter) else None
+        self.lifter = None if self.temporal is not None else check_part(lifter, "lifter")
         if metric_pose is None:
             heights = PoseConfig().person_height_m if person_height_m is None else person_height_m
             metric_pose = MetricPose(camera, heights, initial_distance_m, keypoint_threshold)
@@ -123,7 +126,6 @@ class VideoToPose(nn.Module):
             detector = RTMDet.from_pretrained(tracking.detector)
         if pose is None:
             pose = pretrained_pose(people.network, people.flip_test)
-        library = None if people.library is None else load_pose_library(people.library)
         return cls(
             detector,
             top_down(pose, people.flip_test),
@@ -142,12 +144,7 @@ class VideoToPose(nn.Module):
                 process_noise=tracking.process_noise,
                 measurement_noise=tracking.measurement_noise,
             ),
-            lifter=NearestPoseLifter(
-                library,
-                neighbours=people.neighbours,
-                temporal=people.temporal,
-                pitch_rad=people.camera.pitch_rad,
-            ),
+            lifter=pretrained_lifter(people),
             metric_pose=MetricPose(
                 people.camera,
                 people.person_height_m,
@@ -164,27 +161,37 @@ class VideoToPose(nn.Module):
         Raises:
             TensorsimError: a lifter or metric pose of another class, which may know no camera.
         """
-        if not isinstance(self.lifter, NearestPoseLifter) or not isinstance(self.metric_pose, MetricPose):
+        lifter = self.lifter if self.temporal is None else self.temporal
+        if not isinstance(lifter, (NearestPoseLifter, TemporalLifter)) or not isinstance(
+            self.metric_pose, MetricPose
+        ):
             raise TensorsimError(
-                f"seen_by: got {type(self.lifter).__name__} and {type(self.metric_pose).__name__}, expected "
-                "NearestPoseLifter and MetricPose"
+                f"seen_by: got {type(lifter).__name__} and {type(self.metric_pose).__name__}, expected "
+                "NearestPoseLifter or TemporalLifter, and MetricPose"
             )
         other = copy.copy(self)
         other._modules = dict(self._modules)
-        other.lifter = self.lifter.tilted(camera.pitch_rad)
+        if isinstance(lifter, TemporalLifter):
+            other.temporal = lifter.seen_by(camera)
+        else:
+            other.lifter = lifter.tilted(camera.pitch_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
-    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Pose:
+    def forward(
+        self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
+    ) -> Pose:
         """Estimate the people of whole clips.
 
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
             lengths: (B,) frames of each clip when the shorter ones are padded; None takes all T.
+            times_s: (B, T) seconds, increasing, of frames that are not evenly spaced: the people are interpolated to
+                ``fps`` frames per second, see :func:`~tensorsim.vision.smoothing.even_time.to_even_time`. None: even.
 
         Raises:
-            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive.
+            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive, times that do not increase.
         """
         check_rank(video, 5, "video", "(B, T, 3, H, W)")
         check_size(video, 2, 3, "video", "(B, T, 3, H, W)")
@@ -207,6 +214,8 @@ class VideoToPose(nn.Module):
         keypoints, scores = self.estimate(frames, boxes, valid)
         keypoints = keypoints.reshape(b, t, people, 17, 2).transpose(1, 2)
         scores = scores.reshape(b, t, people, 17).transpose(1, 2)
+        if times_s is not None:
+            tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, fps)
         return self.lift(tracks, keypoints, scores, height, width, fps)
 
     def frames_present(self, clips: int, frames: int, lengths: Tensor | None, device: torch.device) -> Tensor:
@@ -304,7 +313,13 @@ class VideoToPose(nn.Module):
         usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
         usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
         usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
-        lifted = self.lifter(body, body_scores)
+        if self.temporal is not None:
+            found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
+            lifted = self.temporal.in_picture(found, body_scores, height, width)
+            body, noise = lifted.keypoints, found.deviation
+        else:
+            lifted = self.lifter(body, body_scores)
+            noise = keypoint_noise(body_scores, lifted.scale)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
@@ -312,7 +327,6 @@ class VideoToPose(nn.Module):
         # the joint of the matched pose replaces it, as long as the person is in the scene.
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
-        noise = keypoint_noise(body_scores, lifted.scale)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
         # Nobody is where no frame of a track shows a joint.

@@ -17,6 +17,7 @@ from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerTimeMap, RangeDopplerVideo, doppler_time_map
 from tensorsim.radar.processing.mti import MovingTargetIndicator, two_pulse_canceller
 from tensorsim.radar.processing.point_cloud import PointCloud, Points
+from tensorsim.radar.processing.range_doppler import PointDetector, RangeDopplerAngle, RangeDopplerCube
 from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile, range_profile
 from tensorsim.radar.processing.ridges import PathRidgeExtractor, RidgeExtractor
 from tensorsim.radar.processing.synchrosqueeze import SynchrosqueezedMap
@@ -56,11 +57,14 @@ __all__ = [
     "PathRidgeExtractor",
     "PhaseNoise",
     "PointCloud",
+    "PointDetector",
     "Points",
     "QuadratureImbalance",
     "RadarScene",
     "RadarSimulator",
     "RangeBinSynthesizer",
+    "RangeDopplerAngle",
+    "RangeDopplerCube",
     "RangeDopplerVideo",
     "RangeProfile",
     "RealReceiver",

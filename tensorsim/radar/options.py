@@ -12,7 +12,7 @@ from tensorsim.radar.synthesis.echo import EchoSynthesizer
 #: Fields of a scene that an EchoSynthesizer is made from.
 _ECHO_FIELDS = (
     "floor", "multipath", "leakage", "wall_echo", "wall_paths", "incidence", "polarization", "bounces", "direct",
-    "paths",
+    "paths", "wall_attenuation",
 )  # fmt: skip
 #: Options that a module given in place of them would leave without effect.
 _REPLACED = {

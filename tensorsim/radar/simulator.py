@@ -17,10 +17,10 @@ from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
 from tensorsim.radar.processing.ridges import RidgeExtractor, Ridges
-from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.recorder import Recorder
 from tensorsim.radar.synthesis.echo import EchoSynthesizer, check_scene
-from tensorsim.radar.synthesis.engines import RangeBinEngine, TimeEngine
-from tensorsim.radar.synthesis.noise import ProfileNoise, ReceiverNoise, decibels
+from tensorsim.radar.synthesis.front_end import Levels
+from tensorsim.radar.synthesis.noise import decibels
 from tensorsim.types import RadarMaps
 
 #: ``source(start, stop)`` gives pulses start to stop of a scene: positions (stop - start, S, 3) and RCS.
@@ -31,8 +31,8 @@ class Pending(NamedTuple):
     """What later pulses of B clips need of earlier ones.
 
     Attributes:
-        profiles: (B, p, R) complex, the last ones that the moving target indicator has seen.
-        moving: (B, q, R) complex, what it made of them as far as later Doppler frames need it.
+        profiles: (B, p, V R) complex, the last ones that the moving target indicator has seen.
+        moving: (B, q, V R) complex, what it made of them as far as later Doppler frames need it.
     """
 
     profiles: Tensor
@@ -43,18 +43,16 @@ class Piece(NamedTuple):
     """What a stretch of m pulses adds to the maps of B clips.
 
     Attributes:
-        profiles: (B, m, R) complex, with noise.
-        moving: (B, m', R) complex; fewer in the first piece.
+        profiles: (B, m, V R) complex, with noise; the channels of V antennas stand one after the other.
+        moving: (B, m', V R) complex; fewer in the first piece.
         doppler_time: (B, F, k) frames that the pulses complete.
         pending: for the next piece.
-        noise_energy: (B,).
     """
 
     profiles: Tensor
     moving: Tensor
     doppler_time: Tensor
     pending: Pending
-    noise_energy: Tensor
 
 
 class RadarSimulator(nn.Module):
@@ -74,17 +72,23 @@ class RadarSimulator(nn.Module):
         echo: an :class:`~tensorsim.radar.EchoSynthesizer` in place of one made from the scene.
         mti: the method of a :class:`~tensorsim.radar.MovingTargetIndicator`, or a module of that class.
         doppler, ridges: modules in place of those made from ``processing``.
+        seed: of the room's reflectors, the sensor's vibration and the phase noise.
         **options: fields of :class:`~tensorsim.SceneConfig` (beside a radar) and of
             :class:`~tensorsim.ProcessingConfig` by name: ``multipath=True``, ``snr_db=20.0``, ``ridge_count=1``, ...
             Here ``multipath`` is off unless it is asked for.
 
     A scene without echo gets the noise of one with a target of 1 m^2 at 3 m in free space. With ``near_bins`` the
-    relative error is ``simulator.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann). Noise is drawn
-    for a few chunks of pulses at a time, so with one seed another ``pulse_chunk`` is another realisation.
+    relative error is ``simulator.recorder.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann).
+    Noise is drawn for a few chunks of pulses at a time, so with one seed another ``pulse_chunk`` is another
+    realisation.
 
     Shapes: positions (..., M, S, 3) m, rcs (..., S), (..., M, S) or (S,) m^2 ->
     :class:`~tensorsim.types.RadarMaps` in float32, or float64 after ``.double()``. Differentiable but for
     ridge bins.
+
+    Several antennas are one radar: range-time maps are root mean squares over the V channels, Doppler-time maps add
+    their powers, and every channel has noise of its own. :meth:`profiles` gives the channels themselves, for angles and
+    points (:class:`~tensorsim.radar.AngleMapper`, :class:`~tensorsim.radar.PointDetector`).
 
     Attributes:
         range_time_block: pulses per column of the range-time maps.
@@ -108,6 +112,7 @@ class RadarSimulator(nn.Module):
         mti: Mti | MovingTargetIndicator | None = None,
         doppler: DopplerTimeMap | None = None,
         ridges: RidgeExtractor | None = None,
+        seed: int = 0,
         **options: Any,
     ) -> None:
         super().__init__()
@@ -122,32 +127,19 @@ class RadarSimulator(nn.Module):
             *(["learnable"] if learnable else []),
         }
         refuse_conflicts(ready, scene, processing, given)
+        scene.check_engine(processing.engine)
         radar = scene.radar
-        if radar.has_array:
+        if radar.has_array and processing.integration == "coherent":
             raise TensorsimError(
-                "radar: got several antennas, expected one transmitter and one receiver; for an array call the "
-                "EchoSynthesizer and the stages after it, and AngleMapper for the angles"
+                "integration: got 'coherent' with several antennas, expected 'noncoherent' or 'paper': their phases "
+                "differ with the direction"
             )
         self.echo = echo or echo_of(scene, processing.pulse_chunk, antenna, learnable)
-        self.noise = ReceiverNoise(
-            scene.snr_db,
-            scene.noise_reference,
-            empty_power=(self.echo.paths.scale / 3.0**2) ** 2,
-            bandwidth_hz=radar.sample_rate_hz,
-            noise_figure_db=scene.noise_figure_db,
-            transmit_power_w=scene.transmit_power_w,
-        )
         gate_m = processing.range_gate_m
         self.fixed_gate_m = None if isinstance(gate_m, float | int) else gate_m
         self.range_profile = RangeProfile(radar, processing.range_window, self.fixed_gate_m)
-        total = scene.noise_reference == "total"
-        self.engine: nn.Module = TimeEngine(self.echo, self.range_profile, total)
-        if processing.engine == "range-bins":
-            bins = RangeBinSynthesizer(
-                self.echo, self.range_profile, processing.near_bins, processing.energy_stride
-            )
-            self.engine = RangeBinEngine(bins, total)
-        self.profile_noise = ProfileNoise(self.range_profile.window)
+        self.recorder = Recorder(scene, processing, self.echo, self.range_profile, seed)
+        self.channels, self.has_array = self.recorder.channels, radar.has_array
         self.gate: nn.Module | None = None
         if isinstance(gate_m, float | int):
             self.gate = FollowingGate(radar, self.range_profile.range_m, gate_m)
@@ -156,7 +148,6 @@ class RadarSimulator(nn.Module):
             radar, processing.window_s, processing.overlap, processing.integration
         )
         self.ridges = ridges or RidgeExtractor(processing.ridge_count)
-        self.pulse_chunk = processing.pulse_chunk
         # Chunks in a piece: few, so that the allocator reuses their memory; not few, since pieces overlap.
         self.piece_chunks = 8
         self.range_time_block = 1
@@ -170,22 +161,26 @@ class RadarSimulator(nn.Module):
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
         pulses = positions.shape[1]
-        echoes, signal = self._echoes(positions, rcs)
-        noise = torch.zeros_like(signal)
+        echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
+        noise = torch.zeros_like(levels.signal)
         pending = self._nothing_pending(positions)
         range_time: list[Tensor] = []
         range_time_mti: list[Tensor] = []
         doppler_times: list[Tensor] = []
-        span = self._span(positions)
+        ahead, span = self.echo.displacements(positions), self._span(positions)
         for start in range(0, pulses, span):
-            stop = start + span
-            piece = self._piece(echoes.pop(0), positions[:, start:stop], rcs[:, start:stop], signal, pending)
-            range_time.append(piece.profiles.transpose(1, 2).abs())
-            range_time_mti.append(piece.moving.transpose(1, 2).abs())
+            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
+            way = None if ahead is None else ahead[:, start : start + span]
+            fresh, noise_energy = self.recorder.received(points, sections, start, way, levels, echoes)
+            piece = self._piece(fresh, points, sections, pending)
+            range_time.append(self._shown(piece.profiles))
+            range_time_mti.append(self._shown(piece.moving))
             doppler_times.append(piece.doppler_time)
-            pending, noise = piece.pending, noise + piece.noise_energy
+            pending, noise = piece.pending, noise + noise_energy
         doppler_time = torch.cat(doppler_times, -1)
         ridges = self.ridges(doppler_time)
+        # Without noise the ratio is infinite, and no gradient goes through it.
+        signal = levels.signal.detach() if self.recorder.noise.noiseless else levels.signal
         snr_db = decibels(signal, noise / (pulses * self.echo.samples)).to(doppler_time.dtype)
         return RadarMaps(
             unflatten_batch(block_rms(torch.cat(range_time, -1), self.range_time_block), lead),
@@ -201,17 +196,39 @@ class RadarSimulator(nn.Module):
         """Only the Doppler-time map (..., F, K) of :meth:`forward`; with one seed the same."""
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
-        pulses = positions.shape[1]
-        echoes, signal = self._echoes(positions, rcs)
+        echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
         pending = self._nothing_pending(positions)
         parts: list[Tensor] = []
-        span = self._span(positions)
-        for start in range(0, pulses, span):
-            stop = start + span
-            piece = self._piece(echoes.pop(0), positions[:, start:stop], rcs[:, start:stop], signal, pending)
+        ahead, span = self.echo.displacements(positions), self._span(positions)
+        for start in range(0, positions.shape[1], span):
+            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
+            way = None if ahead is None else ahead[:, start : start + span]
+            fresh, _ = self.recorder.received(points, sections, start, way, levels, echoes)
+            piece = self._piece(fresh, points, sections, pending)
             parts.append(piece.doppler_time)
             pending = piece.pending
         return unflatten_batch(torch.cat(parts, -1), lead)
+
+    @torch.jit.export
+    def profiles(self, positions: Tensor, rcs: Tensor) -> Tensor:
+        """Complex range profiles as they are received, (..., M, R), or (..., V, M, R) of V channels of an array.
+
+        Channel ``v = k A + a`` is transmitter k with receiver a; transmitters fire in turn, see
+        :func:`~tensorsim.radar.align_transmitters`. With one seed those of :meth:`forward`.
+        """
+        lead = list(positions.shape)[:-3]
+        positions, rcs = self._scene(positions, rcs)
+        echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
+        parts: list[Tensor] = []
+        ahead, span = self.echo.displacements(positions), self._span(positions)
+        for start in range(0, positions.shape[1], span):
+            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
+            way = None if ahead is None else ahead[:, start : start + span]
+            parts.append(self.recorder.received(points, sections, start, way, levels, echoes)[0])
+        profiles = torch.cat(parts, 1)
+        if self.has_array:
+            profiles = profiles.unflatten(-1, [self.channels, -1]).transpose(1, 2)
+        return unflatten_batch(profiles, lead)
 
     def _scene(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (B, M, S, 3) and RCS (B, M, S) of a scene, checked."""
@@ -225,7 +242,7 @@ class RadarSimulator(nn.Module):
         """Pulses in a piece."""
         if self.mti.whole_clip:
             return positions.shape[1]
-        return max(self.piece_chunks * self._step(positions), self.mti.lost_pulses + 1)
+        return max(self.piece_chunks * self.recorder.step(positions), self.mti.lost_pulses + 1)
 
     @torch.no_grad()
     def stream(self, source: Source, pulses: int) -> RadarMaps:
@@ -245,11 +262,12 @@ class RadarSimulator(nn.Module):
             )
         self._check_pulses(pulses)
         speeds = SpeedCheck(self.radar, self.fixed_gate_m)
-        signal = torch.zeros(1, dtype=torch.float64)
-        for positions, rcs in self._pieces(source, pulses):
+        levels = Levels(torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+        for start, positions, rcs, ahead in self._pieces(source, pulses):
             speeds.add(positions, rcs)
-            if not self.noise.noiseless:
-                signal = signal + self._profiles(positions, rcs)[1].to(signal) / (pulses * self.echo.samples)
+            if self.recorder.needs_levels:
+                energies = self.recorder.survey(positions, rcs, start, ahead)[1]
+                levels = self.recorder.add(levels, energies, pulses)
         speeds.judge()
 
         seen = pulses - self.mti.lost_pulses
@@ -259,14 +277,15 @@ class RadarSimulator(nn.Module):
         # Small tensors kept from every piece would pin the freed memory of the large ones between them.
         peak_bins, peak_magnitudes = Columns(doppler_time.total), Columns(doppler_time.total)
         pending: list[Pending] = []
-        noise = torch.zeros_like(signal)
-        for positions, rcs in self._pieces(source, pulses):
+        noise = torch.zeros_like(levels.signal)
+        for start, positions, rcs, ahead in self._pieces(source, pulses):
             before = pending[0] if pending else self._nothing_pending(positions)
-            fresh = self._profiles(positions, rcs)[0]
-            piece = self._piece(fresh, positions, rcs, signal.to(positions.device), before)
-            pending, noise = [piece.pending], noise + piece.noise_energy.to(noise)
-            range_time.push(piece.profiles[0].T.abs())
-            range_time_mti.push(piece.moving[0].T.abs())
+            there = Levels(levels.signal.to(positions.device), levels.arriving.to(positions.device))
+            fresh, noise_energy = self.recorder.received(positions, rcs, start, ahead, there, [])
+            piece = self._piece(fresh, positions, rcs, before)
+            pending, noise = [piece.pending], noise + noise_energy.to(noise)
+            range_time.push(self._shown(piece.profiles)[0])
+            range_time_mti.push(self._shown(piece.moving)[0])
             doppler_time.push(piece.doppler_time[0])
             peaks = self.ridges.peaks(piece.doppler_time[0])
             peak_bins.push(peaks.indices)
@@ -279,21 +298,47 @@ class RadarSimulator(nn.Module):
             whole,
             ridges.indices,
             ridges.magnitudes,
-            decibels(signal, noise / (pulses * self.echo.samples))[0].to(whole),
+            decibels(levels.signal, noise / (pulses * self.echo.samples))[0].to(whole),
         )
 
-    def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[Tensor, Tensor]]:
-        """Positions (1, m, S, 3) and RCS (1, m, S) of a source, checked; m a multiple of ``pulse_chunk``."""
-        span = max(self.piece_chunks * self.pulse_chunk, self.mti.lost_pulses + 1)
+    @torch.no_grad()
+    def advance(self, positions: Tensor, rcs: Tensor, first: int, pending: Pending | None) -> Piece:
+        """Maps of the next pulses of a scene without end.
+
+        The noise is that of an empty scene, see the class, as the power of what is still to come is not known.
+
+        Args:
+            positions: (B, m, S, 3) metres, m above the ``lost_pulses`` of the moving target indicator.
+            rcs: (B, m, S) m^2.
+            first: number of the first of these pulses.
+            pending: of the piece before; None begins.
+        """
+        rcs = check_scene(positions, rcs)
+        pending = self._nothing_pending(positions) if pending is None else pending
+        nothing = torch.zeros(positions.shape[0], dtype=torch.float64)
+        fresh, _ = self.recorder.received(positions, rcs, first, None, Levels(nothing, nothing), [])
+        return self._piece(fresh, positions, rcs, pending)
+
+    def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
+        """Pieces of a source, checked: number of the first pulse, positions (1, m, S, 3), RCS (1, m, S), way ahead.
+
+        All but the last are a multiple of ``pulse_chunk`` long. The way until the next pulse (1, m, S, 3) is for
+        transmitters in turn, else None; for it the source is asked for one pulse more.
+        """
+        span = max(self.piece_chunks * self.recorder.pulse_chunk, self.mti.lost_pulses + 1)
         for start in range(0, pulses, span):
-            stop = min(start + span, pulses)
+            own = min(span, pulses - start)
+            stop = min(start + own + (self.echo.paths.transmitters > 1), pulses)
             positions, rcs = source(start, stop)
             if positions.dim() != 3 or positions.shape[0] != stop - start:
                 raise TensorsimError(
                     f"source({start}, {stop}): got positions of shape {list(positions.shape)}, expected "
                     f"({stop - start}, scatterers, 3)"
                 )
-            yield positions.unsqueeze(0), check_scene(positions, rcs).unsqueeze(0)
+            rcs = check_scene(positions, rcs)
+            ahead = self.echo.displacements(positions)
+            ahead = None if ahead is None else ahead[None, :own]
+            yield start, positions[None, :own], rcs[None, :own], ahead
 
     def _check_pulses(self, pulses: int) -> None:
         if pulses < self.min_pulses:
@@ -303,27 +348,30 @@ class RadarSimulator(nn.Module):
 
     def _nothing_pending(self, positions: Tensor) -> Pending:
         """What is pending before the first pulse of positions (B, M, S, 3)."""
-        bins = self.range_profile.range_m.shape[0]
+        bins = self.range_profile.range_m.shape[0] * self.channels
         nothing = self.echo.static_echo().new_zeros([positions.shape[0], 0, bins])
         return Pending(nothing, nothing)
 
-    def _piece(
-        self, fresh: Tensor, positions: Tensor, rcs: Tensor, signal: Tensor, pending: Pending
-    ) -> Piece:
+    def _shown(self, profiles: Tensor) -> Tensor:
+        """Magnitude (B, R, m) of profiles (B, m, V R), root mean square over the antennas."""
+        magnitude = profiles.transpose(1, 2).abs()
+        if self.channels == 1:
+            return magnitude
+        return magnitude.unflatten(1, [self.channels, -1]).square().mean(1).sqrt()
+
+    def _piece(self, fresh: Tensor, positions: Tensor, rcs: Tensor, pending: Pending) -> Piece:
         """Maps of the next pulses, after those of which ``pending`` is left.
 
-        Their profiles (B, m, R) free of noise, positions (B, m, S, 3), RCS (B, m, S); ``signal`` (B,) is the mean
-        power that the noise refers to.
+        Their profiles (B, m, V R) as received, positions (B, m, S, 3), RCS (B, m, S).
         """
-        noise_energy = torch.zeros_like(signal)
-        if not self.noise.noiseless:
-            noise, noise_energy = self.profile_noise(fresh.transpose(1, 2), self.noise.noise_power(signal))
-            fresh = fresh + noise.transpose(1, 2)
         profiles = join_pulses(pending.profiles, fresh)
         moving = self.mti(profiles)
         if self.gate is not None:
             late = positions.shape[1] - moving.shape[1]
-            moving = self.gate(moving, positions[:, late:], rcs[:, late:])
+            gated: list[Tensor] = []
+            for channel in moving.chunk(self.channels, 2):
+                gated.append(self.gate(channel, positions[:, late:], rcs[:, late:]))
+            moving = torch.cat(gated, 2)
         waiting = join_pulses(pending.moving, moving)
         count = self.doppler.frames(waiting.shape[1])
         if count > 0:
@@ -331,39 +379,4 @@ class RadarSimulator(nn.Module):
         else:
             doppler_time = fresh.abs().new_zeros([fresh.shape[0], self.doppler.bins, 0])
         last = profiles[:, profiles.shape[1] - self.mti.lost_pulses :]
-        return Piece(
-            fresh,
-            moving,
-            doppler_time,
-            Pending(last, waiting[:, count * self.doppler.hop :]),
-            noise_energy,
-        )
-
-    def _echoes(self, positions: Tensor, rcs: Tensor) -> tuple[list[Tensor], Tensor]:
-        """Profiles free of noise, piece by piece, and the mean power (B,) of the noise reference."""
-        pulses, span = positions.shape[1], self._span(positions)
-        pieces: list[Tensor] = []
-        total = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
-        for start in range(0, pulses, span):
-            profiles, energy = self._profiles(
-                positions[:, start : start + span], rcs[:, start : start + span]
-            )
-            pieces.append(profiles)
-            total = total + energy
-        return pieces, total / (pulses * self.echo.samples)
-
-    def _profiles(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
-        """Profiles (B, M, R) free of noise, stored with time running fastest, and the energy (B,) of the reference."""
-        total = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
-        chunks: list[Tensor] = []
-        step = self._step(positions)
-        for start in range(0, positions.shape[1], step):
-            profiles, energy = self.engine(positions[:, start : start + step], rcs[:, start : start + step])
-            # Without noise the ratio is infinite, and no gradient goes through it.
-            total = total + (energy.detach() if self.noise.noiseless else energy)
-            chunks.append(profiles.transpose(1, 2))
-        return torch.cat(chunks, -1).transpose(1, 2), total
-
-    def _step(self, positions: Tensor) -> int:
-        """Pulses of every clip to work on at a time."""
-        return max(1, self.pulse_chunk // max(1, positions.shape[0]))
+        return Piece(fresh, moving, doppler_time, Pending(last, waiting[:, count * self.doppler.hop :]))

@@ -10,25 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.recognition.spnet import as_pictures, centred
+from tensorsim.recognition.blocks import as_pictures, centred, conv_norm
 
 #: Groups of each version; the widths of the stages are 16, 32 and 64 times this number.
 VERSIONS = {"s2p6": 6, "s2p7": 7, "s2p8": 8, "s2p9": 9}
 #: Number of layers of each stage.
 _BLOCKS = (4, 8, 3)
-
-
-def conv_norm(
-    in_channels: int, out_channels: int, kernel: int, stride: int = 1, groups: int = 1, relu: bool = True
-) -> nn.Sequential:
-    """Convolution without bias, normalisation, and optionally ReLU."""
-    layers: list[nn.Module] = [
-        nn.Conv2d(in_channels, out_channels, kernel, stride, kernel // 2, groups=groups, bias=False),
-        nn.BatchNorm2d(out_channels),
-    ]
-    if relu:
-        layers.append(nn.ReLU())
-    return nn.Sequential(*layers)
 
 
 class TwoLevelLayer(nn.Module):

@@ -9,67 +9,9 @@ import os
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_not_empty
-
-
-def centred(pictures: Tensor, mean: Tensor, name: str) -> Tensor:
-    """Images (..., C, H, W) as a batch (B, C, H, W), less the mean (C,) of each channel.
-
-    Raises:
-        TensorsimError: another number of channels, no images, NaN.
-    """
-    check_floating(pictures, name)
-    channels = mean.shape[0]
-    if pictures.dim() < 3 or pictures.shape[-3] != channels:
-        raise TensorsimError(
-            f"{name}: got shape {list(pictures.shape)}, expected (..., {channels} channels, height, width)"
-        )
-    check_not_empty(pictures, name)
-    check_finite(pictures, name)
-    return pictures.reshape(-1, channels, pictures.shape[-2], pictures.shape[-1]) - mean.view(-1, 1, 1)
-
-
-def as_pictures(logits: Tensor, pictures: Tensor) -> Tensor:
-    """Logits (B, classes) with the leading dimensions of the images (..., C, H, W)."""
-    shape = list(pictures.shape[:-3])
-    shape.append(logits.shape[-1])
-    return logits.reshape(shape)
-
-
-def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Padding (before, after) for an output of ``ceil(size / stride)``, as MATLAB's "same": an odd pixel goes after."""
-    total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
-    return total // 2, total - total // 2
-
-
-class SameConv(nn.Module):
-    """A 3x3 convolution whose output is ``ceil(size / stride)``.
-
-    Args:
-        in_channels, out_channels, stride, groups: of the convolution.
-        padding: ``"matlab"``: see :func:`same_padding` (even sizes at stride 2: none before, one after);
-            ``"torch"``: one on every side.
-    """
-
-    def __init__(
-        self, in_channels: int, out_channels: int, stride: int = 1, groups: int = 1, padding: str = "matlab"
-    ) -> None:
-        super().__init__()
-        self.matlab = padding == "matlab" and stride > 1  # both are equal at stride 1
-        self.stride = stride
-        self.conv = nn.Conv2d(
-            in_channels, out_channels, 3, stride, padding=0 if self.matlab else 1, groups=groups
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, C', ceil(H / stride), ceil(W / stride))."""
-        if self.matlab:
-            top, bottom = same_padding(x.shape[-2], 3, self.stride)
-            left, right = same_padding(x.shape[-1], 3, self.stride)
-            x = F.pad(x, [left, right, top, bottom])
-        return self.conv(x)
+from tensorsim.errors import TensorsimError
+from tensorsim.recognition.blocks import SameConv, as_pictures, centred, glorot
 
 
 class ParallelBlock(nn.Module):
@@ -152,7 +94,7 @@ class SPNet(nn.Module):
         self.act: nn.Module = nn.ReLU() if activation == "relu" else nn.Identity()
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):
-                _glorot(module)
+                glorot(module)
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Images (..., C, H, W) to logits (..., num_classes)."""
@@ -185,16 +127,3 @@ class SPNet(nn.Module):
         network = cls(last.shape[0], first.shape[1])
         load_strict(network, weights, path)
         return network.eval()
-
-
-def _glorot(layer: nn.Conv2d | nn.Linear) -> None:
-    """Initial weights as in MATLAB: Glorot's uniform distribution for each branch, bias 0."""
-    weight = layer.weight
-    receptive = weight[0, 0].numel()
-    groups = layer.groups if isinstance(layer, nn.Conv2d) else 1
-    inputs = weight.shape[1] * receptive
-    outputs = weight.shape[0] // groups * receptive
-    bound = (6 / (inputs + outputs)) ** 0.5
-    nn.init.uniform_(weight, -bound, bound)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)

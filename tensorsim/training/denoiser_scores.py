@@ -7,7 +7,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.enhance.ksvd import ksvd_denoise
 from tensorsim.radar.analysis.metrics import envelope_rmse, level_envelope, psnr
 from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.processing.doppler import DopplerFrames
@@ -21,15 +20,6 @@ _COLUMNS_AT_MOST = 1024
 Key = tuple[str, str, float, str]
 #: By name; None does nothing.
 Denoisers = dict[str, Callable[[Tensor], Tensor] | None]
-
-
-class KSVDMaps:
-    """:func:`~tensorsim.enhance.ksvd.ksvd_denoise` of magnitude maps, each scaled to [0, 1] and back."""
-
-    def __call__(self, maps: Tensor) -> Tensor:
-        """(H, W) to (H, W)."""
-        low, high = maps.amin(), maps.amax()
-        return ksvd_denoise((maps - low) / (high - low)).clamp_min(0.0) * (high - low) + low
 
 
 def ridge_error(noisy: Tensor, clean: Tensor, speed_m_s: Tensor) -> float:

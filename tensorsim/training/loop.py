@@ -88,6 +88,7 @@ class LoopConfig:
         checkpoint_every, validate_every, log_every: steps between.
         ema_decay: of the moving average of the weights that is validated and saved; 0 takes the weights as they are.
         quiet: no progress bar.
+        events: write events for TensorBoard as well as ``metrics.csv``.
 
     Raises:
         TensorsimError: counts below one, a decay outside of [0, 1), an unknown precision.
@@ -105,6 +106,7 @@ class LoopConfig:
     log_every: int = 20
     ema_decay: float = 0.999
     quiet: bool = False
+    events: bool = True
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every", "validate_every", "log_every"):
@@ -152,13 +154,7 @@ class _Shares:
 class _Log:
     """``metrics.csv`` (step, name, value) and TensorBoard events; removes lines of an older run after ``step``."""
 
-    def __init__(self, out: Path, step: int) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise TensorsimError(
-                f"training logs: TensorBoard does not import ({error}); install tensorsim[train]"
-            ) from error
+    def __init__(self, out: Path, step: int, events: bool) -> None:
         self.path = out / "metrics.csv"
         rows: list[list[str]] = []
         if self.path.is_file():
@@ -166,13 +162,29 @@ class _Log:
                 rows = [row for row in list(csv.reader(file))[1:] if len(row) == 3 and int(row[0]) <= step]
         with complete_file(self.path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([["step", "name", "value"], *rows])
-        self.events = SummaryWriter(str(out), purge_step=step + 1)
+        self.events = _events(out, step) if events else None
 
     def write(self, step: int, values: dict[str, float]) -> None:
         with self.path.open("a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([step, name, f"{value:.6g}"] for name, value in values.items())
-        for name, value in values.items():
-            self.events.add_scalar(name, value, step)
+        if self.events is not None:
+            for name, value in values.items():
+                self.events.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        if self.events is not None:
+            self.events.close()
+
+
+def _events(out: Path, step: int) -> Any:
+    """A writer of TensorBoard's events after ``step``."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise TensorsimError(
+            f"training logs: TensorBoard does not import ({error}); install tensorsim[train]"
+        ) from error
+    return SummaryWriter(str(out), purge_step=step + 1)
 
 
 # One function, although a long one: the steps of a run share nearly all of its state.
@@ -215,7 +227,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     if processes > 1:
         ids = [device.index] if device.type == "cuda" else None
         wrapped = nn.parallel.DistributedDataParallel(recipe.net, device_ids=ids)
-    log = _Log(config.out, first) if rank == 0 else None
+    log = _Log(config.out, first, config.events) if rank == 0 else None
 
     loader = DataLoader(
         _Stream(recipe),
@@ -264,7 +276,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
             _save(last, done, best, recipe, config, averaged, optimiser)
     bar.close()
     if log:
-        log.events.close()
+        log.close()
     if processes > 1:
         distributed.destroy_process_group()
     return best

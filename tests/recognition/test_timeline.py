@@ -8,6 +8,7 @@ from torch import Tensor, nn
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
 from tensorsim.recognition.timeline import NOT_SURE, label_windows, scene_probabilities, window_starts
+from tensorsim.results import label_of
 from tensorsim.types import RadarMaps
 
 RADAR = ts.RadarConfig.through_wall()
@@ -100,3 +101,28 @@ def test_bad_input_is_refused() -> None:
         label_windows(recognizer(), RadarMaps(*(x[None] for x in maps(10, 5))), 4.0)
     with pytest.raises(TensorsimError, match="duration_s: got 0"):
         label_windows(recognizer(), maps(10, 5), 0.0)
+
+
+class Fixed(nn.Module):
+    """Says the same of every picture."""
+
+    num_classes = 3
+    in_channels = 1
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        return torch.tensor([1.0, 3.0, 0.0]).expand(*pictures.shape[:-3], 3)
+
+
+def test_the_summary_has_the_label_and_every_probability() -> None:
+    """softmax(1, 3, 0) = 0.1142, 0.8438, 0.0420; names in the order of the network's outputs."""
+    names = ("sitting", "walking", "falling")
+    known = ts.recognition.ActivityRecognizer(RADAR, Fixed(), size=64, class_names=names).eval()
+    found = label_of(known, maps(400, 200), 4.0)
+    assert found["label"] == "walking"
+    assert found["probabilities"] == {"sitting": 0.1142, "walking": 0.8438, "falling": 0.042}
+    assert [w["label"] for w in found["timeline"]] == ["walking"]
+    assert found["timeline"][0]["probability"] == 0.8438
+    unsure = label_of(known, maps(400, 200), 4.0, 0.9)
+    assert unsure["label"] == NOT_SURE
+    assert unsure["probabilities"] == found["probabilities"]
+    assert label_of(None, maps(400, 200), 4.0) == {"label": None, "probabilities": None, "timeline": None}

@@ -28,17 +28,23 @@ def few(labels: Tensor, shots: int) -> Tensor:
     return torch.cat(chosen)
 
 
-def lda_logits(train: Tensor, labels: Tensor, test: Tensor, classes: int) -> Tensor:
-    """Log-probabilities (N, classes) of scikit-learn's LDA with shrinkage on pictures of half the height and width."""
+def lda_logits(train: list[Tensor], labels: Tensor, test: list[Tensor], classes: int) -> Tensor:
+    """Log-probabilities (N, classes) of scikit-learn's LDA with shrinkage on pictures of half the height and width.
+
+    The pictures of all maps of a clip together are its features.
+    """
     try:
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     except ImportError as error:
         raise TensorsimError(
             f"LDA: scikit-learn does not import ({error}); install tensorsim[train]"
         ) from error
-    features = [torch.nn.functional.avg_pool2d(x, 2).flatten(1).double().numpy() for x in (train, test)]
+    halved = [
+        [torch.nn.functional.avg_pool2d(x, 2).flatten(1) for x in pictures] for pictures in (train, test)
+    ]
+    features = [torch.cat(parts, 1).double().numpy() for parts in halved]
     model = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features[0], labels.numpy())
-    logits = torch.full((len(test), classes), -100.0)
+    logits = torch.full((len(test[0]), classes), -100.0)
     logits[:, torch.as_tensor(model.classes_)] = torch.from_numpy(
         model.predict_log_proba(features[1]).clip(min=-100.0)
     ).float()
@@ -73,6 +79,7 @@ class Experiment:
         self.clips, self.steps, self.seed, self.quiet = clips, steps, seed, quiet
         self.train, self.train_labels = measured.load(train)
         self.test, self.test_labels = measured.load(test)
+        self.train_beside, self.test_beside = measured.load_beside(train), measured.load_beside(test)
 
     def quick(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips by the shipped weights."""
@@ -88,15 +95,13 @@ class Experiment:
             net, path, {"trained_on": "simulation alone", "classes": ",".join(self.measured.classes)}
         )
         chosen = few(self.train_labels, SHOTS)
-        shots = self.train[chosen], self.train_labels[chosen]
-        nets = {
-            "simulation_only": net,
-            "ten_shot": self._joined(net, simulated, labels, *shots, self.steps // 2),
-            "ten_shot_alone": self._fit(self._new(), *shots, self.steps // 2),
-            "all": self._joined(net, simulated, labels, self.train, self.train_labels, self.steps),
-        }
-        logits = {name: predict(trained, self.test) for name, trained in nets.items()}
-        logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
+        everything = torch.arange(len(self.train_labels))
+        logits = {"simulation_only": predict(net, self.test)}
+        logits["ten_shot"] = self._measured_logits(net, chosen, self.steps // 2)
+        logits["ten_shot_alone"] = self._measured_logits(None, chosen, self.steps // 2)
+        logits["all"] = self._measured_logits(net, everything, 3 * self.steps // 2)
+        maps = [[x for x in pair if x is not None] for pair in self._maps()]
+        logits["lda"] = lda_logits(maps[0], self.train_labels, maps[1], len(self.measured.classes))
         return logits
 
     def ablation(self) -> dict[str, Tensor]:
@@ -115,21 +120,29 @@ class Experiment:
         fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=self.seed)
         return net
 
-    def _joined(
-        self,
-        net: PictureNet,
-        simulated: Tensor,
-        labels: Tensor,
-        shown: Tensor,
-        shown_labels: Tensor,
-        steps: int,
-    ) -> PictureNet:
-        """A copy that went on with simulated and measured clips, three of four measured."""
-        weights = torch.ones(len(labels) + len(shown_labels))
-        weights[len(labels) :] = 3 * len(labels) / len(shown_labels)
-        net = copy.deepcopy(net)
+    def _maps(self) -> tuple[tuple[Tensor, Tensor | None], tuple[Tensor, Tensor | None]]:
+        """Pictures of both maps, of train and of test."""
+        return (self.train, self.train_beside), (self.test, self.test_beside)
+
+    def _measured_logits(self, net: PictureNet | None, chosen: Tensor, steps: int) -> Tensor:
+        """Log-probabilities (N, classes) of the test clips by networks that learned from chosen clips of train.
+
+        A copy of ``net`` goes on at a third of the learning rate; None begins anew. Where the clips have another map,
+        a second network learns that alone, and the log-probabilities of both are added.
+        """
+        labels = self.train_labels[chosen]
+        learner = self._new() if net is None else copy.deepcopy(net)
         fit_pictures(
-            net, torch.cat([simulated, shown]), torch.cat([labels, shown_labels]), steps=steps,
-            augment=self.measured.augment, learning_rate=2e-3, weights=weights, seed=self.seed,
+            learner, self.train[chosen], labels, steps=steps, augment=self.measured.augment_measured,
+            learning_rate=3e-3 if net is None else 1e-3, seed=self.seed,
         )  # fmt: skip
-        return net
+        logits = predict(learner, self.test).log_softmax(-1)
+        beside = self.measured.beside
+        if beside is not None and self.train_beside is not None and self.test_beside is not None:
+            torch.manual_seed(self.seed)
+            second = PictureNet(len(self.measured.classes), self.train_beside.shape[-2])
+            fit_pictures(
+                second, self.train_beside[chosen], labels, steps=steps, augment=beside.augment, seed=self.seed
+            )
+            logits = logits + predict(second, self.test_beside).log_softmax(-1)
+        return logits

@@ -29,6 +29,13 @@ class AngleMaps(NamedTuple):
     azimuth_time: Tensor
 
 
+def virtual_elements(radar: RadarConfig) -> Tensor:
+    """Places ``p + q`` (V, 3) in metres, float64, of the channels ``v = k A + a`` of an array."""
+    tx = torch.tensor(radar.tx_positions_m, dtype=torch.float64)
+    rx = torch.tensor(radar.rx_positions_m, dtype=torch.float64)
+    return (tx[:, None] + rx).flatten(0, 1)
+
+
 def steering_vectors(
     channels_m: Tensor, azimuth_rad: Tensor, elevation_rad: float, wavelength_m: float
 ) -> Tensor:
@@ -110,9 +117,7 @@ class AngleMapper(nn.Module):
             raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
         if not math.isfinite(elevation_rad):
             raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
-        tx = torch.tensor(radar.tx_positions_m, dtype=torch.float64)
-        rx = torch.tensor(radar.rx_positions_m, dtype=torch.float64)
-        channels = (tx[:, None] + rx).flatten(0, 1)
+        channels = virtual_elements(radar)
         cycles = steering_vectors(channels, azimuth, elevation_rad, radar.doppler_wavelength_m)
         self.register_buffer("cycles", cycles - cycles.round(), persistent=False)
         self.register_buffer("azimuth_rad", azimuth, persistent=False)

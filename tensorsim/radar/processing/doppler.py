@@ -16,14 +16,16 @@ from tensorsim.radar.processing.range_profile import gate_bins
 
 
 def doppler_time_map(profiles: Tensor, window: Tensor, hop: int, fft_length: int) -> Tensor:
-    """Doppler-time map ``sqrt(sum over range bins of |STFT of that bin|^2)``.
+    r"""Doppler-time map: short-time Fourier transform of each range bin, summed over range in power.
+
+    $$ D[f, k] = \sqrt{\sum_r \left| \sum_{m=0}^{L-1} w[m] \, x_r^*[m + k h] \, e^{-j 2 \pi f m / F} \right|^2} $$
 
     Profiles are conjugated, so that positive Doppler is approaching. Frames lie wholly inside the signal.
 
     Args:
         profiles: (..., M, R) complex, M pulses of R range bins.
         window: (L,) real, over the pulses of a frame, L <= M.
-        hop: pulses from frame to frame.
+        hop: $h$, pulses from frame to frame.
         fft_length: F >= L, length of the zero-padded transform.
 
     Returns:
@@ -183,6 +185,7 @@ class DopplerTimeMap(DopplerFrames):
             )
         self.integration = integration
         self.samples = radar.samples_per_chirp
+        self.gated = gate_m is not None
         self.first_bin, self.last_bin = 0, self.samples - 1
         if gate_m is not None:
             self.first_bin, self.last_bin = gate_bins(gate_m, radar.range_resolution_m, self.samples)
@@ -195,7 +198,9 @@ class DopplerTimeMap(DopplerFrames):
                 f"profiles: got shape {list(profiles.shape)}, expected more than the {self.first_bin} range bins "
                 f"before the gate"
             )
-        series = self.series(profiles[..., self.first_bin : self.last_bin + 1])  # (B, R, M)
+        if self.gated:
+            profiles = profiles[..., self.first_bin : self.last_bin + 1]
+        series = self.series(profiles)  # (B, R, M)
         if self.integration == "paper":
             series = series.abs().sum(1, keepdim=True)
         elif self.integration == "coherent":

@@ -17,9 +17,9 @@ METHODS = ("two-pulse", "n-pulse", "mean", "high-pass")
 
 
 def two_pulse_canceller(profiles: Tensor) -> Tensor:
-    """Two-pulse canceller ``y[m] = x[m + 1] - x[m]``: (..., M, R) -> (..., M - 1, R).
+    r"""Two-pulse canceller: (..., M, R) -> (..., M - 1, R).
 
-    Its response to a Doppler frequency fd is ``|2 sin(pi fd / PRF)|``.
+    $$ y[m] = x[m + 1] - x[m], \quad |H(f_d)| = |2 \sin(\pi f_d / \mathrm{PRF})| $$
     """
     return profiles[..., 1:, :] - profiles[..., :-1, :]
 

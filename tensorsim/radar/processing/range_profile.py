@@ -19,14 +19,16 @@ _WINDOWS = {
 
 
 def range_profile(intermediate: Tensor, window: Tensor) -> Tensor:
-    """Pulse compression: the first N // 2 bins of ``FFT(IF * window)`` over fast time, not normalised.
+    r"""Pulse compression: the first N // 2 bins of the Fourier transform over fast time, not normalised.
+
+    $$ X_m[k] = \sum_{n=0}^{N-1} w[n] \, \mathrm{IF}_m[n] \, e^{-j 2 \pi k n / N} $$
 
     Args:
         intermediate: (..., M, N) complex IF samples of M pulses.
         window: (N,) real.
 
     Returns:
-        (..., M, N // 2) complex; bin k is at range ``k c / (2 B)``.
+        (..., M, N // 2) complex; bin $k$ is at range $k c / (2 B)$.
     """
     return torch.fft.fft(intermediate * window)[..., : intermediate.shape[-1] // 2]
 

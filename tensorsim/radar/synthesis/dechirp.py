@@ -15,22 +15,23 @@ from tensorsim.radar.synthesis.paths import Paths, Resonance
 def intermediate_frequency(
     delay_s: Tensor, amplitude: Tensor, carrier_hz: float, slope_hz_per_s: float, time_s: Tensor
 ) -> Tensor:
-    """Dechirp: the transmitted chirp times the conjugate of the received sum of its delayed copies.
+    r"""Dechirp: the transmitted chirp times the conjugate of the received sum of its delayed copies.
 
-    With the instantaneous frequency ``f(t) = fc + mu t``::
+    With the instantaneous frequency $f(t) = f_c + \mu t$, and delays $\tau_p$ and amplitudes $a_p$ of the paths:
 
-        IF(t) = sum over paths of conj(a) exp(+j 2 pi (fc tau + mu tau t - mu tau^2 / 2))
+    $$ \mathrm{IF}(t) = \sum_p a_p^* \exp\left(+j 2 \pi \left(f_c \tau_p + \mu \tau_p t - \frac{\mu \tau_p^2}{2}
+    \right)\right) $$
 
-    so the beat frequency ``mu tau`` is positive and the phase of an approaching target decreases. See Jankiraman,
-    *FMCW Radar Design*, ch. 2; sign and ``mu tau^2 / 2`` follow from the mixing product. This evaluates every
+    so the beat frequency $\mu \tau$ is positive and the phase of an approaching target decreases. See Jankiraman,
+    *FMCW Radar Design*, ch. 2; sign and $\mu \tau^2 / 2$ follow from the mixing product. This evaluates every
     exponential, in float64; :class:`~tensorsim.radar.EchoSynthesizer` computes the same sum faster.
 
     Args:
-        delay_s: (..., P) tau of P paths, seconds.
-        amplitude: (..., P) a of the received wave, real or complex; a phase of a wall or a floor is part of it.
-        carrier_hz: fc, the frequency at the start of the sweep.
-        slope_hz_per_s: mu, bandwidth over chirp duration.
-        time_s: (N,) t, seconds after the start of the chirp.
+        delay_s: (..., P) $\tau$ of P paths, seconds.
+        amplitude: (..., P) $a$ of the received wave, real or complex; a phase of a wall or a floor is part of it.
+        carrier_hz: $f_c$, the frequency at the start of the sweep.
+        slope_hz_per_s: $\mu$, bandwidth over chirp duration.
+        time_s: (N,) $t$, seconds after the start of the chirp.
 
     Returns:
         (..., N) complex128. Differentiable.

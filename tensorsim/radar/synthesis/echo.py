@@ -57,6 +57,7 @@ class EchoSynthesizer(nn.Module):
         paths: names of the path groups to include, of ``tensorsim.radar.synthesis.paths.PATH_NAMES``; replaces
             ``direct``, ``multipath``, ``leakage``, ``wall_echo`` and ``floor``.
         learnable: which of ``tensorsim.radar.synthesis.paths.LEARNABLE`` are parameters of ``.paths``, by that name.
+        wall_attenuation: False lets echoes through the wall keep their power and their delay.
 
     Shapes:
         positions (..., M, S, 3) metres in the world frame, rcs (..., S) m^2 per clip, (..., M, S) per pulse
@@ -97,6 +98,7 @@ class EchoSynthesizer(nn.Module):
         antenna: nn.Module | None = None,
         paths: tuple[str, ...] | None = None,
         learnable: tuple[str, ...] = (),
+        wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
         if pulse_chunk < 1:
@@ -104,8 +106,9 @@ class EchoSynthesizer(nn.Module):
         names = chosen_paths(multipath, leakage, wall_echo, direct, floor is not None, paths)
         wall = place_wall(wall, radar)
         self.paths = PropagationPaths(
-            radar, wall, names, wall_paths, incidence, polarization, bounces, floor, antenna, learnable
-        )
+            radar, wall, names, wall_paths, incidence, polarization, bounces, floor, antenna, learnable,
+            wall_attenuation,
+        )  # fmt: skip
         self.carrier_hz = float(radar.carrier_hz)
         self.slope_hz_per_s = float(radar.slope_hz_per_s)
         self.sample_rate_hz = float(radar.sample_rate_hz)
@@ -168,7 +171,8 @@ class EchoSynthesizer(nn.Module):
         """(..., M, S, 3) metres and (..., S) or (..., M, S) m^2 to IF (..., M, N) or (..., V, M, N)."""
         rcs = check_scene(positions, rcs).flatten(0, -2)
         pulses = positions.flatten(0, -3)
-        step = self._step(positions)
+        step = self.displacements(positions)
+        step = None if step is None else step.flatten(0, -3)
         static = self.static_echo()
         echo = static.new_empty(list(static.shape[:-2]) + [pulses.shape[0], self.samples])  # noqa: RUF005 (TorchScript)
         chunks: list[Tensor] = []
@@ -185,15 +189,25 @@ class EchoSynthesizer(nn.Module):
         echo = echo.unflatten(-2, list(positions.shape[:-2]))
         return echo.movedim(0, -3) if self.paths.has_array else echo
 
-    def _step(self, positions: Tensor) -> Tensor | None:
-        """Displacement until the next pulse, (pulses of all clips, S, 3); None for one transmitter."""
+    @torch.jit.export
+    def displacements(self, positions: Tensor) -> Tensor | None:
+        """Way of the scatterers until the next pulse, (..., M, S, 3) like ``positions``; None for one transmitter.
+
+        That of the last pulse is as long as the one before.
+        """
         if self.paths.transmitters == 1:
             return None
         positions = positions.double()
         if positions.shape[-3] == 1:
-            return torch.zeros_like(positions).flatten(0, -3)
+            return torch.zeros_like(positions)
         step = positions.diff(dim=-3)
-        return torch.cat((step, step[..., -1:, :, :]), -3).flatten(0, -3)
+        return torch.cat((step, step[..., -1:, :, :]), -3)
+
+    @torch.jit.export
+    def pulse_times(self, start: int, count: int) -> Tensor:
+        """Times (count,) in seconds, float64, of pulses ``start`` onwards."""
+        pulse = torch.arange(count, dtype=torch.float64, device=self.fine.device)
+        return (start + pulse) / self.prf_hz
 
     @torch.jit.export
     def contributions(self, positions: Tensor, rcs: Tensor, groups: Tensor) -> Tensor:
@@ -220,9 +234,7 @@ class EchoSynthesizer(nn.Module):
             )
         if bool((groups < 0).any()):
             raise TensorsimError(f"groups: got {int(groups.min())}, expected numbers from 0")
-        step = self._step(positions)
-        if step is not None:
-            step = step.reshape(positions.shape)
+        step = self.displacements(positions)
         paths = self.paths(positions.double(), rcs.double(), step)
         resonance = self.paths.resonance(positions.double(), step) if self.paths.airy else None
         parts: list[Tensor] = []
@@ -247,9 +259,7 @@ class EchoSynthesizer(nn.Module):
     def side_channels(self, positions: Tensor, rcs: Tensor) -> SideChannels:
         """Range, radial speed and amplitude of each path over each scatterer; arguments as in forward."""
         rcs = check_scene(positions, rcs)
-        step = self._step(positions)
-        if step is not None:
-            step = step.reshape(positions.shape)
+        step = self.displacements(positions)
         paths = self.paths(positions.double(), rcs.double(), step)
         length = paths.delay_s * (self.paths.speed_m_s / 2)
         speed = torch.zeros_like(length)

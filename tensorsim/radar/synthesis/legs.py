@@ -66,13 +66,15 @@ def mirror_image(position: Tensor, face_y: float) -> Tensor:
 def mirror_delays(
     positions: Tensor, tx_m: Tensor, rx_m: Tensor, face_y: float, speed_m_s: float = SPEED_OF_LIGHT_M_S
 ) -> Tensor:
-    """Mirror method: delays (..., 3) of the echoes of a target in front of a wall that the wall reflects.
+    r"""Mirror method: delays (..., 3) of the echoes of a target in front of a wall that the wall reflects.
 
-    With the images Tx' and Rx' of the antennas in the wall face (see :func:`mirror_image`)::
+    With the images $T'$ and $R'$ of the antennas $T$ and $R$ in the wall face (see :func:`mirror_image`):
 
-        tau_a = (|P - Tx'| + |P - Rx|) / c     reflected on the way to the target; amplitude times G
-        tau_b = (|P - Tx| + |P - Rx'|) / c     reflected on the way back;          amplitude times G
-        tau_c = (|P - Tx'| + |P - Rx'|) / c    reflected on both;                  amplitude times G^2
+    $$ \tau_a = \frac{|P - T'| + |P - R|}{c}, \quad \tau_b = \frac{|P - T| + |P - R'|}{c}, \quad
+    \tau_c = \frac{|P - T'| + |P - R'|}{c} $$
+
+    Path a is reflected on the way to the target, b on the way back, c on both. The amplitudes of a and b have the
+    factor $\Gamma$ of the wall face, that of c has $\Gamma^2$.
 
     Args:
         positions: (..., 3) metres, in front of the face.
@@ -129,6 +131,7 @@ class TracedLegs(nn.Module):
     thickness_m: Tensor
     orders: int
     paper: bool
+    attenuates: bool
     with_bounces: bool
     with_images: bool
     with_floor: bool
@@ -182,7 +185,12 @@ class TracedLegs(nn.Module):
         return Slab(slab.reflection, slab.loss_neper, (length - straight) / self.speed_m_s, slab.bounce_s)
 
     def _transmission(self, slab: Slab, bounces: int) -> Tensor:
-        """Transmission of one leg with this number of internal bounce pairs."""
+        """Transmission of one leg with this number of internal bounce pairs; relative to none if nothing is lost."""
+        if self.attenuates:
+            return self._slab_transmission(slab, bounces)
+        return self._slab_transmission(slab, bounces) / self._slab_transmission(slab, 0)
+
+    def _slab_transmission(self, slab: Slab, bounces: int) -> Tensor:
         if self.paper:
             return paper_transmission(slab, bounces, self.carrier_hz)
         return transmission(slab, bounces)

@@ -74,20 +74,24 @@ class ProfileNoise(nn.Module):
 
 
 class ReceiverNoise(nn.Module):
-    """Adds complex white Gaussian noise to IF samples.
+    r"""Adds complex white Gaussian noise to IF samples.
+
+    Its power per sample is that of the reference, averaged over the clip, over the signal-to-noise ratio:
+
+    $$ P_n = P_s \, 10^{-\mathrm{SNR} / 10} $$
 
     The noise is drawn from PyTorch's global generator; ``torch.manual_seed`` makes it reproducible.
 
     Args:
         snr_db: signal-to-noise ratio per IF sample, both powers averaged over the clip; None adds no noise.
         reference: the signal of the ratio: ``"echo"``, the echo of the targets; ``"total"``, the whole IF,
-            including leakage and wall echo. ``"absolute"`` sets the noise power to ``k T0 B F / Pt`` (IF
+            including leakage and wall echo. ``"absolute"`` sets the noise power to $k T_0 B F / P_t$ (IF
             samples are for transmit power 1) and ignores ``snr_db``.
         empty_power: signal power assumed for a clip whose signal is exactly zero, so that an empty scene has a
             noise floor.
-        bandwidth_hz: B for ``"absolute"``: the sample rate of the complex IF.
-        noise_figure_db: F for ``"absolute"``.
-        transmit_power_w: Pt for ``"absolute"``.
+        bandwidth_hz: $B$ for ``"absolute"``: the sample rate of the complex IF.
+        noise_figure_db: $F$ for ``"absolute"``.
+        transmit_power_w: $P_t$ for ``"absolute"``.
 
     Shapes: IF (..., M, N) complex, optionally the target echo in it, of the same shape -> IF with noise.
         Without the target echo the whole IF is the reference. One noise power per clip. Differentiable: the noise

@@ -64,16 +64,17 @@ def radar_equation_amplitude(
     tx_gain: float = 1.0,
     rx_gain: float = 1.0,
 ) -> Tensor:
-    """Bistatic radar equation: amplitude of the echo of a scatterer for unit transmit power.
+    r"""Bistatic radar equation: amplitude of the echo of a scatterer for unit transmit power.
 
-    ``a = sqrt(Gt Gr lambda^2 sigma / ((4 pi)^3 R1^2 R2^2))`` (Richards, *Fundamentals of Radar Signal Processing*,
-    ch. 2).
+    $$ a = \sqrt{\frac{G_t G_r \lambda^2 \sigma}{(4 \pi)^3 R_1^2 R_2^2}} $$
+
+    (Richards, *Fundamentals of Radar Signal Processing*, ch. 2).
 
     Args:
-        rcs_m2: (...) radar cross section sigma.
-        tx_range_m, rx_range_m: (...) lengths R1 and R2 of the two legs of the path.
-        wavelength_m: lambda, ``c / fc``.
-        tx_gain, rx_gain: Gt and Gr, linear power gains.
+        rcs_m2: (...) radar cross section $\sigma$.
+        tx_range_m, rx_range_m: (...) lengths $R_1$ and $R_2$ of the two legs of the path.
+        wavelength_m: $\lambda = c / f_c$.
+        tx_gain, rx_gain: $G_t$ and $G_r$, linear power gains.
 
     Returns:
         (...) real. Differentiable; the gradient by an RCS of 0 is 0.
@@ -150,6 +151,8 @@ class PropagationPaths(TracedLegs):
         antenna: pattern of all antennas (see :mod:`~tensorsim.radar.synthesis.antenna`); None is isotropic.
         learnable: which of ``LEARNABLE`` are parameters; the others are buffers. The position of the near face
             does not depend on the thickness.
+        wall_attenuation: False is the ablation "without wall attenuation": a leg through the wall keeps its delay and
+            loses nothing, and bounces in the wall keep their ratio to it. Reflections by the wall are not changed.
 
     Shapes: positions (..., S, 3) metres, rcs (..., S) m^2 -> :class:`Paths` of (..., S, P). All float64.
     Several antennas: (..., M, S, 3), (..., M, S) -> (..., V, M, S, P), channel ``v = k A + a`` for transmitter
@@ -188,6 +191,7 @@ class PropagationPaths(TracedLegs):
         floor: FloorConfig | None = None,
         antenna: nn.Module | None = None,
         learnable: tuple[str, ...] = (),
+        wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
         for option, value, known in (
@@ -205,6 +209,7 @@ class PropagationPaths(TracedLegs):
             raise TensorsimError(f"bounces: got {bounces}, expected at least 1")
         self._shape_legs(radar, wall, incidence, polarization, floor, antenna)
         self.paper = wall_paths == "paper"
+        self.attenuates = wall_attenuation
         self.peak_gain = 10 ** (radar.antenna_gain_dbi / 10)
         self.wavelength_m = radar.wavelength_m
         self.scale = self.peak_gain * radar.wavelength_m / (4 * math.pi) ** 1.5

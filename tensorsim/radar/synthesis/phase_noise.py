@@ -11,6 +11,10 @@ from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_complex_map, check_size
 from tensorsim.radar.synthesis.counter_noise import normal
 
+#: Single-sideband phase noise of integrated oscillators at 77 GHz (typical): offsets from the carrier, L there.
+OFFSETS_HZ = (1e4, 1e5, 1e6, 1e7)
+LEVELS_DBC_HZ = (-68.0, -80.0, -93.0, -113.0)
+
 
 def interpolated_level(frequency_hz: Tensor, offsets_hz: Tensor, level_dbc_hz: Tensor) -> Tensor:
     """Single-sideband phase noise L(f) in dBc/Hz at (...), linear in dB over log f between the offsets (P,)."""
@@ -55,8 +59,8 @@ class PhaseNoise(nn.Module):
     def __init__(
         self,
         radar: RadarConfig,
-        offsets_hz: Sequence[float] = (1e4, 1e5, 1e6, 1e7),
-        level_dbc_hz: Sequence[float] = (-68.0, -80.0, -93.0, -113.0),
+        offsets_hz: Sequence[float] = OFFSETS_HZ,
+        level_dbc_hz: Sequence[float] = LEVELS_DBC_HZ,
         seed: int = 0,
     ) -> None:
         super().__init__()

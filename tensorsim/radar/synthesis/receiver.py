@@ -95,11 +95,33 @@ class RealReceiver(nn.Module):
         return torch.complex(in_phase, torch.zeros_like(in_phase))
 
 
+def quantise(intermediate: Tensor, full_scale: Tensor, bits: int) -> Tensor:
+    """Mid-rise quantisation and clipping of I and Q.
+
+    Levels are odd multiples of half a step, ``step = 2 full_scale / 2^bits``.
+
+    Args:
+        intermediate: (..., M, N) complex.
+        full_scale: (...) largest value of I or Q; where it is 0, all becomes 0.
+        bits: of each channel.
+
+    Returns:
+        (..., M, N) complex. The gradient is that of clipping: steps have none.
+    """
+    parts = torch.view_as_real(intermediate.resolve_conj())
+    step = (2 * full_scale / 2**bits).to(parts.dtype)[..., None, None, None]
+    highest = step * (2 ** (bits - 1) - 0.5)
+    parts = torch.minimum(torch.maximum(parts, -highest), highest)
+    levels = (torch.floor(parts / torch.where(step > 0, step, 1.0)) + 0.5) * step
+    rounding = torch.minimum(torch.maximum(levels, -highest), highest) - parts
+    return torch.view_as_complex(parts + rounding.detach())
+
+
 class Converter(nn.Module):
     """Quantises I and Q to a number of bits and clips them (an analogue-to-digital converter for each).
 
-    Levels are odd multiples of half a step (mid-rise), ``step = 2 full_scale / 2^bits``. Noise of a signal that covers
-    many steps is ``step^2 / 12`` per channel; a tone of full scale has 6.02 bits + 1.76 dB.
+    See :func:`quantise`. Noise of a signal that covers many steps is ``step^2 / 12`` per channel; a tone of full scale
+    has 6.02 bits + 1.76 dB.
 
     Args:
         bits: 1 to 24.
@@ -117,13 +139,12 @@ class Converter(nn.Module):
         if not 1 <= bits <= 24:
             raise TensorsimError(f"bits: got {bits}, expected 1 to 24")
         check_positive(full_scale, "full_scale")
-        self.step = 2 * full_scale / 2**bits
-        self.highest = full_scale - self.step / 2
+        self.bits, self.full_scale = bits, float(full_scale)
 
     def forward(self, intermediate: Tensor) -> Tensor:
         """IF to IF on the converter's levels."""
         check_complex_map(intermediate, "IF", "(..., pulses, samples)")
-        parts = torch.view_as_real(intermediate.resolve_conj()).clamp(-self.highest, self.highest)
-        levels = (torch.floor(parts / self.step) + 0.5) * self.step
-        rounding = levels.clamp(-self.highest, self.highest) - parts
-        return torch.view_as_complex(parts + rounding.detach())
+        full_scale = torch.full(
+            intermediate.shape[:-2], self.full_scale, dtype=torch.float64, device=intermediate.device
+        )
+        return quantise(intermediate, full_scale, self.bits)

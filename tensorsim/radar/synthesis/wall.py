@@ -65,11 +65,14 @@ def refractive_index(relative_permittivity: Tensor, loss_tangent: Tensor) -> tup
 def fresnel(
     relative_permittivity: Tensor, loss_tangent: Tensor, cos_incidence: Tensor, polarization: str
 ) -> Tensor:
-    """Reflection coefficient of an interface from air, complex (...).
+    r"""Reflection coefficient of an interface from air, complex (...).
 
-    ``"te"``: field normal to the plane of incidence, ``(cos i - n cos t) / (cos i + n cos t)``; ``"tm"``: in
-    that plane, ``(cos t - n cos i) / (cos t + n cos i)``. Signs are those of the electric field, so that both
-    are ``(1 - n) / (1 + n)`` at normal incidence.
+    ``"te"``, with the field normal to the plane of incidence, and ``"tm"``, with the field in that plane:
+
+    $$ \Gamma_{TE} = \frac{\cos i - n \cos t}{\cos i + n \cos t}, \quad
+    \Gamma_{TM} = \frac{\cos t - n \cos i}{\cos t + n \cos i} $$
+
+    Signs are those of the electric field, so that both are $(1 - n) / (1 + n)$ at normal incidence.
     """
     real, imaginary = refractive_index(relative_permittivity, loss_tangent)
     n = torch.complex(real, -imaginary)
@@ -88,10 +91,12 @@ def slab_coefficients(
     polarization: str = "te",
     speed_m_s: float = SPEED_OF_LIGHT_M_S,
 ) -> Slab:
-    """Coefficients of a slab for a plane wave.
+    r"""Coefficients of a slab for a plane wave.
 
-    The ray is refracted by ``n'``; the loss follows from the imaginary part of ``n cos t``. At normal incidence
-    ``alpha = (2 pi f / c) n''``.
+    The ray is refracted by the real part of $n = \sqrt{\varepsilon_r (1 - j \tan \delta)} = n' - j n''$; the loss
+    follows from the imaginary part of $n \cos t$. At normal incidence
+
+    $$ \alpha = \frac{2 \pi f}{c} n'' $$
 
     Args:
         relative_permittivity, loss_tangent, thickness_m: () or (...), see :func:`wall_tensors`.
@@ -126,7 +131,9 @@ def transmission(slab: Slab, bounces: int) -> Tensor:
 
 
 def paper_transmission(slab: Slab, bounces: int, frequency_hz: float) -> Tensor:
-    """:func:`transmission` as the paper prints it: ``T_k exp(-j (2k + 1) beta d)``, ``beta = (2 pi f / c) n' cos t``.
+    r""":func:`transmission` as the paper prints it.
+
+    $$ T_k e^{-j (2 k + 1) \beta d}, \quad \beta = \frac{2 \pi f}{c} n' \cos t $$
 
     The propagation phase of the wall is then counted twice, here and in the delay.
     """
@@ -135,7 +142,9 @@ def paper_transmission(slab: Slab, bounces: int, frequency_hz: float) -> Tensor:
 
 
 def two_way_wall_transmission(slab: Slab) -> WallTerms:
-    """Two-way transmission ``(T0 + T1)^2`` of a wall, term by term: without, with one and with two bounce pairs.
+    """Two-way transmission of a wall, term by term: without, with one and with two pairs of bounces.
+
+    $$ (T_0 + T_1)^2 = T_0^2 + 2 T_0 T_1 + T_1^2 $$
 
     Both legs of the path pass the wall; :func:`transmission` is one of them. Each leg is late by ``excess_s``,
     and each pair of internal bounces adds ``bounce_s``::

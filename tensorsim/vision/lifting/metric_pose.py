@@ -25,7 +25,7 @@ PANEL_DISTANCES_M = (4.00, 0.50)
 
 
 def metres_per_pixel(height_m: Tensor, height_px: Tensor) -> Tensor:
-    """Scale of a body in the image, ``alpha = H / h``: standing height (m) over height in pixels."""
+    r"""Scale of a body in the image, $\alpha = H / h$: standing height (m) over height in pixels."""
     return height_m / height_px
 
 
@@ -41,9 +41,9 @@ def camera_range(focal_px: Tensor, height_m: Tensor, height_px: Tensor) -> Tenso
 
 
 def accumulated_displacement(u: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
-    """The paper's position: displacement of every frame times the scale of that frame, accumulated.
+    r"""The paper's position: displacement of every frame times the scale of that frame, accumulated.
 
-        x(0) = 0,   x(t) = x(t - 1) + alpha(t) (u(t) - u(t - 1))
+    $$ x(0) = 0, \quad x(t) = x(t - 1) + \alpha(t) (u(t) - u(t - 1)) $$
 
     Args:
         u: (..., T) pixels.

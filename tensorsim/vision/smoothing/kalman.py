@@ -48,7 +48,9 @@ class KalmanState(NamedTuple):
 
 
 def constant_velocity_predict(state: KalmanState, process_noise: Tensor, dt: float) -> KalmanState:
-    """The state one frame later: ``x = F x``, ``P = F P F' + Q``.
+    r"""The state one frame later.
+
+    $$ x \leftarrow F x, \quad P \leftarrow F P F^T + Q $$
 
     Args:
         state: filtered estimates of the frame before.
@@ -69,7 +71,9 @@ def constant_velocity_predict(state: KalmanState, process_noise: Tensor, dt: flo
 def kalman_update(
     state: KalmanState, measured: Tensor, measurement_noise: Tensor, valid: Tensor
 ) -> KalmanState:
-    """The state after a measurement: gain ``K = P H' / (P00 + r)``, ``x = x + K (z - H x)``, ``P = (1 - K H) P``.
+    r"""The state after a measurement, with the gain K.
+
+    $$ K = \frac{P H^T}{H P H^T + r}, \quad x \leftarrow x + K (z - H x), \quad P \leftarrow (1 - K H) P $$
 
     Args:
         state: predicted estimates.

@@ -340,3 +340,27 @@ def test_a_uniform_array_is_a_fourier_transform():
 def test_bad_arguments(make, message):
     with pytest.raises(TensorsimError, match=message):
         make()
+
+
+def test_the_wall_echo_leaves_and_arrives_at_its_own_angles():
+    """Antennas of unequal height before a wall: each pattern counts at the angle of its own leg of the mirror path."""
+    tx, rx, face = (0.0, 0.0, 1.0), (0.5, 0.0, 3.0), 2.0
+    radar = replace(SMALL, tx_m=tx, rx_m=rx)
+    azimuth, elevation = (torch.linspace(-1.5, 1.5, 61, dtype=torch.float64) for _ in range(2))
+
+    def gain_db(azimuth, elevation):
+        return -20 * (azimuth - 0.3) ** 2 - 30 * (elevation - 0.2) ** 2
+
+    pattern = TabulatedAntenna(azimuth, elevation, gain_db(azimuth[None], elevation[:, None]))
+    wall = WallConfig((0.0, face + 0.12, 1.5))
+    bare, seen = (
+        EchoSynthesizer(radar, wall, wall_echo=True, direct=False, antenna=antenna).paths.static().gain.abs()
+        for antenna in (None, pattern)
+    )
+    # The specular point is halfway between the antennas.
+    point = np.array([0.25, face, 2.0])
+    decibels = 0.0
+    for place in (tx, rx):
+        x, y, z = point - np.array(place)
+        decibels += gain_db(np.arctan2(x, y), np.arctan2(z, np.hypot(x, y)))
+    assert float(20 * torch.log10(seen / bare)) == pytest.approx(decibels, abs=0.1)

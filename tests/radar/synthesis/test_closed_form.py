@@ -124,6 +124,29 @@ def test_whole_half_and_aliased_bins(beat):
         assert reference.relative(gradients[0], gradients[1]) < 1e-9
 
 
+@pytest.mark.parametrize(("window", "near_bins", "error"), [("hamming", 8, 0.0128), ("hann", 8, 0.00057)])
+def test_truncation_is_the_energy_beyond_the_near_bins(window, near_bins, error):
+    """By NumPy: a tone at a fraction of a bin, its windowed spectrum, and what lies beyond the bins nearest to it."""
+    n = np.arange(FREE.samples_per_chirp)
+    taper = {"hamming": np.hamming, "hann": np.hanning}[window](len(n))
+    beyond, whole = 0.0, 0.0
+    for fraction in (np.arange(32) + 0.5) / 32 - 0.5:
+        power = np.abs(np.fft.fft(taper * np.exp(2j * np.pi * (100 + fraction) * n / len(n)))) ** 2
+        whole += power.sum()
+        beyond += power.sum() - power[100 - near_bins : 100 + near_bins + 1].sum()
+    assert np.sqrt(beyond / whole) == pytest.approx(error, rel=0.05)
+    assert synthesizer(FREE, window, near_bins).truncation == pytest.approx(error, rel=0.05)
+
+
+@pytest.mark.parametrize("near_bins", [1, 5])
+def test_exactly_the_near_bins_are_computed(near_bins):
+    """As many on either side of the bin nearest to the target, and no more."""
+    target = torch.tensor([[[0.0, 40.3 * FREE.range_resolution_m, 1.5]]], dtype=torch.float64)
+    target[..., 1] = (target[..., 1] ** 2 - 0.1**2).sqrt()  # half of the antennas' distance
+    filled = torch.nonzero(synthesizer(FREE, "hamming", near_bins)(target, torch.ones(1))[0].abs() > 0)[:, 0]
+    assert filled.tolist() == list(range(40 - near_bins, 41 + near_bins))
+
+
 @pytest.mark.parametrize("window", WINDOWS)
 @pytest.mark.parametrize("near_bins", [4, 12])
 def test_truncation_is_the_stated_one(window, near_bins):

@@ -36,6 +36,29 @@ def test_in_air_leaves_the_wall_out():
     assert reference.relative(EchoSynthesizer(THROUGH, BETWEEN).double()(p, rcs), air) > 0.1
 
 
+@pytest.mark.parametrize("wall_paths", ["series", "paper"])
+def test_without_attenuation_the_delay_stays(wall_paths):
+    """The strength of free space at the delay behind the wall; bounces keep their ratio to the straight path."""
+    p, rcs = scene()
+    rcs = rcs.expand(p.shape[:-1])
+
+    def paths(wall, attenuation):
+        echo = EchoSynthesizer(
+            THROUGH, wall, wall_paths=wall_paths, wall_attenuation=attenuation, multipath=True
+        )
+        return echo.paths(p, rcs)
+
+    wall = WallConfig(center_m=(0.0, 2.0, 1.5))
+    lossy, lossless, air = paths(wall, True), paths(wall, False), paths(None, True)
+    behind = p[..., 1] > 2.12
+    assert bool(behind.any())
+    assert_same(lossless.delay_s, lossy.delay_s)
+    assert_same(lossless.gain[..., 0].abs(), air.gain[..., 0].abs(), atol=1e-12)
+    assert float((lossy.gain[..., 0] / lossless.gain[..., 0])[behind].abs().min()) < 0.9
+    ratio = lossless.gain[behind] / lossless.gain[behind][:, :1]
+    assert_same(ratio, lossy.gain[behind] / lossy.gain[behind][:, :1], atol=1e-10)
+
+
 def test_bounces_and_images_are_apart():
     p, rcs = scene()
     both = EchoSynthesizer(THROUGH, BETWEEN, multipath=True, direct=False).double()(p, rcs)

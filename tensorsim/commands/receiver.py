@@ -1,0 +1,63 @@
+"""The receiver and what else it hears as options: imperfections, the furniture of a room, another radar."""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from tensorsim.config import SimulationConfig
+
+#: The field of the configuration that an option of the receiver sets.
+RECEIVER_FIELDS = {
+    "phase_noise_dbc_hz": "scene__receiver__phase_noise_dbc_hz",
+    "iq_imbalance_db": "scene__receiver__iq_imbalance_db",
+    "dc_offset_db": "scene__receiver__dc_offset_db",
+    "real_receiver": "scene__receiver__real",
+    "adc_bits": "scene__receiver__adc_bits",
+    "adc_headroom_db": "scene__receiver__adc_headroom_db",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReceiverOptions:
+    """The receiver, the room and its other radars."""
+
+    receiver: Literal["ideal", "typical"] | None = None
+    """An ideal receiver, or one with the phase noise, 12-bit converters, I/Q imbalance and offset of an integrated
+    radar; the options below change single effects. Default: ideal."""
+    phase_noise_dbc_hz: float | None = None
+    """Phase noise of the oscillator 1 MHz from the carrier, such as -93. Default: none."""
+    iq_imbalance_db: float | None = None
+    """Gain of Q over I. Default: 0."""
+    iq_phase_deg: float | None = None
+    """Degrees by which Q is not a quarter turn from I. Default: 0."""
+    dc_offset_db: float | None = None
+    """Power of a constant offset over that of the people's echo. Default: none."""
+    real_receiver: bool | None = None
+    """One channel in place of I and Q: spectra of a radar without range are mirror-symmetric. Default: two."""
+    adc_bits: int | None = None
+    """Bits of the converters. Default: no quantisation."""
+    adc_headroom_db: float | None = None
+    """Full scale of the converters over the root mean square of what arrives at them; less saturates more. Default:
+    12."""
+    clutter: Literal["none", "room"] | None = None
+    """Furniture and walls of a room before a sensor that vibrates. Default: none."""
+    interference: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Another radar of the same band at this place in metres, with slower sweeps. Default: none."""
+
+    def with_receiver(self, config: "SimulationConfig") -> "SimulationConfig":
+        """The configuration with ``--receiver``, ``--iq-phase-deg``, ``--clutter`` and ``--interference``."""
+        from tensorsim.config import ClutterConfig, InterferenceConfig, ReceiverConfig
+
+        if self.receiver is not None:
+            chosen = ReceiverConfig.typical() if self.receiver == "typical" else ReceiverConfig()
+            config = config.replace(scene__receiver=chosen)
+        if self.iq_phase_deg is not None:
+            config = config.replace(scene__receiver__iq_phase_rad=math.radians(self.iq_phase_deg))
+        if self.clutter is not None:
+            config = config.replace(scene__clutter=ClutterConfig() if self.clutter == "room" else None)
+        if self.interference is not None:
+            config = config.replace(scene__interference=InterferenceConfig(self.interference))
+        return config

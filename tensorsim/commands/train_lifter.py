@@ -1,0 +1,70 @@
+"""``tensorsim train lifter``: train the temporal lifter on motion before random cameras."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tensorsim.commands.options import check_seed
+from tensorsim.commands.training import TrainOptions
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class TrainLifter(TrainOptions):
+    """Train the lifter; run again with the same arguments, it goes on where it stopped.
+
+    Attributes:
+        motion: motion capture files (.npz, .bvh) beside the generated motion; every second sequence is held out.
+        motions: motions of all kinds; they are made first, in OUT/motion.pt.
+        steps: optimiser steps.
+        batch: windows per step.
+        frames: of a window.
+        channels: width of the network.
+        learning_rate: largest learning rate.
+        motion_seed: of the motions.
+    """
+
+    motion: tuple[Path, ...] = ()
+    motions: int = 12_000
+    steps: int = 7000
+    batch: int = 48
+    frames: int = 64
+    channels: int = 256
+    learning_rate: float = 1.5e-3
+    motion_seed: int = 0
+
+    def run(self) -> None:
+        """Do it."""
+        import torch
+
+        from tensorsim.training.lifter import LifterRecipe
+        from tensorsim.training.lifter_motion import FRAMES, build_pool
+        from tensorsim.vision.lifting.temporal_net import TemporalNet
+
+        check_seed(self.motion_seed, "--motion-seed")
+        if self.motions < 100:
+            raise TensorsimError(f"--motions: got {self.motions}, expected at least 100")
+        if not 16 <= self.frames <= FRAMES // 4:
+            raise TensorsimError(f"--frames: got {self.frames}, expected 16 to {FRAMES // 4}")
+        if self.channels < 8:
+            raise TensorsimError(f"--channels: got {self.channels}, expected at least 8")
+        loop = self.loop(
+            steps=self.steps,
+            batch=self.batch,
+            checkpoint_every=min(200, self.steps),
+            validate_every=min(500, self.steps),
+        )
+        torch.manual_seed(self.seed)
+        net = TemporalNet(self.channels)
+        self.begin(net)
+        pool = build_pool(
+            self.out / "motion.pt", self.motions, self.motion, self.motion_seed, quiet=self.quiet
+        )
+        judged = build_pool(
+            self.out / "held_out.pt",
+            max(self.motions // 20, 48),
+            self.motion,
+            self.motion_seed + 1,
+            True,
+            self.quiet,
+        )
+        self.train(LifterRecipe(net, pool, judged, self.frames, self.learning_rate, self.seed), loop)

@@ -1,0 +1,143 @@
+"""Imperfections of the receiver, the furniture of a room, and another radar that is heard."""
+
+import math
+from dataclasses import dataclass
+
+from tensorsim.config.checks import (
+    Vector,
+    as_positions,
+    is_finite,
+    require_counts,
+    require_positive,
+    require_vector,
+)
+from tensorsim.errors import TensorsimError
+from tensorsim.limits import check_range
+
+
+@dataclass(frozen=True)
+class ReceiverConfig:
+    """What the receiver does to the signal. Every effect is off unless it is asked for.
+
+    Attributes:
+        phase_noise_dbc_hz: single-sideband phase noise of the oscillator 1 MHz from the carrier; its form over
+            frequency is that of :class:`tensorsim.radar.PhaseNoise`. None is a clean oscillator.
+        iq_imbalance_db: gain of Q over I, see :class:`tensorsim.radar.QuadratureImbalance`.
+        iq_phase_rad: angle by which Q is not a quarter turn from I.
+        dc_offset_db: power of a constant offset over the mean power of the echo that the noise refers to; None is
+            no offset.
+        real: the receiver has one channel, I alone, see :class:`tensorsim.radar.RealReceiver`.
+        adc_bits: bits of the converters of I and Q, see :class:`tensorsim.radar.Converter`; None does not quantise.
+        adc_headroom_db: full scale of the converters over the root mean square magnitude of what arrives at them,
+            over the clip; 0 dB is a wave of full scale, less saturates more.
+
+    Raises:
+        TensorsimError: numbers that are not finite, bits out of range.
+    """
+
+    phase_noise_dbc_hz: float | None = None
+    iq_imbalance_db: float = 0.0
+    iq_phase_rad: float = 0.0
+    dc_offset_db: float | None = None
+    real: bool = False
+    adc_bits: int | None = None
+    adc_headroom_db: float = 12.0
+
+    def __post_init__(self) -> None:
+        for name in (
+            "phase_noise_dbc_hz",
+            "iq_imbalance_db",
+            "iq_phase_rad",
+            "dc_offset_db",
+            "adc_headroom_db",
+        ):
+            value = getattr(self, name)
+            if value is not None and not is_finite(value):
+                raise TensorsimError(f"ReceiverConfig.{name}: got {value!r}, expected a finite number")
+        for name in ("iq_imbalance_db", "adc_headroom_db"):
+            check_range(getattr(self, name), "gain", f"ReceiverConfig.{name}")
+        for name in ("phase_noise_dbc_hz", "dc_offset_db"):
+            if getattr(self, name) is not None:
+                check_range(getattr(self, name), "ratio of powers", f"ReceiverConfig.{name}")
+        if self.adc_bits is not None:
+            require_counts(self, "adc_bits")
+            check_range(self.adc_bits, "bits of a converter", "ReceiverConfig.adc_bits")
+
+    @classmethod
+    def typical(cls) -> "ReceiverConfig":
+        """An integrated 77 GHz radar: its oscillator, converters of 12 bits, and what is left after calibration."""
+        return cls(
+            phase_noise_dbc_hz=-93.0,
+            iq_imbalance_db=0.3,
+            iq_phase_rad=math.radians(1.0),
+            dc_offset_db=0.0,
+            adc_bits=12,
+        )
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the fields that change the signal."""
+        switched = {
+            "phase_noise_dbc_hz": self.phase_noise_dbc_hz is not None,
+            "iq_imbalance_db": self.iq_imbalance_db != 0,
+            "iq_phase_rad": self.iq_phase_rad != 0,
+            "dc_offset_db": self.dc_offset_db is not None,
+            "real": self.real,
+            "adc_bits": self.adc_bits is not None,
+        }
+        return tuple(name for name, on in switched.items() if on)
+
+
+@dataclass(frozen=True)
+class ClutterConfig:
+    """The furniture and walls of a room before a sensor that vibrates, see :class:`tensorsim.radar.RoomClutter`.
+
+    Attributes:
+        reflectors: their number.
+        jitter_m: root mean square of the sensor's vibration along each axis.
+
+    Raises:
+        TensorsimError: no reflector, a jitter below 0.
+    """
+
+    reflectors: int = 12
+    jitter_m: float = 10e-6
+
+    def __post_init__(self) -> None:
+        require_counts(self, "reflectors")
+        if not (is_finite(self.jitter_m) and self.jitter_m >= 0):
+            raise TensorsimError(
+                f"ClutterConfig.jitter_m: got {self.jitter_m!r}, expected a finite number >= 0"
+            )
+
+
+@dataclass(frozen=True)
+class InterferenceConfig:
+    """Another radar of the same band that is heard, see :class:`tensorsim.radar.Interference`.
+
+    Attributes:
+        position_m: where it stands.
+        chirp_ratio: length of its sweeps over that of the own; the slopes differ, and the sweeps cross. Its sweeps
+            follow one another almost without a pause.
+        power_ratio_db: its transmit power over the own.
+        delay_s: time at which its first sweep arrives.
+
+    Raises:
+        TensorsimError: a position without three finite numbers, a ratio that is not positive.
+    """
+
+    position_m: Vector = (2.0, 6.0, 1.5)
+    chirp_ratio: float = 1.3
+    power_ratio_db: float = 0.0
+    delay_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position_m", as_positions(self.position_m))
+        require_vector("InterferenceConfig", position_m=self.position_m)
+        require_positive("InterferenceConfig", chirp_ratio=self.chirp_ratio)
+        for name in ("power_ratio_db", "delay_s"):
+            if not is_finite(getattr(self, name)):
+                raise TensorsimError(
+                    f"InterferenceConfig.{name}: got {getattr(self, name)!r}, expected a finite number"
+                )
+        check_range(self.power_ratio_db, "ratio of powers", "InterferenceConfig.power_ratio_db")

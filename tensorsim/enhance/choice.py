@@ -1,0 +1,29 @@
+"""The denoisers of radar maps by name."""
+
+from torch import nn
+
+from tensorsim.enhance.dncnn import MapDenoiser
+from tensorsim.enhance.ksvd import KSVD
+from tensorsim.enhance.perona_malik import PeronaMalik
+
+#: Names that stand for a method; any other is a name or file of DnCNN weights.
+DENOISERS = ("none", "perona-malik", "ksvd", "dncnn")
+
+
+def map_denoiser(choice: str | None) -> nn.Module | None:
+    """The denoiser of magnitude maps (..., H, W) that a name stands for, in evaluation mode.
+
+    Args:
+        choice: ``"none"`` or None; ``"perona-malik"``; ``"ksvd"``, which needs scikit-learn, takes minutes per long
+            map and does not script; ``"dncnn"``, the shipped network; or a name or file of other weights of it.
+
+    Raises:
+        TensorsimError: weights that are not there or of another network; scikit-learn missing.
+    """
+    if choice is None or choice == "none":
+        return None
+    if choice == "perona-malik":
+        return MapDenoiser(PeronaMalik()).eval()
+    if choice == "ksvd":
+        return KSVD().eval()
+    return MapDenoiser.from_pretrained(None if choice == "dncnn" else choice)

@@ -1,0 +1,130 @@
+"""The experiments by name, and how one is run and written."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tensorsim.config.documents import from_document, suggestion, to_document
+from tensorsim.config.yaml_files import read_yaml
+from tensorsim.errors import TensorsimError
+from tensorsim.experiments import ablations, networks, paper, real, video
+from tensorsim.experiments.work import Report, Work
+from tensorsim.files import complete_or_nothing
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A table of the paper.
+
+    Attributes:
+        title: heading of its report.
+        config: its settings; the defaults are the size of the paper, as far as it says.
+        run: (settings, work) -> report.
+        quick: settings that finish within three minutes.
+    """
+
+    title: str
+    config: type
+    run: Callable[[Any, Work], Report]
+    quick: Callable[[], Any]
+
+
+def _paper(config: paper.PaperConfig, work: Work) -> Report:
+    return paper.paper_report(config, work, {name: e for name, e in EXPERIMENTS.items() if name != "paper"})
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "video-ablation": Experiment(
+        "Detectors, trackers, pose networks and lifters on films of known motion",
+        video.VideoConfig,
+        video.video_report,
+        video.quick_video,
+    ),
+    "echo-ablation": Experiment(
+        "Echo without wall attenuation, without multipath",
+        ablations.EchoConfig,
+        ablations.echo_report,
+        ablations.quick_echo,
+    ),
+    "denoiser-ablation": Experiment(
+        "Denoisers of the maps",
+        ablations.DenoiserConfig,
+        ablations.denoiser_report,
+        ablations.quick_denoisers,
+    ),
+    "networks": Experiment(
+        "Recognisers in both scenes",
+        networks.NetworksConfig,
+        networks.networks_report,
+        networks.quick_networks,
+    ),
+    "snr": Experiment(
+        "Recognisers against noise", networks.NetworksConfig, networks.snr_report, networks.quick_networks
+    ),
+    "inputs": Experiment(
+        "Recognisers by input", networks.InputsConfig, networks.inputs_report, networks.quick_inputs
+    ),
+    "real": Experiment("Recognisers on measured radar", real.RealConfig, real.real_report, real.quick_real),
+    "paper": Experiment("All experiments", paper.PaperConfig, _paper, lambda: paper.PaperConfig(quick=True)),
+}
+
+
+def find_experiment(name: str) -> Experiment:
+    """The experiment of this name.
+
+    Raises:
+        TensorsimError: no such one; the message lists the known ones.
+    """
+    if name not in EXPERIMENTS:
+        known = list(EXPERIMENTS)
+        raise TensorsimError(
+            f"experiment: got {name!r}, expected one of {', '.join(known)}{suggestion(name, known)}"
+        )
+    return EXPERIMENTS[name]
+
+
+def configuration(name: str, quick: bool, file: Path | None, options: dict[str, Any]) -> Any:
+    """Settings of an experiment: the defaults or the quick ones, those of a YAML file, then single options.
+
+    Raises:
+        TensorsimError: unknown names, options that this experiment does not have, values that it refuses.
+    """
+    experiment = find_experiment(name)
+    document: dict[str, Any] = to_document(experiment.quick() if quick else experiment.config())
+    if file is not None:
+        read = read_yaml(file)
+        if read.pop("experiment", name) != name:
+            raise TensorsimError(f"{file}: got the settings of another experiment, expected those of {name}")
+        document |= read
+    known = [f"--{key.replace('_', '-')}" for key in document]
+    for option, value in options.items():
+        if option not in document:
+            flag = f"--{option.replace('_', '-')}"
+            raise TensorsimError(f"{flag}: {name} has no such setting, expected {', '.join(known)}")
+        document[option] = list(value) if isinstance(value, tuple) else value
+    return from_document(name, experiment.config, document)
+
+
+def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
+    """Run an experiment and write its report: ``NAME.md``, ``NAME*.csv``, ``NAME-*.png`` and ``.svg``, ``NAME.yaml``.
+
+    Files appear once all of them are complete. What was computed stays in the cache of ``work``.
+    """
+    from tensorsim.plot.figure import save_figure
+
+    experiment = find_experiment(name)
+    report = experiment.run(config, work)
+    with complete_or_nothing(out) as new:
+        (new / f"{name}.md").write_text(report.markdown(experiment.title), encoding="utf-8")
+        settings = {"experiment": name} | to_document(config)
+        (new / f"{name}.yaml").write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
+        for table in report.tables:
+            stem = f"{name}-{table.file}" if table.file else name
+            (new / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
+        for figure_name, figure in report.figures.items():
+            for suffix in ("png", "svg"):
+                save_figure(figure, new / f"{name}-{figure_name}.{suffix}")
+    return report

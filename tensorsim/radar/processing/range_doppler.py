@@ -1,0 +1,168 @@
+"""Range, Doppler and angle of each frame of an array's pulses, and the points that are detected in them."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import RadarConfig
+from tensorsim.errors import TensorsimError, check_size, check_tensor
+from tensorsim.radar.processing.array import steering_vectors, virtual_elements
+from tensorsim.radar.processing.cfar import CfarDetector
+from tensorsim.radar.processing.doppler import DopplerFrames
+from tensorsim.radar.processing.point_cloud import PointCloud, Points
+
+
+class RangeDopplerCube(DopplerFrames):
+    """Complex range-Doppler spectra of each antenna and frame, with transmitters in turn (TDM) compensated.
+
+    Transmitter k of K fires ``k / (K PRF)`` late, in which a target of Doppler f turns by ``2 pi f k / (K PRF)``: each
+    Doppler bin is turned back by as much. Targets beyond PRF / 2 stay wrong. Input is conjugated as in the Doppler-time
+    map: positive Doppler is approaching, and the phase grows towards antennas that are nearer to the target.
+
+    Args:
+        radar: the array, its channels in the order of the echo, ``v = k A + a``; or one antenna pair.
+        window_s, overlap: see :class:`DopplerFrames`.
+
+    Shapes: profiles (..., V, M, R) complex -> (..., K, V, R, F) complex. Differentiable.
+
+    Raises:
+        TensorsimError: as :class:`DopplerFrames`; another number of channels, real profiles, fewer than L pulses.
+    """
+
+    turn_cycles: Tensor
+
+    def __init__(self, radar: RadarConfig, window_s: float = 0.1, overlap: float = 0.9) -> None:
+        super().__init__(radar, window_s, overlap)
+        transmitters, receivers = len(radar.tx_positions_m), len(radar.rx_positions_m)
+        self.channels = transmitters * receivers
+        late = torch.arange(transmitters, dtype=torch.float64).repeat_interleave(receivers) / transmitters
+        self.register_buffer(
+            "turn_cycles", late[:, None] * self.doppler_hz / self.prf_hz, persistent=False
+        )  # (V, F)
+
+    def forward(self, profiles: Tensor) -> Tensor:
+        """Profiles (..., V, M, R) to the cube (..., K, V, R, F)."""
+        layout = f"(..., {self.channels} channels, pulses, range bins)"
+        check_tensor(profiles, "profiles", layout, "complex", finite=False)
+        check_size(profiles, -3, self.channels, "profiles", layout)
+        lead, bins = list(profiles.shape[:-3]), profiles.shape[-1]
+        frames = self.series(profiles).unfold(-1, self.length, self.hop)  # (B V, R, K, L)
+        spectrum = torch.view_as_complex(self.spectrum(frames)).conj().resolve_conj()
+        spectrum = spectrum.reshape(lead + [self.channels, bins, -1, self.bins])  # noqa: RUF005 (TorchScript)
+        angle = (-2 * math.pi) * self.turn_cycles.double()
+        turn = torch.polar(torch.ones_like(angle), angle).to(spectrum.dtype)
+        return (spectrum * turn[:, None, None]).movedim(-2, -4)
+
+
+class RangeDopplerAngle(nn.Module):
+    """Power over range, Doppler and azimuth of each frame, by the conventional beamformer.
+
+    Args:
+        radar: the array.
+        azimuth_rad: (D,) directions; 0 is +y, positive is to the right (+x).
+        elevation_rad: of all of them.
+        window_s, overlap: see :class:`RangeDopplerCube`.
+
+    Shapes: profiles (..., V, M, R) complex -> (..., K, R, F, D) power; a plane wave has that of one channel at its
+    direction. Differentiable.
+
+    Raises:
+        TensorsimError: as :class:`RangeDopplerCube`; azimuths that are not a finite vector.
+    """
+
+    cycles: Tensor
+
+    def __init__(
+        self,
+        radar: RadarConfig,
+        azimuth_rad: Tensor,
+        elevation_rad: float = 0.0,
+        window_s: float = 0.1,
+        overlap: float = 0.9,
+    ) -> None:
+        super().__init__()
+        azimuth = torch.as_tensor(azimuth_rad).double()
+        if azimuth.dim() != 1 or azimuth.numel() == 0 or not bool(torch.isfinite(azimuth).all()):
+            raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
+        if not math.isfinite(elevation_rad):
+            raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
+        self.cube = RangeDopplerCube(radar, window_s, overlap)
+        cycles = steering_vectors(virtual_elements(radar), azimuth, elevation_rad, radar.doppler_wavelength_m)
+        self.register_buffer("cycles", cycles - cycles.round(), persistent=False)
+
+    def forward(self, profiles: Tensor) -> Tensor:
+        """Profiles (..., V, M, R) to power (..., K, R, F, D)."""
+        cube = self.cube(profiles).movedim(-3, -1)  # (..., K, R, F, V)
+        # The cube is conjugated, and so are the steering vectors; a beam is the product with their conjugate.
+        angle = 2 * math.pi * self.cycles.double()
+        weights = torch.complex(angle.cos(), angle.sin()).to(cube.dtype) / self.cycles.shape[1]
+        return torch.view_as_real(torch.matmul(cube, weights.transpose(0, 1))).square().sum(-1)
+
+
+class PointDetector(nn.Module):
+    """Profiles of an antenna array to detected points: range-Doppler cube, CFAR over range and Doppler, angles.
+
+    Args:
+        radar: the array; its virtual elements stand in a row along x, evenly spaced, or it is one antenna pair, whose
+            points have angle 0.
+        window_s, overlap: frames, see :class:`RangeDopplerCube`.
+        points: the most points of a frame.
+        nearest_m: range of the first bin of the profiles.
+        cfar: detector over (range, Doppler); None is cell averaging with a false alarm rate of 1e-5, along Doppler
+            alone where the radar has hardly any range, as one of continuous wave.
+
+    Shapes: profiles (..., V, M, R) complex, after a moving target indicator where what stands still is not wanted ->
+    :class:`Points` (..., K, points). Differentiable as :class:`PointCloud`.
+
+    Raises:
+        TensorsimError: as :class:`RangeDopplerCube` and :class:`CfarDetector`; an array that is no even row along x.
+
+    Example:
+        >>> scene = ts.radar.PRESETS["ti-awr1843-array"]
+        >>> simulator = ts.radar.RadarSimulator(scene)
+        >>> positions = torch.tensor([1.0, 3.0, 1.0]) - torch.arange(900)[:, None, None] * torch.tensor([0, 2e-4, 0])
+        >>> channels = simulator.mti(simulator.profiles(positions, torch.ones(1)))  # (8, 899, 256)
+        >>> ts.radar.PointDetector(scene.radar)(channels).speed_m_s.shape  # frames, points
+        torch.Size([1, 64])
+    """
+
+    def __init__(
+        self,
+        radar: RadarConfig,
+        window_s: float = 0.1,
+        overlap: float = 0.5,
+        points: int = 64,
+        nearest_m: float = 0.0,
+        cfar: CfarDetector | None = None,
+    ) -> None:
+        super().__init__()
+        self.cube = RangeDopplerCube(radar, window_s, overlap)
+        elements = virtual_elements(radar)
+        spacing = elements.diff(dim=0)
+        even = bool((spacing - spacing[:1]).abs().max() < 1e-6) if len(elements) > 2 else True
+        along_x = bool((spacing[:, 1:].abs() < 1e-9).all()) and bool((spacing[:, 0] > 0).all())
+        if not (even and along_x):
+            raise TensorsimError(
+                f"radar: got virtual elements at {[[round(v, 5) for v in place] for place in elements.tolist()]} m, "
+                "expected an even row along x, from left to right"
+            )
+        step_m = float(spacing[0, 0]) if len(elements) > 1 else radar.doppler_wavelength_m / 2
+        if cfar is None:
+            ranges = radar.samples_per_chirp // 2 > 10
+            guard, training = ((2, 4), (8, 8)) if ranges else ((0, 4), (0, 16))
+            cfar = CfarDetector(guard, training, 1e-5, edges=("reflect", "circular"))
+        self.cfar = cfar
+        speed_step = self.cube.prf_hz / self.cube.bins * radar.doppler_wavelength_m / 2
+        self.cloud = PointCloud(
+            radar.range_resolution_m, speed_step, points, step_m / radar.doppler_wavelength_m
+        )
+        self.nearest_m = float(nearest_m)
+
+    def forward(self, profiles: Tensor) -> Points:
+        """Profiles (..., V, M, R) to points (..., K, points)."""
+        cube = self.cube(profiles)
+        power = torch.view_as_real(cube).square().sum(-1).mean(-3)
+        found = self.cloud(cube, self.cfar(power))
+        range_m = torch.where(found.valid, found.range_m + self.nearest_m, 0.0)
+        return Points(range_m, found.speed_m_s, found.sine, found.power, found.valid)

@@ -1,0 +1,159 @@
+"""What a radar records of a scene: range profiles with the noise and the effects of its receiver."""
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.config import ProcessingConfig, SceneConfig
+from tensorsim.radar.processing.range_profile import RangeProfile
+from tensorsim.radar.synthesis.closed_form import RangeBinSynthesizer
+from tensorsim.radar.synthesis.clutter import RoomClutter
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
+from tensorsim.radar.synthesis.engines import RangeBinEngine, TimeEngine, channels_as_bins
+from tensorsim.radar.synthesis.front_end import FrontEnd, Levels
+from tensorsim.radar.synthesis.noise import ProfileNoise, ReceiverNoise, energy
+
+
+class Recorder(nn.Module):
+    """Scatterers to range profiles as they are received, a piece of the clip at a time.
+
+    Noise and converters depend on the mean powers of the whole clip (:class:`Levels`), so every scene is worked on
+    twice: :meth:`survey` measures the powers, :meth:`received` gives the profiles. With an ideal receiver the profiles
+    of the first time are kept, and noise is added to them; otherwise a :class:`FrontEnd` works on the samples.
+
+    Args:
+        scene: radar, noise, receiver, clutter, interference.
+        processing: the engine and ``pulse_chunk``.
+        echo: of the scene.
+        profile: samples to range profiles.
+        seed: of clutter and phase noise.
+
+    Shapes: positions (B, m, S, 3) m and RCS (B, m, S) m^2, which are not checked here, to profiles (B, m, V R): the
+    channels of V antennas stand one after the other.
+
+    Attributes:
+        channels: V.
+        needs_levels: whether the levels have an effect.
+    """
+
+    def __init__(
+        self,
+        scene: SceneConfig,
+        processing: ProcessingConfig,
+        echo: EchoSynthesizer,
+        profile: RangeProfile,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        radar = scene.radar
+        self.noise = ReceiverNoise(
+            scene.snr_db,
+            scene.noise_reference,
+            empty_power=(echo.paths.scale / 3.0**2) ** 2,
+            bandwidth_hz=radar.sample_rate_hz,
+            noise_figure_db=scene.noise_figure_db,
+            transmit_power_w=scene.transmit_power_w,
+        )
+        total, clutter = scene.noise_reference == "total", None
+        if scene.clutter is not None:
+            clutter = RoomClutter(scene.clutter.reflectors, jitter_m=scene.clutter.jitter_m, seed=seed)
+        self.engine: nn.Module = TimeEngine(echo, profile, total, clutter)
+        if processing.engine == "range-bins":
+            bins = RangeBinSynthesizer(echo, profile, processing.near_bins, processing.energy_stride)
+            self.engine = RangeBinEngine(bins, total, clutter)
+        self.front_end: nn.Module | None = None
+        if scene.sampled_effects:
+            self.front_end = FrontEnd(scene, self.noise, seed)
+        self.echo = echo
+        self.profile, self.profile_noise = profile, ProfileNoise(profile.window)
+        self.samples, self.pulse_chunk = echo.samples, processing.pulse_chunk
+        self.channels = len(radar.tx_positions_m) * len(radar.rx_positions_m)
+        self.needs_levels = not self.noise.noiseless or self.front_end is not None
+
+    def echoes(self, positions: Tensor, rcs: Tensor, span: int) -> tuple[list[Tensor], Levels]:
+        """Profiles free of noise, ``span`` pulses in each (none with a front end), and the levels of the clips."""
+        pulses = positions.shape[1]
+        ahead = self.echo.displacements(positions)
+        pieces: list[Tensor] = []
+        nothing = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
+        levels = Levels(nothing, nothing)
+        for start in range(0, pulses, span):
+            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
+            way = None if ahead is None else ahead[:, start : start + span]
+            profiles, energies = self.survey(points, sections, start, way)
+            if self.front_end is None:
+                pieces.append(profiles)
+            levels = self.add(levels, energies, pulses)
+        return pieces, levels
+
+    def add(self, levels: Levels, energies: Levels, pulses: int) -> Levels:
+        """Mean powers of clips of so many pulses, with the energies of another piece."""
+        samples = pulses * self.samples
+        signal = levels.signal + energies.signal.to(levels.signal) / samples
+        return Levels(signal, levels.arriving + energies.arriving.to(levels.arriving) / samples)
+
+    def survey(
+        self, positions: Tensor, rcs: Tensor, first: int, ahead: Tensor | None
+    ) -> tuple[Tensor, Levels]:
+        """Profiles free of noise, stored with time running fastest, and energies (B,), of pulses ``first`` onwards.
+
+        ``ahead`` (B, m, S, 3): see :mod:`~tensorsim.radar.synthesis.engines`.
+
+        With a front end the profiles are empty: what it records depends on the levels of the whole clip.
+        """
+        signal = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
+        arriving = torch.zeros_like(signal)
+        chunks: list[Tensor] = []
+        step = self.step(positions)
+        for start in range(0, positions.shape[1], step):
+            points, sections = positions[:, start : start + step], rcs[:, start : start + step]
+            way = None if ahead is None else ahead[:, start : start + step]
+            if self.front_end is not None:
+                samples, reference = self.engine.samples(points, sections, first + start, way)
+                heard = energy(self.front_end.arriving(samples, first + start))
+                arriving = arriving + heard.reshape([heard.shape[0], -1]).mean(-1)
+                chunks.append(samples.new_zeros([samples.shape[0], 0, 0]))
+            else:
+                profiles, reference = self.engine(points, sections, first + start, way)
+                chunks.append(profiles.transpose(1, 2))
+            # Without noise the ratio is infinite, and no gradient goes through it.
+            signal = signal + (reference if self.needs_levels else reference.detach())
+        return torch.cat(chunks, -1).transpose(1, 2), Levels(signal, arriving)
+
+    def received(
+        self,
+        positions: Tensor,
+        rcs: Tensor,
+        first: int,
+        ahead: Tensor | None,
+        levels: Levels,
+        echoes: list[Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """Profiles of pulses ``first`` onwards with all that the receiver adds, and the energy (B,) of its noise.
+
+        The first of ``echoes``, if there is one, is taken out: profiles free of noise, which need not be made again.
+        """
+        if self.front_end is not None:
+            chunks: list[Tensor] = []
+            energies = torch.zeros_like(levels.signal)
+            step = self.step(positions)
+            for start in range(0, positions.shape[1], step):
+                points, sections = positions[:, start : start + step], rcs[:, start : start + step]
+                way = None if ahead is None else ahead[:, start : start + step]
+                samples, _ = self.engine.samples(points, sections, first + start, way)
+                samples, drawn = self.front_end(samples, levels, first + start)
+                chunks.append(channels_as_bins(self.profile(samples)).transpose(1, 2))
+                energies = energies + drawn
+            return torch.cat(chunks, -1).transpose(1, 2), energies
+        clean = echoes.pop(0) if len(echoes) > 0 else self.survey(positions, rcs, first, ahead)[0]
+        if self.noise.noiseless:
+            return clean, torch.zeros_like(levels.signal)
+        # Every antenna has noise of its own.
+        like = clean.transpose(1, 2).reshape([clean.shape[0] * self.channels, -1, clean.shape[1]])
+        power = self.noise.noise_power(levels.signal).repeat_interleave(self.channels)
+        noise, drawn = self.profile_noise(like, power)
+        noise = noise.reshape([clean.shape[0], -1, clean.shape[1]]).transpose(1, 2)
+        return clean + noise, drawn.reshape([-1, self.channels]).mean(-1)
+
+    def step(self, positions: Tensor) -> int:
+        """Pulses of every clip to work on at a time."""
+        return max(1, self.pulse_chunk // max(1, positions.shape[0]))

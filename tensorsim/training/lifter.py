@@ -1,0 +1,182 @@
+"""The recipe of the lifter: windows of motion before random cameras, seen through errors, to joints."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import BONES, mid_hips
+from tensorsim.training.lifter_motion import MotionPool
+from tensorsim.training.lifter_views import Windows, film
+from tensorsim.training.loop import Batch, Recipe
+from tensorsim.vision.lifting.sight import Sight
+from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
+
+#: Weights of the terms of the loss.
+_VELOCITY, _BONES, _RANGE, _SPREAD = 0.12, 0.3, 0.5, 0.03
+#: Errors of joints count relative to these: wrists and ankles move fastest, and the radar sees speed.
+_JOINTS = (1.0, 0.8, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3)
+
+
+def target(window: Windows, sight: Sight) -> Tensor:
+    """True joints (B, T, 14, 3) in the frame that faces the person, in body heights."""
+    cos, sin = sight.azimuth[..., None, 0], sight.azimuth[..., None, 1]
+    x, y, z = window.joints.unbind(-1)
+    return torch.stack([x * cos - y * sin, x * sin + y * cos, z], dim=-1)
+
+
+def laplace(error: Tensor, log_spread: Tensor) -> Tensor:
+    """Negative logarithm of the likelihood of absolute errors of a known mean: ``|e| / b + log b``."""
+    return error * torch.exp(-log_spread) + log_spread
+
+
+def _about_hips(joints: Tensor) -> Tensor:
+    return joints - mid_hips(joints)[..., None, :]
+
+
+def _bone_lengths(joints: Tensor) -> Tensor:
+    """(B, T, 12) lengths of the bones."""
+    points = torch.cat([joints, mid_hips(joints)[..., None, :]], dim=-2)
+    first, second = zip(*BONES, strict=True)
+    return (
+        (points[..., list(first), :] - points[..., list(second), :])
+        .square()
+        .sum(dim=-1)
+        .clamp(min=1e-6)
+        .sqrt()
+    )
+
+
+def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> dict[str, Tensor]:
+    """The loss and its terms.
+
+    Args:
+        found: what the network says.
+        true: (B, T, 14, 3), see :func:`target`.
+        weight: (B, T) of frames.
+        fps: (B,).
+    """
+    weight = weight / weight.sum().clamp(min=1.0)
+    joints, about = _about_hips(found.joints), _about_hips(true)
+    each = torch.tensor(_JOINTS)
+    error = (joints - about).abs()
+    across, along = error[..., ::2].mean(dim=-1), error[..., 1]
+    place = ((across + along) * each).mean(dim=-1)
+    # The angle of the hips and the logarithm of their distance: metres far away count as much as nearby.
+    far = mid_hips(true)[..., 1].clamp(min=0.3)
+    hips = mid_hips(found.joints)[..., 1].clamp(min=0.05)
+    off_range = (hips / far).log().abs()
+    rate = fps[:, None, None, None]
+    moved = torch.diff(joints - about, dim=1) * rate
+    hips_moved = torch.diff((hips / far).log() * far.clamp(max=4.0), dim=1) * rate[..., 0, 0]
+    pairs = torch.minimum(weight[:, 1:], weight[:, :-1])
+    speed = (moved.square().sum(dim=-1) + 1e-4).sqrt() * each
+    lengths = _bone_lengths(found.joints).log() - _bone_lengths(true).log()
+    spread = (
+        laplace(across.detach(), found.log_spread[..., 0]) + laplace(along.detach(), found.log_spread[..., 1])
+    ).mean(dim=-1) + laplace(off_range.detach(), found.log_range_spread)
+    terms = {
+        "place": (weight * place).sum(),
+        "range": (weight * off_range).sum(),
+        "speed": (pairs * (speed.mean(dim=-1) + 0.5 * hips_moved.abs())).sum(),
+        "bones": (weight * lengths.abs().mean(dim=-1)).sum(),
+        "spread": (weight * spread).sum(),
+        "depth": (weight * along.mean(dim=-1)).sum(),
+    }
+    loss = terms["place"] + _RANGE * terms["range"] + _VELOCITY * terms["speed"]
+    loss = loss + _BONES * 0.1 * terms["bones"] + _SPREAD * terms["spread"]
+    return {"loss": loss} | terms
+
+
+class LifterRecipe(Recipe):
+    """What :func:`tensorsim.training.loop.fit` trains.
+
+    Args:
+        net: a :class:`~tensorsim.vision.lifting.temporal_net.TemporalNet`.
+        pool: motion to train on.
+        held_out: motion to validate on.
+        frames: of a window.
+        learning_rate: largest.
+        seed: of cameras and errors.
+    """
+
+    def __init__(
+        self,
+        net: TemporalNet,
+        pool: MotionPool,
+        held_out: MotionPool,
+        frames: int = 64,
+        learning_rate: float = 1.5e-3,
+        seed: int = 0,
+    ) -> None:
+        settings = {
+            "frames": frames,
+            "learning_rate": learning_rate,
+            "seed": seed,
+            "motions": len(pool.joints),
+        }
+        super().__init__(net, settings, {"network": "TemporalLifter"})
+        self.pool, self.frames, self.seed = pool, frames, seed
+        self.learning_rate = learning_rate
+        self.judged = [film(held_out, 64, frames, torch.Generator().manual_seed(k)) for k in range(6)]
+
+    def sample(self, index: int) -> dict[str, Any]:
+        """Windows are made by the batch."""
+        return {"index": index}
+
+    def collate(self, samples: list[dict[str, Any]]) -> Batch:
+        """Film as many windows as there are samples; their first number is the seed."""
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003_139 + int(samples[0]["index"]))
+        window = film(self.pool, len(samples), self.frames, generator)
+        sight = window.sight()
+        return {
+            "sight": tuple(sight),
+            "target": target(window, sight),
+            "weight": _weight(window),
+            "fps": window.fps,
+        }
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Of a batch of :meth:`collate`."""
+        found = net(Sight(*batch["sight"]))
+        located = Located(*(part.float() for part in found))
+        return lifter_loss(located, batch["target"], batch["weight"], batch["fps"])
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        """AdamW; no decay of offsets and norms."""
+        decayed = [p for p in self.net.parameters() if p.dim() > 1]
+        others = [p for p in self.net.parameters() if p.dim() <= 1]
+        return torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": 0.02}, {"params": others, "weight_decay": 0.0}],
+            lr=self.learning_rate,
+            betas=(0.9, 0.98),
+        )
+
+    def rate(self, step: int, steps: int) -> float:
+        """Rises over 300 steps, then falls along a cosine."""
+        rise = min(1.0, (step + 1) / 300)
+        return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Errors on held-out motion: of depths about the hips in cm of a body of 1.75 m, of ranges in per cent."""
+        totals: dict[str, float] = {}
+        for window in self.judged:
+            sight = window.sight()
+            with torch.autocast("cpu", enabled=False):
+                terms = lifter_loss(net(sight), target(window, sight), _weight(window), window.fps)
+            for name, value in terms.items():
+                totals[name] = totals.get(name, 0.0) + float(value) / len(self.judged)
+        return {
+            "score": -totals["loss"],
+            "depth_cm": 175 * totals["depth"],
+            "range_percent": 100 * totals["range"],
+            "speed_m_s": 1.75 * totals["speed"],
+            "place_cm": 175 * totals["place"],
+        }
+
+
+def _weight(window: Windows) -> Tensor:
+    """Frames in which the person is followed count fully, gaps less; people beside the picture hardly."""
+    count = (window.scores >= 0.3).sum(dim=-1) * window.valid
+    return 0.05 + 0.25 * (count > 0) + 0.7 * (count >= 8)

@@ -1,0 +1,282 @@
+"""Motion to train a lifter on: activities and exercises in all their variants, falls, poses joined at random, captures.
+
+Everything is kept as joints at 60 frames a second, about 4 s each, on the floor, and is turned, placed and filmed anew
+every time it is used.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tensorsim.body.kinematics import BodyPose, forward_kinematics, rest_on_floor
+from tensorsim.body.proportions import Proportions
+from tensorsim.body.skeleton import body_height, mid_hips
+from tensorsim.data.motion_files import load_motion, motion_keys
+from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
+from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot
+from tensorsim.motion.activities import perform
+from tensorsim.motion.exercises import EXERCISES
+from tensorsim.motion.people import People, PeopleConfig, draw_people
+from tensorsim.motion.pose_sampler import FAMILIES, sample_angles
+from tensorsim.motion.resample import PoseResampler
+from tensorsim.motion.scripts import SCRIPTS, toppling
+from tensorsim.motion.timing import bell, minimum_jerk, segment
+
+#: Frames per second and frames of a motion.
+RATE_HZ, FRAMES = 60.0, 256
+#: People, and ways of moving, of all kinds and in all headings.
+_PEOPLE = PeopleConfig(
+    height_m=(1.4, 2.0), limb_deviation=0.05, speed_m_s=(0.4, 1.8), heading_rad=math.pi, variation=0.2,
+    tempo=(0.5, 1.1), start_range_m=(0.0, 0.0), keep_range_m=(0.0, 1e6), start_side_m=0.0,
+)  # fmt: skip
+#: People whose motion is worked out at once.
+_CHUNK = 24
+#: Captured joints that seem to move faster have lost a marker.
+_FASTEST_M_S = 20.0
+#: Segments whose lengths vary from body to body: joint, the joint that it hangs from, and the pair that varies alike.
+_CHAIN = (
+    (2, 1, 0), (5, 1, 0), (0, 1, 1), (3, 2, 2), (6, 5, 2), (4, 3, 3), (7, 6, 3),
+    (9, 8, 4), (12, 11, 4), (10, 9, 5), (13, 12, 5),
+)  # fmt: skip
+
+
+class MotionPool(NamedTuple):
+    """Motions of equal length.
+
+    Attributes:
+        joints: (N, FRAMES, 14, 3) metres, z up from the floor.
+        height_m: (N,) standing heights.
+        kind: (N,) int64 index into ``KINDS``.
+    """
+
+    joints: Tensor
+    height_m: Tensor
+    kind: Tensor
+
+
+#: Kinds of motion and the share of each.
+KINDS = {"activities": 0.34, "exercises": 0.16, "falls": 0.16, "joined poses": 0.20, "captures": 0.14}
+
+
+def fall_any_way(time: Tensor, who: People) -> Act:
+    """Gives way and topples like a rod about the feet, in any direction; some slowly, as those who lie down."""
+    v = Vary(who)
+    slow = (who.gait_phase < 0.3)[:, None]
+    rate = torch.where(slow, 0.45, 1.0) * who.tempo[:, None]
+    down = toppling(rate * time, who.height_m) / 88
+    way = 2 * math.pi * torch.remainder(who.gait_phase * 7.0, 1.0)[:, None]
+    lean, roll = 88 * torch.cos(way), 88 * torch.sin(way)
+    give = bell(time, 0.0 * v(1.0), v(1.1) / rate)
+    # Arms lie on the floor, beside the body or over the head; nothing bends into the floor.
+    overhead = (torch.remainder(who.gait_phase * 29.0, 1.0) < 0.3)[:, None]
+    arms = torch.where(overhead, v(165.0), v(60.0) - 60)
+    spread, fold = (3 * v(45.0) - 90) * torch.cos(way).square(), (v(60.0) - 40) * torch.cos(way).square()
+    supine = 0.5 * (1 - torch.cos(way))
+    legs = supine.square() * (3 * v(35.0) - 70)
+    knees = 1.6 * legs + (1 - supine) * (v(60.0) - 48)
+    rest = 1 - 0.6 * down
+    bend = v(55.0) - 10
+    pose = make_pose(
+        time,
+        who,
+        lean=lean * down,
+        pitch=(v(40.0) - 40) * down + v(12.0) * give,
+        twist=(v(40.0) - 40) * down,
+        nod=(v(60.0) - 60) * down,
+        hip=(rest * REST_HIP + legs * down + (bend + 10) * give, rest * REST_HIP + 0.8 * legs * down + bend * give),
+        knee=(rest * REST_KNEE + knees * down + 1.2 * bend * give, rest * REST_KNEE + 0.8 * knees * down + bend * give),
+        flexion=(2 + arms * down, 2 + 0.9 * arms * down),
+        abduction=(8 + spread * down, 8 + 0.7 * spread * down),
+        elbow=(12 + fold * down, 12 + 0.8 * fold * down),
+    )  # fmt: skip
+    pose = pose._replace(roll=pose.roll + torch.deg2rad(roll * down))
+    act = on_the_spot(time, pose)
+    upright = 1 - segment(time, 0.0 * v(1.0) + 0.3, 0.9 / rate)
+    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+
+
+def _performed(
+    script: Callable[[Tensor, People], Act], count: int, earliest_s: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Joints (count, FRAMES, 14, 3) of people who follow a script, from a random moment on, and their heights."""
+    who = draw_people(count, _PEOPLE, generator)
+    start = earliest_s * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    time = torch.arange(FRAMES, dtype=torch.float64) / RATE_HZ + start
+    return perform(script, time, who), who.height_m
+
+
+def _joined(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Bodies that go from one random pose to the next, drift and turn as they do; the lowest joint is on the floor."""
+    keys = 16
+    who = draw_people(count, _PEOPLE, generator)
+    families = torch.randint(FAMILIES, (2,), generator=generator).tolist()
+    drawn = [sample_angles(family, count * keys, generator) for family in families]
+    change = torch.rand(count, keys, generator=generator) < 0.35
+    pace = torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    hold = 0.25 + (0.25 + 1.2 * pace) * torch.rand(count, keys, generator=generator, dtype=torch.float64)
+    ends = hold.cumsum(dim=1)
+    time = (torch.arange(FRAMES, dtype=torch.float64) / RATE_HZ).expand(count, -1).contiguous()
+    key = torch.searchsorted(ends, time, right=True).clamp(max=keys - 2)
+    since = time - (ends.gather(1, key) - hold.gather(1, key))
+    share = minimum_jerk((since / hold.gather(1, key)).clamp(0.0, 1.0))
+    turns = (torch.randn(count, keys, generator=generator, dtype=torch.float64) * 0.6).cumsum(dim=1)
+
+    def between(of_keys: Tensor) -> Tensor:
+        """Angles (count, keys, ...) at each time."""
+        rows = torch.arange(count)[:, None]
+        weight = share.reshape(share.shape + (1,) * (of_keys.dim() - 2))
+        return torch.lerp(of_keys[rows, key], of_keys[rows, key + 1], weight)
+
+    fields = {}
+    for name in BodyPose._fields:
+        one, other = (getattr(pose, name).unflatten(0, (count, keys)) for pose in drawn)
+        chosen = change.reshape(change.shape + (1,) * (one.dim() - 2))
+        fields[name] = between(torch.where(chosen, other, one))
+    pose = BodyPose(**fields)
+    pose = pose._replace(heading=pose.heading + between(turns))
+    sizes = Proportions(*(torch.as_tensor(p)[:, None] for p in who.proportions))
+    joints = rest_on_floor(forward_kinematics(pose, who.height_m[:, None], sizes), who.height_m[:, None])
+    stops = 0.5 * torch.randn(count, keys, 2, generator=generator, dtype=torch.float64).cumsum(dim=1)
+    drift = between(stops * torch.rand(count, 1, 1, generator=generator, dtype=torch.float64))
+    return joints + torch.nn.functional.pad(drift, (0, 1))[:, :, None], who.height_m
+
+
+def with_other_bones(joints: Tensor, factors: Tensor) -> Tensor:
+    """Motion (T, 14, 3) of a body whose segments have other lengths.
+
+    Args:
+        joints: metres.
+        factors: (7,) of shoulders, head, upper arm, forearm, thigh, shank and trunk.
+    """
+    moved = joints.clone()
+    hips = mid_hips(joints)
+    neck = hips + factors[6] * (joints[:, 1] - hips)
+    moved[:, 1] = neck
+    for joint, parent, group in _CHAIN:
+        moved[:, joint] = moved[:, parent] + factors[group] * (joints[:, joint] - joints[:, parent])
+    return moved + (joints[..., 2].amin() - moved[..., 2].amin()) * moved.new_tensor([0.0, 0.0, 1.0])
+
+
+def captures(paths: tuple[Path, ...], held_out: bool) -> dict[str, tuple[Tensor, float]]:
+    """Captured motion (T, 14, 3) and its frame rate by name: every second sequence is held out.
+
+    The first frame, often a calibration pose, is left out. A file that has no frame rate may have it in its name, as
+    ``walks_120hz.npz``.
+
+    Raises:
+        TensorsimError: files that cannot be read.
+    """
+    found = {}
+    for path in paths:
+        named = re.search(r"(\d+)hz", path.stem)
+        for key in motion_keys(path):
+            motion = load_motion(path, key, float(named[1]) if named else None)
+            found[f"{path.stem} {key}"] = (motion.joints[0, 1:].double(), float(motion.fps))
+    return {name: one for i, (name, one) in enumerate(found.items()) if (i % 2 == 1) == held_out}
+
+
+def _captured(
+    sequences: list[tuple[Tensor, float]], count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Pieces of captured motion at 0.75 to 1.3 of its speed, of bodies with other proportions and sizes."""
+    pieces, heights = [], []
+    while len(pieces) < count:
+        lengths = torch.tensor([len(joints) / fps for joints, fps in sequences]).clamp(max=12.0)
+        joints, fps = sequences[int(torch.multinomial(lengths, 1, generator=generator))]
+        speed = 0.75 + 0.55 * float(torch.rand(1, generator=generator))
+        dense = PoseResampler(RATE_HZ)(joints, fps * speed)
+        factors = 1 + 0.06 * torch.randn(7, generator=generator, dtype=torch.float64).clamp(-2, 2)
+        dense = with_other_bones(dense, factors)
+        # Short captures are played to and fro.
+        while len(dense) < FRAMES:
+            dense = torch.cat([dense, dense.flip(0)[1:]])
+        start = int(torch.randint(len(dense) - FRAMES + 1, (1,), generator=generator))
+        height = 1.4 + 0.6 * float(torch.rand(1, generator=generator))
+        piece = dense[start : start + FRAMES]
+        if float((piece[1:] - piece[:-1]).norm(dim=-1).max()) * RATE_HZ > _FASTEST_M_S:
+            continue  # a marker was lost
+        pieces.append(piece * (height / float(body_height(piece).median())))
+        heights.append(height)
+    return torch.stack(pieces), torch.tensor(heights, dtype=torch.float64)
+
+
+def _batches(
+    kind: str, count: int, sequences: list[tuple[Tensor, float]], generator: torch.Generator
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Motions of one kind and heights, a chunk at a time."""
+    scripts = list(EXERCISES.values())
+    for i, first in enumerate(range(0, count, _CHUNK)):
+        size = min(_CHUNK, count - first)
+        if kind == "activities":
+            yield _performed(SCRIPTS[i % 12], size, 2.0, generator)
+        elif kind == "exercises":
+            yield _performed(scripts[i % len(scripts)], size, 0.5, generator)
+        elif kind == "falls":
+            joints, heights = _performed(fall_any_way, size, 0.0, generator)
+            # Backwards in time they get up.
+            back = torch.rand(size, generator=generator) < 0.25
+            yield torch.where(back[:, None, None, None], joints.flip(1), joints), heights
+        elif kind == "captures":
+            yield _captured(sequences, size, generator)
+        else:
+            yield _joined(size, generator)
+
+
+def build_pool(
+    path: Path | None,
+    count: int,
+    motions: tuple[Path, ...] = (),
+    seed: int = 0,
+    held_out: bool = False,
+    quiet: bool = False,
+) -> MotionPool:
+    """The motions of a file, made and stored first if it is not there.
+
+    Args:
+        path: ``.pt`` file; None stores nothing.
+        count: motions of all kinds.
+        motions: motion capture files. Without any, the other kinds share.
+        seed: of everything random.
+        held_out: take those captures that are not trained on, see :func:`captures`.
+        quiet: no progress bar.
+
+    Raises:
+        TensorsimError: a damaged file, or one of other motions.
+    """
+    settings = {"count": count, "seed": seed, "held_out": held_out}
+    settings |= {"motions": [file.name for file in motions]}
+    if path is not None and path.is_file():
+        try:
+            stored = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:
+            raise TensorsimError(
+                f"{path}: damaged ({type(error).__name__}); remove it to make it anew"
+            ) from error
+        if stored.get("settings") != settings:
+            raise TensorsimError(f"{path}: got motions of {stored.get('settings')}, expected {settings}")
+        return MotionPool(*(stored[name] for name in MotionPool._fields))
+    generator = torch.Generator().manual_seed(seed)
+    sequences = list(captures(motions, held_out).values())
+    shares = {kind: share for kind, share in KINDS.items() if sequences or kind != "captures"}
+    counts = {kind: max(1, round(count * share / sum(shares.values()))) for kind, share in shares.items()}
+    joints, heights, kinds = [], [], []
+    with tqdm(total=sum(counts.values()), desc="motion", disable=quiet) as bar:
+        for kind, number in counts.items():
+            for made, tall in _batches(kind, number, sequences, generator):
+                joints.append(made.float())
+                heights.append(tall.float())
+                kinds.append(torch.full((len(made),), list(KINDS).index(kind)))
+                bar.update(len(made))
+    pool = MotionPool(torch.cat(joints), torch.cat(heights), torch.cat(kinds))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with complete_file(path) as scratch:
+            torch.save(pool._asdict() | {"settings": settings}, scratch)
+    return pool

@@ -1,0 +1,178 @@
+"""How well people are lifted: the whole way from key points to smooth joints, with known camera and height."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import mid_hips
+from tensorsim.config import CameraConfig
+from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH
+from tensorsim.pipeline import VideoToPose
+from tensorsim.training.film_errors import films_of
+from tensorsim.training.lifter_motion import KINDS, MotionPool
+from tensorsim.training.lifter_views import Draw, before_camera, seen_in, windows_of
+from tensorsim.types import Tracks
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+
+#: Frames of a window, 3 s, and people before each camera at a time.
+FRAMES, PEOPLE = 90, 16
+#: Cameras: degrees below level, metres above the floor, horizontal field of view in degrees.
+CAMERAS = ((0.0, 1.0, 60.0), (12.0, 1.8, 75.0), (28.0, 2.8, 60.0))
+#: Wrists and ankles, whose speeds the radar shows most.
+ENDS = (4, 7, 10, 13)
+#: Peaks are these quantiles of the speed over time, and count from this speed on.
+_PEAK, _SLOWEST_M_S = 0.98, 0.5
+
+#: A camera and the heights of people to the lifter for them.
+MakeLifter = Callable[[CameraConfig, tuple[float, ...]], nn.Module]
+
+
+class LiftErrors(NamedTuple):
+    """Errors of lifted people; lower is better but for ``peak``.
+
+    Attributes:
+        depth_cm: mean absolute error along the horizontal line of sight of the joints about the hips.
+        joints_cm: mean distance of the joints about the hips.
+        range_percent: mean absolute error of the distance of the hips from the camera.
+        peak: median ratio of estimated and true peak speeds of wrists and ankles.
+        within: share of these in which the ratio is within 20 %.
+        speed_m_s: mean error of the velocity of all joints.
+    """
+
+    depth_cm: float
+    joints_cm: float
+    range_percent: float
+    peak: float
+    within: float
+    speed_m_s: float
+
+
+class Seen(NamedTuple):
+    """People before one camera: key points as :class:`~tensorsim.evaluation.films.Observed`, and the truth.
+
+    Attributes:
+        camera: it.
+        extent: width and height of the picture.
+        heights: of the P people, metres.
+        joints: (P, T, 14, 3) true joints in the world.
+        boxes, keypoints, scores, valid: see :class:`~tensorsim.evaluation.films.Observed`.
+    """
+
+    camera: CameraConfig
+    extent: tuple[int, int]
+    heights: tuple[float, ...]
+    joints: Tensor
+    boxes: Tensor
+    keypoints: Tensor
+    scores: Tensor
+    valid: Tensor
+
+
+def camera_of(tilt_deg: float, height_m: float, fov_deg: float) -> CameraConfig:
+    """A camera above the origin that looks down by ``tilt_deg``."""
+    return CameraConfig(
+        horizontal_fov_rad=math.radians(fov_deg),
+        position_m=(0.0, 0.0, height_m),
+        pitch_rad=-math.radians(tilt_deg),
+    )
+
+
+def views(pool: MotionPool, kinds: tuple[str, ...], errors: bool, seed: int = 0) -> Iterator[Seen]:
+    """People of some kinds of motion before each of ``CAMERAS``."""
+    chosen = torch.isin(pool.kind, torch.tensor([list(KINDS).index(kind) for kind in kinds]))
+    some = MotionPool(*(field[chosen] for field in pool))
+    for i, numbers in enumerate(CAMERAS):
+        camera, extent = camera_of(*numbers), (640, 480)
+        draw = Draw(PEOPLE, torch.Generator().manual_seed(seed * 100 + i))
+        joints, height, fps = windows_of(some, FRAMES, draw, FPS)
+        view = before_camera(joints, camera, extent, draw)
+        window = seen_in(view, height, fps, draw, errors)
+        yield Seen(
+            camera, extent, tuple(height.tolist()), view.joints + torch.tensor(camera.position_m),
+            window.boxes, window.keypoints, window.scores, window.valid,
+        )  # fmt: skip
+
+
+def watched(folder: Path) -> Iterator[Seen]:
+    """The one person of each film of ``tensorsim evaluate truth --settings c``, as far as the networks found it."""
+    for _, clip, found in films_of(folder):
+        if clip.present and found.valid.shape[0] > 0:
+            one = int(found.valid.sum(dim=-1).argmax())
+            yield Seen(
+                CAMERA, (WIDTH, HEIGHT), (clip.height_m,), clip.joints(FPS).float()[None],
+                *(field[one : one + 1] for field in (found.boxes, found.keypoints, found.scores, found.valid)),
+            )  # fmt: skip
+
+
+def nearest(camera: CameraConfig, heights: tuple[float, ...]) -> nn.Module:
+    """Nearest matching."""
+    return NearestPoseLifter(pitch_rad=camera.pitch_rad).eval()
+
+
+def temporal(lifter: TemporalLifter) -> MakeLifter:
+    """The network of a lifter."""
+
+    def make(camera: CameraConfig, heights: tuple[float, ...]) -> nn.Module:
+        return lifter.seen_by(camera, heights)
+
+    return make
+
+
+@torch.inference_mode()
+def lifted(make: MakeLifter, seen: Seen) -> tuple[Tensor, Tensor]:
+    """Joints (P, T, 14, 3) that the pipeline makes of key points, and in which frames (P, T)."""
+    nothing = nn.Identity()
+    stage = VideoToPose(
+        nothing,
+        nothing,
+        lifter=make(seen.camera, seen.heights),
+        metric_pose=MetricPose(seen.camera, seen.heights),
+    ).eval()
+    tracks = Tracks(seen.boxes[None], seen.valid[None], seen.valid[None])
+    pose = stage.lift(tracks, seen.keypoints[None], seen.scores[None], seen.extent[1], seen.extent[0], FPS)
+    return pose.joints[0], pose.valid[0]
+
+
+def _peaks(joints: Tensor, valid: Tensor) -> Tensor:
+    """(4,) peak speeds of wrists and ankles of one person (T, 14, 3)."""
+    speed = torch.diff(joints[:, ENDS], dim=0).norm(dim=-1) * FPS
+    return speed[valid[1:] & valid[:-1]].quantile(_PEAK, dim=0)
+
+
+def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
+    """Mean errors over people; frames in which nobody is followed do not count."""
+    sums = torch.zeros(5, dtype=torch.float64)
+    ratios = []
+    for seen in people:
+        found, valid = lifted(make, seen)
+        found, true = found.double(), seen.joints.double()
+        place = true.new_tensor(seen.camera.position_m)
+        sight = nn.functional.normalize((mid_hips(true) - place) * true.new_tensor([1.0, 1.0, 0.0]), dim=-1)
+        error = (found - mid_hips(found)[..., None, :]) - (true - mid_hips(true)[..., None, :])
+        depth = (error * sight[..., None, :]).sum(dim=-1).abs().mean(dim=-1)
+        away = (mid_hips(true) - place).norm(dim=-1)
+        off = ((mid_hips(found) - place).norm(dim=-1) / away - 1).abs()
+        moved = torch.diff(found - true, dim=1).norm(dim=-1).mean(dim=-1) * FPS
+        moved = torch.cat([moved[:, :1], moved], dim=1)
+        columns = torch.stack([torch.ones_like(depth), depth, error.norm(dim=-1).mean(dim=-1), off, moved])
+        sums += columns[:, valid].sum(dim=-1)
+        for one, other, there in zip(found, true, valid, strict=True):
+            if int((there[1:] & there[:-1]).sum()) >= FPS:
+                peak, truth = _peaks(one, there), _peaks(other, there)
+                ratios.append((peak / truth.clamp(min=1e-3))[truth >= _SLOWEST_M_S])
+    mean = (sums[1:] / sums[0].clamp(min=1.0)).tolist()
+    ratio = torch.cat(ratios) if ratios else torch.ones(1)
+    return LiftErrors(
+        100 * mean[0],
+        100 * mean[1],
+        100 * mean[2],
+        float(ratio.median()),
+        float(((ratio - 1).abs() <= 0.2).double().mean()),
+        mean[3],
+    )

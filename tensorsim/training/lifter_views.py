@@ -1,0 +1,302 @@
+"""Motion seen by random cameras, through errors as networks make them: what a lifter is trained on.
+
+Everything is worked out for a whole batch at once: B windows of T frames.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.body.kinematics import rotation
+from tensorsim.body.skeleton import body_to_coco, coco_to_body, mid_hips, mirror
+from tensorsim.config import CameraConfig
+from tensorsim.geometry.camera import camera_to_world, focal_length
+from tensorsim.training.lifter_motion import RATE_HZ, MotionPool
+from tensorsim.vision.lifting.sight import Sight, level_sight
+from tensorsim.vision.pose2d.topdown import MIRRORED
+
+#: Score below which a key point counts as hidden.
+THRESHOLD = 0.3
+#: Relative size of the errors of each COCO key point: face, shoulders, elbows, wrists, hips, knees, ankles.
+_ERROR = (0.7,) * 5 + (0.9,) * 2 + (1.2,) * 2 + (1.5,) * 2 + (1.2,) * 2 + (1.0,) * 2 + (1.2,) * 2
+#: Key points that are mistaken for one another: (right, left) of arms, of legs, and all.
+_SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
+
+
+class Windows(NamedTuple):
+    """A batch of windows.
+
+    Attributes:
+        joints: (B, T, 14, 3) true joints from the camera in the world axes of the assumed one, body heights.
+        keypoints: (B, T, 17, 2) pixels with errors.
+        scores: (B, T, 17).
+        boxes: (B, T, 4).
+        valid: (B, T) bool.
+        focal: (B,) assumed focal length in pixels.
+        center: (B, 2).
+        rotation: (B, 3, 3) assumed, world from camera.
+        extent: (B, 2) width and height of the picture.
+        fps: (B,).
+    """
+
+    joints: Tensor
+    keypoints: Tensor
+    scores: Tensor
+    boxes: Tensor
+    valid: Tensor
+    focal: Tensor
+    center: Tensor
+    rotation: Tensor
+    extent: Tensor
+    fps: Tensor
+
+    def sight(self) -> Sight:
+        """What the network gets."""
+        joints, joint_scores = coco_to_body(self.keypoints, self.scores, THRESHOLD)
+        return level_sight(
+            self.keypoints, self.scores, joints, joint_scores, self.boxes, self.valid, self.focal, self.center,
+            self.rotation, self.extent, self.fps, THRESHOLD,
+        )  # fmt: skip
+
+
+class Draw:
+    """Random numbers of a batch."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        self.count, self.generator = count, generator
+
+    def number(self, low: float, high: float, *tail: int) -> Tensor:
+        """Uniform numbers (B, *tail)."""
+        return low + (high - low) * torch.rand(self.count, *tail, generator=self.generator)
+
+    def normal(self, *tail: int) -> Tensor:
+        """Normal numbers (B, *tail)."""
+        return torch.randn(self.count, *tail, generator=self.generator)
+
+    def chance(self, probability: float, *tail: int) -> Tensor:
+        """(B, *tail) bool, true with this probability."""
+        return torch.rand(self.count, *tail, generator=self.generator) < probability
+
+    def spells(self, frames: int, rate: float, shortest: float, longest: float, *tail: int) -> Tensor:
+        """(B, *tail, T) bool: with probability ``rate`` one spell of a share of the frames, anywhere."""
+        length = self.number(shortest, longest, *tail) * frames
+        start = self.number(-0.3, 1.1, *tail) * frames
+        time = torch.arange(frames)
+        inside = (time >= start[..., None]) & (time < (start + length)[..., None])
+        return inside & self.chance(rate, *tail)[..., None]
+
+    def correlated(self, frames: int, last: Tensor, *tail: int) -> Tensor:
+        """(B, T, *tail) noise of unit variance that lasts for ``last`` (B,) frames: a first-order process, twice."""
+        white = self.normal(frames, *tail)
+        keep = torch.exp(-1 / last.clamp(min=0.1)).reshape(-1, *(1 for _ in tail))
+        drive = (1 - keep.square()).sqrt()
+        x = white[:, 0]
+        rows = [x]
+        for t in range(1, frames):
+            x = keep * x + drive * white[:, t]
+            rows.append(x)
+        return torch.stack(rows, dim=1)
+
+
+def windows_of(
+    pool: MotionPool, frames: int, draw: Draw, rate_hz: float | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Joints (B, T, 14, 3) in metres about a spot on the floor, heights (B) and frame rates (B)."""
+    lengths = pool.joints.shape[1]
+    which = torch.randint(len(pool.joints), (draw.count,), generator=draw.generator)
+    slowest = RATE_HZ * (frames - 1) / (lengths - 2)
+    usual = torch.tensor([30.0, 30.0, 25.0, 24.0])[torch.randint(4, (draw.count,), generator=draw.generator)]
+    fps = torch.where(draw.chance(0.5), usual, draw.number(slowest, 60.0)).clamp(min=slowest)
+    if rate_hz is not None:
+        fps = torch.full_like(fps, rate_hz)
+    step = RATE_HZ / fps
+    start = draw.number(0.0, 1.0) * (lengths - 1.01 - step * (frames - 1))
+    at = start[:, None] + step[:, None] * torch.arange(frames)
+    before = at.floor().long()
+    share = (at - before)[..., None, None]
+    joints = torch.lerp(pool.joints[which[:, None], before], pool.joints[which[:, None], before + 1], share)
+    joints = torch.where(draw.chance(0.5)[:, None, None, None], mirror(joints), joints)
+    spot = mid_hips(joints).mean(dim=1, keepdim=True) * torch.tensor([1.0, 1.0, 0.0])
+    turn = rotation(2, draw.number(0.0, 2 * math.pi))
+    return (joints - spot[:, :, None]) @ turn[:, None].mT, pool.height_m[which], fps
+
+
+class View(NamedTuple):
+    """Cameras: joints (B, T, 14, 3) from them in world axes, rotation (B, 3, 3), focal length (B), picture (B, 2)."""
+
+    joints: Tensor
+    rotation: Tensor
+    focal: Tensor
+    extent: Tensor
+
+
+#: Camera axes (right, down, forward) of a level camera, as columns in world axes.
+_LEVEL = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def _any_camera(joints: Tensor, draw: Draw) -> View:
+    """Random cameras in front of people."""
+    size = torch.tensor([[640.0, 360.0], [640.0, 480.0], [480.0, 640.0], [360.0, 640.0]])
+    share = torch.tensor([0.5, 0.3, 0.1, 0.1])
+    extent = size[torch.multinomial(share, draw.count, True, generator=draw.generator)]
+    half = torch.deg2rad(draw.number(20.0, 45.0))
+    focal = extent.amax(dim=-1) / 2 / torch.tan(half)
+    far = torch.exp(draw.number(math.log(1.6), math.log(9.0)))
+    height = draw.number(0.6, 3.0)
+    local = joints + torch.stack([torch.zeros_like(far), far, -height], dim=-1)[:, None, None]
+    hips = local[:, :, 8].mean(dim=1)
+    up = torch.atan2(hips[:, 2], hips[:, 1])
+    tall, wide = torch.atan(extent / 2 / focal[:, None]).flip(-1).unbind(-1)
+    pitch = (up - 0.5 * tall * draw.normal().clamp(-2, 2)).clamp(-0.75, 0.3)
+    # Many cameras are level, if that has the hips in the picture.
+    pitch = torch.where(draw.chance(0.25), (up + 0.8 * tall).clamp(max=0.0), pitch)
+    yaw = 0.8 * wide * draw.number(-1.0, 1.0)
+    return View(local, rotation(2, yaw) @ rotation(0, pitch) @ _LEVEL, focal, extent)
+
+
+def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int], draw: Draw) -> View:
+    """Joints (B, T, 14, 3) about a spot on the floor put before one camera: at a random place in its picture."""
+    width, height = extent
+    focal = torch.full((draw.count,), focal_length(camera, width))
+    down, tall = -camera.pitch_rad, math.atan(height / 2 / float(focal[0]))
+    rise = camera.position_m[2] - 0.9
+    # The hips are at most this far from the middle of the picture, up or down.
+    lowest, highest = down + 0.5 * tall, max(down - 0.5 * tall, 0.0)
+    nearest = max(2.0, rise / math.tan(lowest)) if rise > 0 else 2.0
+    farthest = min(7.0, rise / math.tan(highest)) if rise > 0 and highest > 0 else 7.0
+    far = draw.number(nearest, max(farthest, nearest))
+    aside = 0.6 * far * width / 2 / focal * draw.number(-1.0, 1.0)
+    local = (
+        joints + torch.stack([aside, far, torch.full_like(far, -camera.position_m[2])], dim=-1)[:, None, None]
+    )
+    turned = camera_to_world(camera)[:, :3].to(local.dtype).expand(draw.count, 3, 3)
+    size = torch.tensor([float(width), float(height)]).expand(draw.count, 2)
+    return View(local, turned, focal, size)
+
+
+def _missed(
+    points: Tensor, unit: Tensor, depth: Tensor, scores: Tensor, fps: Tensor, draw: Draw
+) -> tuple[Tensor, Tensor]:
+    """Key points (B, T, 17, 2) with errors as networks make them, and their scores.
+
+    Args:
+        points: true ones in pixels.
+        unit: (B, T) pixels per body height.
+        depth: (B, T, 17) distances from the camera in body heights.
+        scores: (B, T, 17) of the true ones.
+        fps: (B,) frames per second.
+        draw: random numbers.
+    """
+    frames = points.shape[1]
+    relative = torch.tensor(_ERROR)[:, None]
+    good = torch.exp(0.6 * draw.normal())[:, None, None, None] * relative
+    good = torch.where(draw.chance(0.1)[:, None, None, None], 0.1 * good, good)  # labelled: hardly any
+    error = 0.0015 * good * draw.normal(frames, 17, 2)
+    error = error + 0.006 * good * draw.correlated(frames, 0.12 * fps, 17, 2)
+    error = error + 0.006 * good * draw.correlated(frames, 0.8 * fps, 17, 2)
+    error = error + 0.005 * good * draw.normal(1, 17, 2)
+    wild = draw.spells(frames, 0.10, 0.03, 0.5, 17).transpose(1, 2)
+    error = error + 0.12 * wild[..., None] * draw.correlated(frames, 0.5 * fps, 17, 2)
+    # Bodies come out a little small: faces low and ankles high, by 1 % on rendered films.
+    size = -0.010 + 0.012 * draw.normal(1, 1, 1)
+    error = error + size * (points - points.mean(dim=2, keepdim=True)) / unit[..., None, None]
+    found = points + unit[..., None, None] * error
+
+    other = points[:, :, list(MIRRORED)]
+    near = (points - other).norm(dim=-1) < 0.12 * unit[..., None]
+    behind = depth > depth[:, :, list(MIRRORED)] + 0.04
+    # The far arm or leg of somebody seen from the side is easily taken for the near one.
+    limbs = torch.arange(17) > 6
+    covered = near & behind & limbs & draw.spells(frames, 0.35, 0.1, 1.0, 17).transpose(1, 2)
+    pull = draw.number(0.0, 1.0, 1, 17)[..., None]
+    found = torch.where(covered[..., None], torch.lerp(found, found[:, :, list(MIRRORED)], pull), found)
+    for group in _SWAPS:
+        swapped = torch.zeros(17, dtype=torch.bool)
+        swapped[list(group)] = True
+        swapped = swapped | swapped[list(MIRRORED)]
+        spell = draw.spells(frames, 0.07, 0.02, 0.35)
+        found = torch.where((spell[..., None] & swapped)[..., None], found[:, :, list(MIRRORED)], found)
+
+    miss = (found - points).norm(dim=-1) / unit[..., None]
+    level = draw.number(0.75, 1.0, 1, 1)
+    scores = scores * level - 2.0 * miss * draw.number(0.2, 1.0, 1, 17) - 0.15 * covered
+    scores = scores + 0.05 * draw.correlated(frames, 0.3 * fps, 17)
+    lost = draw.spells(frames, 0.10, 0.05, 1.2, 17).transpose(1, 2)
+    return found, torch.where(lost, draw.number(0.0, 0.45, frames, 17), scores)
+
+
+def _followed(found: Tensor, scores: Tensor, unit: Tensor, draw: Draw, gaps: bool) -> tuple[Tensor, Tensor]:
+    """Boxes (B, T, 4) of key points, as detectors and trackers have them, and in which frames there is one (B, T)."""
+    frames = found.shape[1]
+    seen = scores >= THRESHOLD
+    low = torch.where(seen[..., None], found, torch.inf).amin(dim=-2)
+    high = torch.where(seen[..., None], found, -torch.inf).amax(dim=-2)
+    valid = seen.sum(dim=-1) >= 4
+    margin = unit[..., None] * (
+        0.05 + 0.03 * draw.correlated(frames, torch.full((draw.count,), 5.0), 4).abs()
+    )
+    boxes = torch.cat([low - margin[..., :2], high + margin[..., 2:]], dim=-1)
+    if gaps:
+        valid = valid & ~draw.spells(frames, 0.15, 0.03, 0.4)
+    return torch.where(valid[..., None], boxes, 0.0), valid
+
+
+def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) -> Windows:
+    """``count`` windows of motion of the pool, in random places before random cameras, which are not known exactly."""
+    draw = Draw(count, generator)
+    joints, height, fps = windows_of(pool, frames, draw)
+    view = _any_camera(joints, draw)
+    seen = seen_in(view, height, fps, draw)
+    # Tilt and roll are wrong by some degrees, the focal length by some per cent.
+    wrong = torch.where(draw.chance(0.2), 0.10, 0.02)[:, None] * draw.normal(2)
+    tipped = rotation(0, wrong[:, 0]) @ rotation(1, 0.5 * wrong[:, 1])
+    stretch = torch.exp(torch.where(draw.chance(0.3), 0.15, 0.02) * draw.normal().clamp(-2, 2))
+    forward = view.rotation[:, :, 2]
+    shift = (stretch - 1)[:, None] * (mid_hips(view.joints) * forward[:, None]).sum(dim=-1)
+    joints = view.joints + (shift[..., None] * forward[:, None])[:, :, None]
+    return seen._replace(
+        joints=joints @ tipped[:, None].mT / height[:, None, None, None],
+        focal=view.focal * stretch,
+        rotation=tipped @ view.rotation,
+    )
+
+
+def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = True) -> Windows:
+    """What networks see of people before cameras.
+
+    Args:
+        view: people and cameras.
+        height: (B) standing heights, metres.
+        fps: (B) frames per second.
+        draw: random numbers.
+        errors: False gives the exact key points, those beside the picture with a score of 0.
+    """
+    frames, extent = view.joints.shape[1], view.extent
+    center = (extent - 1) / 2
+    eyes = body_to_coco(view.joints)
+    camera = eyes @ view.rotation[:, None]
+    away = camera[..., 2].clamp(min=0.15)
+    points = camera[..., :2] / away[..., None] * view.focal[:, None, None, None] + center[:, None, None]
+    inside = ((points > -2) & (points < extent[:, None, None] + 2)).all(dim=-1) & (camera[..., 2] > 0.2)
+    unit = (view.focal * height)[:, None] / away[..., 11:13].mean(dim=-1)
+    if errors:
+        scores = torch.ones_like(away)
+        # From behind, eyes and nose are hidden; many networks place them all the same, with high scores.
+        ahead = eyes[:, :, 0] - eyes[:, :, 3:5].mean(dim=2)
+        toward = -(ahead * eyes[:, :, 0]).sum(dim=-1)
+        toward = toward / (ahead.norm(dim=-1) * eyes[:, :, 0].norm(dim=-1)).clamp(min=1e-6)
+        shown = (0.75 + 1.2 * toward[..., None]).clamp(0.0, 1.0)
+        scores[..., :3] *= torch.where(draw.chance(0.35)[:, None, None], shown, 1.0)
+        points, scores = _missed(points, unit, away / height[:, None, None], scores, fps, draw)
+        scores = torch.where(inside, scores, draw.number(0.0, 0.35, frames, 17)).clamp(0.02, 1.0)
+    else:
+        scores = inside.float()
+    points = torch.where(inside[..., None], points, points.clamp(min=0).minimum(extent[:, None, None]))
+    boxes, valid = _followed(points, scores, unit, draw, errors)
+    boxes = torch.minimum(boxes.clamp(min=0), torch.cat([extent, extent], dim=-1)[:, None])
+    return Windows(
+        view.joints / height[:, None, None, None], points, scores, boxes, valid, view.focal, center, view.rotation,
+        extent, fps,
+    )  # fmt: skip

@@ -1,0 +1,288 @@
+"""Lifting by a network that sees a window of time: key points to joints, position and their uncertainty.
+
+The key points are seen as by a level camera (:mod:`tensorsim.vision.lifting.sight`), a network of dilated convolutions
+along time (:mod:`tensorsim.vision.lifting.temporal_net`) finds depths, distance and corrections of the key points.
+"""
+
+import math
+import os
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import coco_to_body, mid_hips
+from tensorsim.config import CameraConfig
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_finite,
+    check_floating,
+    check_points,
+    check_positive,
+    check_size,
+)
+from tensorsim.geometry.camera import camera_to_world, project
+from tensorsim.types import Lifted
+from tensorsim.vision.lifting.sight import RADIUS, level_sight, turned_back
+from tensorsim.vision.lifting.temporal_net import DILATIONS, Located, TemporalNet
+
+
+class TemporalPose(NamedTuple):
+    """People in three dimensions.
+
+    Attributes:
+        joints: (..., P, T, 14, 3) metres about the middle of the hips, in world axes.
+        root: (..., P, T, 3) middle of the hips in the world, metres.
+        deviation: (..., P, T, 14, 3) standard deviations of ``joints`` in metres, along world axes.
+        root_deviation: (..., P, T, 3) of ``root``.
+    """
+
+    joints: Tensor
+    root: Tensor
+    deviation: Tensor
+    root_deviation: Tensor
+
+
+def along_axes(across: Tensor, along: Tensor, azimuth: Tensor) -> Tensor:
+    """Standard deviations (..., 3) along world axes of errors across and along a horizontal direction.
+
+    Args:
+        across, along: (...).
+        azimuth: (..., 2) cosine and sine of the angle of the direction from +y towards +x.
+    """
+    cos, sin = azimuth[..., 0].square(), azimuth[..., 1].square()
+    near, far = across.square(), along.square()
+    return torch.stack([near * cos + far * sin, near * sin + far * cos, near], dim=-1).sqrt()
+
+
+class TemporalLifter(nn.Module):
+    """Key points of tracked people over time -> joints about the hips, position of the hips, standard deviations.
+
+    Args:
+        network: with its weights; None is an untrained one. :meth:`from_pretrained` loads the shipped one.
+        camera: where the camera stands, its tilt and focal length; None is the default one, at the radar.
+        person_height_m: standing heights by order of person; the last one serves all further people.
+        keypoint_threshold: score from which a key point counts as seen.
+        frames_per_block: frames that go through the network at once, which bounds the memory; the result does not
+            depend on it.
+
+    Shape:
+        COCO key points (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
+        valid (..., P, T) bool, height and width of the picture, frames per second -> :class:`TemporalPose`. Frames
+        in which nobody is followed are filled from those around them. Differentiable.
+
+    Raises:
+        TensorsimError: heights that are not positive, wrong shapes, NaN, no frames.
+    """
+
+    heights: Tensor
+    camera_pose: Tensor
+    focal_px: float | None
+    center_px: tuple[float, float] | None
+
+    def __init__(
+        self,
+        network: TemporalNet | None = None,
+        camera: CameraConfig | None = None,
+        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        keypoint_threshold: float = 0.3,
+        frames_per_block: int = 4096,
+    ) -> None:
+        super().__init__()
+        check_positive(keypoint_threshold, "TemporalLifter.keypoint_threshold")
+        check_count(frames_per_block, 1, 2**31, "TemporalLifter.frames_per_block")
+        if len(person_height_m) == 0:
+            raise TensorsimError("TemporalLifter.person_height_m: got no values, expected one per person")
+        for height in person_height_m:
+            check_positive(height, "TemporalLifter.person_height_m")
+        self.network = TemporalNet() if network is None else network
+        self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
+        #: Frames before and after one that have a say in its result.
+        self.reach = self.network.reach + RADIUS
+        camera = CameraConfig() if camera is None else camera
+        self.focal_px, self.center_px = camera.focal_px, camera.center_px
+        self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
+        self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
+        self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
+
+    def seen_by(
+        self, camera: CameraConfig, person_height_m: tuple[float, ...] | None = None
+    ) -> "TemporalLifter":
+        """The same, with the same network, for another camera and, unless None, other people."""
+        heights = tuple(self.heights.tolist()) if person_height_m is None else person_height_m
+        other = TemporalLifter(self.network, camera, heights, self.keypoint_threshold, self.frames_per_block)
+        return other.to(self.heights.device).train(self.training)
+
+    def forward(
+        self,
+        keypoints: Tensor,
+        scores: Tensor,
+        boxes: Tensor,
+        valid: Tensor,
+        image_height: int,
+        image_width: int,
+        fps: float,
+    ) -> TemporalPose:
+        """Key points, scores, boxes, valid, image size and fps -> TemporalPose."""
+        _check(keypoints, scores, boxes, valid)
+        if image_height < 1 or image_width < 1:
+            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        check_positive(fps, "fps")
+        lead, frames = keypoints.shape[:-3], keypoints.shape[-3]
+        tracks = keypoints[..., 0, 0, 0].numel()
+        dtype = self.network.leave.weight.dtype
+        k = keypoints.reshape(tracks, frames, 17, 2).to(dtype)
+        s, b = scores.reshape(tracks, frames, 17).to(dtype), boxes.reshape(tracks, frames, 4).to(dtype)
+        v = valid.reshape(tracks, frames)
+        joints: list[Tensor] = []
+        spreads: list[Tensor] = []
+        ranges: list[Tensor] = []
+        turns: list[Tensor] = []
+        for start in range(0, frames, self.frames_per_block):
+            first, stop = max(start - self.reach, 0), min(start + self.frames_per_block, frames)
+            last = min(stop + self.reach, frames)
+            found, azimuth = self._block(
+                k[:, first:last], s[:, first:last], b[:, first:last], v[:, first:last], image_height, image_width, fps
+            )  # fmt: skip
+            keep = stop - start
+            joints.append(found.joints[:, start - first :][:, :keep])
+            spreads.append(found.log_spread[:, start - first :][:, :keep])
+            ranges.append(found.log_range_spread[:, start - first :][:, :keep])
+            turns.append(azimuth[:, start - first :][:, :keep])
+        height = self._height_of_each(keypoints).to(dtype)[:, None]
+        azimuth = torch.cat(turns, dim=1)
+        points = height[..., None, None] * turned_back(torch.cat(joints, dim=1), azimuth)
+        root = mid_hips(points)
+        # Errors have Laplace's distribution, whose deviation is that many times the mean.
+        spread = math.sqrt(2.0) * height[..., None, None] * torch.cat(spreads, dim=1).exp()
+        off = math.sqrt(2.0) * torch.cat(ranges, dim=1).exp() * root[..., :2].square().sum(dim=-1).sqrt()
+        deviation = along_axes(spread[..., 0], spread[..., 1], azimuth[..., None, :])
+        place = self.camera_pose[:, 3].to(dtype)
+        return TemporalPose(
+            (points - root[..., None, :]).to(keypoints.dtype).unflatten(0, lead),
+            (root + place).to(keypoints.dtype).unflatten(0, lead),
+            deviation.to(keypoints.dtype).unflatten(0, lead),
+            along_axes(0.3 * off, off, azimuth).to(keypoints.dtype).unflatten(0, lead),
+        )
+
+    def in_picture(self, found: TemporalPose, weights: Tensor, image_height: int, image_width: int) -> Lifted:
+        """The pose as :class:`~tensorsim.vision.lifting.metric_pose.MetricPose` takes it.
+
+        Args:
+            found: of :meth:`forward`.
+            weights: (..., P, T, 14) scores of the joints, those that MetricPose is given.
+            image_height, image_width: of the picture, pixels.
+        """
+        focal = self._focal_px(image_width)
+        center = self._center_px(image_height, image_width)
+        pose = self.camera_pose.to(found.root.dtype)
+        pixels, reach = project(found.joints + found.root[..., None, :], focal, center, pose)
+        reach = reach.clamp(min=0.1)
+        hips = 0.5 * (reach[..., 8:9] + reach[..., 11:12])
+        height = self._height_of_each(found.root[..., None, :]).reshape(hips.shape[:-2])[..., None, None]
+        depth = (reach - hips) / height.to(reach.dtype)
+        weights = weights.clamp(min=0.0)
+        weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+        middle = hips[..., 0] / height[..., 0].to(reach.dtype) + (weights * depth).sum(dim=-1)
+        none = torch.zeros_like(middle)
+        return Lifted(depth, focal / middle.clamp(min=0.05), pixels, none.to(torch.int64), none)
+
+    def _block(
+        self,
+        keypoints: Tensor,
+        scores: Tensor,
+        boxes: Tensor,
+        valid: Tensor,
+        rows: int,
+        columns: int,
+        fps: float,
+    ) -> tuple[Located, Tensor]:
+        """Located joints and azimuths of S tracks in some frames."""
+        tracks = keypoints.shape[0]
+        joints, joint_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
+        one = torch.ones(tracks, dtype=keypoints.dtype, device=keypoints.device)
+        center, pose = self._center_px(rows, columns), self.camera_pose.to(keypoints.dtype)
+        sight = level_sight(
+            keypoints,
+            scores,
+            joints,
+            joint_scores,
+            boxes,
+            valid,
+            self._focal_px(columns) * one,
+            torch.stack([center[0] * one, center[1] * one], dim=-1),
+            pose[:, :3].expand(tracks, 3, 3),
+            torch.stack([columns * one, rows * one], dim=-1),
+            fps * one,
+            self.keypoint_threshold,
+        )
+        return self.network(sight), sight.azimuth
+
+    def _height_of_each(self, like: Tensor) -> Tensor:
+        """Standing height of each track, (S,), of (..., P, T, N, D)."""
+        people = like.shape[-4]
+        person = torch.arange(people, device=like.device).clamp(max=self.heights.shape[0] - 1)
+        clips = like[..., 0, 0, 0, 0].numel()
+        return self.heights[person].repeat(clips)
+
+    def _focal_px(self, image_width: int) -> float:
+        focal = self.focal_px
+        return image_width / 2 / self.half_width if focal is None else focal
+
+    def _center_px(self, image_height: int, image_width: int) -> tuple[float, float]:
+        center = self.center_px
+        return ((image_width - 1) / 2, (image_height - 1) / 2) if center is None else center
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        source: str | os.PathLike[str] | None = None,
+        camera: CameraConfig | None = None,
+        person_height_m: tuple[float, ...] = (1.80, 1.70),
+        keypoint_threshold: float = 0.3,
+    ) -> "TemporalLifter":
+        """The lifter with trained weights, in evaluation mode.
+
+        Args:
+            source: a path, a name from ``tensorsim models list``, or None for the shipped weights.
+            camera, person_height_m, keypoint_threshold: see the class.
+
+        Raises:
+            TensorsimError: no such file or name, or weights of another network.
+        """
+        from tensorsim.registry import locate
+        from tensorsim.weights import load_state_dict, load_strict
+
+        path = locate(source, cls.__name__)
+        weights = load_state_dict(path)
+        enter = weights.get("enter.weight")
+        blocks = {key.split(".")[1] for key in weights if key.startswith("blocks.")}
+        if enter is None or enter.dim() != 2 or len(blocks) != len(DILATIONS):
+            raise TensorsimError(
+                f"{path}: got the weights {', '.join(sorted(weights)[:3])}, ..., expected those of a TemporalLifter"
+            )
+        network = TemporalNet(enter.shape[0])
+        load_strict(network, weights, path)
+        return cls(network, camera, person_height_m, keypoint_threshold).eval()
+
+
+def _check(keypoints: Tensor, scores: Tensor, boxes: Tensor, valid: Tensor) -> None:
+    """Refuse inputs that do not fit together."""
+    check_points(keypoints, 4, 17, 2, "keypoints", "(..., P, T, 17, 2) COCO key points in pixels")
+    frames = list(keypoints.shape[:-2])
+    for name, size, expected in (
+        ("scores", list(scores.shape), list(keypoints.shape[:-1])),
+        ("boxes", list(boxes.shape[:-1]), frames),
+        ("valid", list(valid.shape), frames),
+    ):
+        if size != expected:
+            raise TensorsimError(f"{name}: got shape {size}, expected {expected}")
+    check_size(boxes, -1, 4, "boxes", "(..., P, T, 4) xyxy pixels")
+    if valid.dtype != torch.bool:
+        raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
+    if keypoints.shape[-3] < 1:
+        raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
+    for name, values in (("keypoints", keypoints), ("scores", scores), ("boxes", boxes)):
+        check_floating(values, name)
+        check_finite(values, name)
