@@ -1,7 +1,7 @@
 """The whole live chain: a frame in, people, new columns of the maps and a label out."""
 
 import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -271,7 +271,7 @@ def _each_frame_alone(lifter: nn.Module) -> nn.Module:
     return alone
 
 
-def _tracking(config: SimulationConfig) -> dict[str, float]:
+def _tracking(config: SimulationConfig) -> dict[str, Any]:
     """Arguments of the tracker."""
     tracking = config.tracking
     names = (

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -186,7 +186,8 @@ def _captured(
     sequences: list[tuple[Tensor, float]], count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Pieces of captured motion at 0.75 to 1.3 of its speed, of bodies with other proportions and sizes."""
-    pieces, heights = [], []
+    pieces: list[Tensor] = []
+    heights: list[Tensor] = []
     while len(pieces) < count:
         lengths = torch.tensor([len(joints) / fps for joints, fps in sequences]).clamp(max=12.0)
         joints, fps = sequences[int(torch.multinomial(lengths, 1, generator=generator))]
@@ -250,7 +251,7 @@ def build_pool(
     Raises:
         TensorsimError: a damaged file, or one of other motions.
     """
-    settings = {"count": count, "seed": seed, "held_out": held_out}
+    settings: dict[str, Any] = {"count": count, "seed": seed, "held_out": held_out}
     settings |= {"motions": [file.name for file in motions]}
     if path is not None and path.is_file():
         try:

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from tensorsim.config import SimulationConfig
+from tensorsim.config.scene import Body
 from tensorsim.data.sets import outputs
 from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.outputs import OutputConfig, Stored
@@ -116,7 +117,7 @@ def _pair_outputs(
     magnitudes: dict[str, Tensor] = {}
     if kinds & set(outputs.SIGNALS):
         target = simulator.echo.target_echo(points, rcs)
-        signal = simulator.noise(simulator.echo(points, rcs), target)
+        signal = simulator.recorder.noise(simulator.echo(points, rcs), target)
         profiles = simulator.range_profile(signal)
         moving = simulator.mti(profiles)
         found["if_signal"] = outputs.stored_signal(signal[0])
