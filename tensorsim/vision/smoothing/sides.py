@@ -49,8 +49,8 @@ class SteadySides(nn.Module):
     Arms (with the shoulders) and legs (with the hips) are two chains of two states, as found or exchanged. From one
     frame to the next each pair of points, left and right, costs the squared change of the vector between them in
     sizes of the person, times the lower one of its scores. A change of state costs ``change``: the ankles of a walk
-    seen from the side, which pass each other in a few frames, cost less. The path of least cost (Viterbi, IEEE Trans. Inf.
-    Theory 13, 1967) is taken; each exchanged frame costs a little, so that the sides found most of the time stay.
+    seen from the side, which pass each other in a few frames, cost less. The path of least cost is taken (Viterbi, IEEE
+    Trans. Inf. Theory 13, 1967). Each exchanged frame costs a little, so that the sides found most of the time stay.
 
     Args:
         change: squared sizes of the person at 30 frames per second; twice that at 15 and below.
