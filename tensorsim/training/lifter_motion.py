@@ -187,7 +187,7 @@ def _captured(
 ) -> tuple[Tensor, Tensor]:
     """Pieces of captured motion at 0.75 to 1.3 of its speed, of bodies with other proportions and sizes."""
     pieces: list[Tensor] = []
-    heights: list[Tensor] = []
+    heights: list[float] = []
     while len(pieces) < count:
         lengths = torch.tensor([len(joints) / fps for joints, fps in sequences]).clamp(max=12.0)
         joints, fps = sequences[int(torch.multinomial(lengths, 1, generator=generator))]
