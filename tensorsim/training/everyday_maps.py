@@ -192,7 +192,9 @@ class ClipMaker:
 def make_group(index: int, settings: EverydaySettings, maker: ClipMaker, radars: Radars) -> dict[str, Tensor]:
     """One group: ``pictures`` (N, 2, size, size) in bytes, ``activity`` (N,), ``filmed`` (N,)."""
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + index)
-    pictures, labels, films = [], [], []
+    pictures: list[Tensor] = []
+    labels: list[int] = []
+    films: list[bool] = []
     for activity in range(len(ACTIVITIES)):
         for filmed, count in ((True, settings.filmed), (False, settings.true)):
             if count == 0:
