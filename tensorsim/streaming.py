@@ -1,20 +1,19 @@
 """Long films, frame by frame, and long motion, pulse by pulse: memory does not grow with their length."""
 
+from functools import partial
+
+import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from tensorsim import plot
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.progress import picture, progress_bar
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, camera_config
 from tensorsim.vision.smoothing.even_time import to_even_time
-
-
-def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
-    """A progress bar of frames."""
-    return tqdm(desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
 
 
 def pose_of_film(
@@ -118,9 +117,22 @@ def keypoints_of_film(
             k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
             keypoints.append(k)
             scores.append(s)
+            picture(
+                "film",
+                partial(_drawn, frames, boxes[done:stop], k, s, valid[done:stop], stage.keypoint_threshold),
+            )
             done = stop
             bar.update(frames.shape[0])
     return torch.cat(keypoints).transpose(0, 1).unsqueeze(0), torch.cat(scores).transpose(0, 1).unsqueeze(0)
+
+
+def _drawn(
+    frames: Tensor, boxes: Tensor, keypoints: Tensor, scores: Tensor, valid: Tensor, threshold: float
+) -> np.ndarray:
+    """The last of some frames (n, 3, H, W) with its people."""
+    box, points, point_scores, there = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
+    frame = frames[-1].permute(1, 2, 0).numpy()
+    return plot.draw_people(frame, box, points, point_scores, there, threshold)
 
 
 def maps_of_pose(
