@@ -85,7 +85,9 @@ def test_simulate_writes_everything(
     walk: Path, tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "deep" / "out"
-    cli.main(["simulate", str(walk), "--out", str(out), "--person-height", "1.75", "--no-calibrate", *stand_ins])
+    cli.main(
+        ["simulate", str(walk), "--out", str(out), "--person-height", "1.75", "--no-calibrate", *stand_ins]
+    )
     assert {p.name for p in out.iterdir()} == FILES
     assert "1 people in 25 frames" in capsys.readouterr().out
     maps, pose = np.load(out / "maps.npz"), np.load(out / "pose.npz")
