@@ -31,7 +31,7 @@ def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path
     Raises:
         TensorsimError: none of these is there.
     """
-    return _located("detector", detector, "RTMDet"), _located("pose", pose, "HRNet", "CPM")
+    return _located("detector", detector, "RTMDet", "AcfDetector"), _located("pose", pose, "HRNet", "CPM")
 
 
 def _located(role: str, source: str | None, *networks: str) -> Path:
@@ -53,7 +53,6 @@ def load_networks(detector: Path, pose: Path, flip_test: bool) -> tuple[Any, Any
     Raises:
         TensorsimError: files that are damaged, unsafe or of another network.
     """
-    from tensorsim.pipeline import pretrained_pose
-    from tensorsim.vision.detection.rtmdet import RTMDet
+    from tensorsim.pipeline.networks import pretrained_detector, pretrained_pose
 
-    return RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test)
+    return pretrained_detector(detector), pretrained_pose(pose, flip_test)

@@ -9,9 +9,10 @@ import io
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -238,6 +239,14 @@ def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -
             for future in as_completed(futures):
                 found[futures[future]] = future.result()
                 bar.update()
+        except BrokenProcessPool:
+            raise TensorsimError(
+                "a training ended without a result: was it killed, or out of memory?"
+            ) from None
+        except BaseException:
+            for child in active_children():  # they would train to their end
+                child.terminate()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     return [found[k] for k in range(len(trials))]

@@ -52,7 +52,7 @@ class AcfSettings:
     positives: int = 3000
     negatives: int = 3000
     learning_rate: float = 0.5
-    false_per_picture: float = 0.3
+    false_per_picture: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ def crop(image: npt.NDArray[np.uint8], box: Floats, mirrored: bool) -> npt.NDArr
     import cv2
 
     scale = PERSON_HEIGHT / float(box[3] - box[1])
-    source = image
+    source: npt.NDArray[Any] = image
     # Averages first: bilinear interpolation alone would alias.
     if scale < 0.5:
         source = cv2.resize(image, None, fx=2 * scale, fy=2 * scale, interpolation=cv2.INTER_AREA)
