@@ -32,6 +32,7 @@ from tensorsim.config import (
     WallConfig,
 )
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.live import LiveSimulator
 from tensorsim.paper import table as _paper_table
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
@@ -49,6 +50,7 @@ __all__ = [
     "Detections",
     "FloorConfig",
     "InterferenceConfig",
+    "LiveSimulator",
     "Pose",
     "PoseConfig",
     "PoseToDoppler",

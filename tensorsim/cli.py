@@ -9,6 +9,7 @@ from typing import Annotated, Any, NoReturn, Union
 import tyro
 
 from tensorsim import process
+from tensorsim.commands.app import App
 from tensorsim.commands.check import Check
 from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample
 from tensorsim.commands.demo import Demo
@@ -17,17 +18,20 @@ from tensorsim.commands.evaluate_classifier import EvaluateClassifier
 from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
 from tensorsim.commands.evaluate_detector import EvaluateDetector
 from tensorsim.commands.evaluate_films import EvaluateFilms
+from tensorsim.commands.evaluate_lifter import EvaluateLifter
 from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
 from tensorsim.commands.experiment import RunExperiment
 from tensorsim.commands.library import BuildLibrary
+from tensorsim.commands.live import Live
 from tensorsim.commands.models import FetchModels, ListModels, VerifyModels
 from tensorsim.commands.simulate import Simulate
 from tensorsim.commands.train_acf import TrainAcf
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
@@ -41,6 +45,8 @@ examples:
   tensorsim simulate clip.mp4 --out out/ --radar ti-iwr6843
   tensorsim simulate walk.bvh --out out/ --initial-distance 4
   tensorsim demo --activity kicking --out demo/
+  tensorsim live --camera 0
+  tensorsim app
   tensorsim evaluate truth --out truth/ --clips 2
   tensorsim experiment networks --out networks/ --quick
   tensorsim simulate clip.mp4 --out out/ --radar my_radar.yaml
@@ -55,6 +61,8 @@ Networks come with tensorsim; others can be named once for all runs: set TENSORS
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate,
     "demo": Demo,
+    "live": Live,
+    "app": App,
     "evaluate": (
         "Measure the pipeline against the truth, or a network on held-out data.",
         {
@@ -63,6 +71,7 @@ COMMANDS: dict[str, Any] = {
             "pose": EvaluatePose,
             "films": EvaluateFilms,
             "camera": EvaluateCamera,
+            "lifter": EvaluateLifter,
             "denoiser": EvaluateDenoiser,
             "classifier": EvaluateClassifier,
             "measured": EvaluateMeasured,
@@ -76,6 +85,7 @@ COMMANDS: dict[str, Any] = {
             "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
+            "everyday": TrainEveryday,
             "acf": TrainAcf,
         },
     ),

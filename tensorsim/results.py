@@ -2,7 +2,7 @@
 
 import math
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +13,16 @@ from torch import Tensor
 
 from tensorsim import plot
 from tensorsim.config import SimulationConfig
+from tensorsim.data.array_files import save_arrays
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
-from tensorsim.data.video import write_video
+from tensorsim.data.video import VideoWriter
 from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
+from tensorsim.progress import picture, progress_bar
 from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
-from tensorsim.streaming import maps_of_pose, progress_bar
+from tensorsim.report.film import FilmStrip
+from tensorsim.streaming import maps_of_pose
 from tensorsim.types import Pose, RadarMaps
 from tensorsim.vision.tracking.selection import select_people
 
@@ -37,6 +40,7 @@ class Axes:
         time_s: (K,) centres of the Doppler-time columns.
         range_time_rate_hz: columns of the range-time maps per second.
         speed_per_hz: m/s per Hz of Doppler.
+        block: pulses per column of the range-time maps.
     """
 
     range_m: np.ndarray
@@ -44,6 +48,11 @@ class Axes:
     time_s: np.ndarray
     range_time_rate_hz: float
     speed_per_hz: float
+    block: int = 1
+
+    def range_time_s(self, columns: int) -> np.ndarray:
+        """Times (columns,) of the middles of the range-time columns."""
+        return (np.arange(columns) + (self.block - 1) / (2 * self.block)) / self.range_time_rate_hz
 
 
 def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
@@ -59,6 +68,7 @@ def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
         time_s=doppler.frame_times_s(pulses).cpu().numpy() + delay_s,
         range_time_rate_hz=simulator.radar.prf_hz / simulator.range_time_block,
         speed_per_hz=simulator.radar.doppler_wavelength_m / 2,
+        block=simulator.range_time_block,
     )
 
 
@@ -91,6 +101,7 @@ def write_maps(
     axes: Axes,
     truth: RadarMaps | None = None,
     pictures: Pictures = Pictures(),  # immutable
+    formats: Sequence[str] = ("npz",),
 ) -> None:
     """Write ``maps.npz`` and a picture per map.
 
@@ -101,10 +112,11 @@ def write_maps(
         truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
             every picture.
         pictures: how they are drawn.
+        formats: of the arrays, see :func:`~tensorsim.data.array_files.save_arrays`.
     """
-    save_maps(folder / "maps.npz", maps, axes)
+    save_maps(folder / "maps", maps, axes, formats)
     if truth is not None:
-        save_maps(folder / "maps_truth.npz", truth, axes)
+        save_maps(folder / "maps_truth", truth, axes, formats)
     for name, title in (
         ("range_time", "range-time map"),
         ("range_time_mti", "range-time map after moving target indication"),
@@ -112,7 +124,7 @@ def write_maps(
         magnitude = getattr(maps, name).numpy()
         # What the two-pulse canceller gives lies half a pulse later; nothing is left of it at a display rate.
         offset = (maps.range_time.shape[1] - magnitude.shape[1]) / 2
-        time_s = (np.arange(magnitude.shape[1]) + offset) / axes.range_time_rate_hz
+        time_s = axes.range_time_s(magnitude.shape[1]) + offset / axes.range_time_rate_hz
         reference = None if truth is None else getattr(truth, name).numpy()
         plot.save_figure(
             plot.map_figure(
@@ -134,39 +146,40 @@ def write_maps(
             axes.doppler_hz,
             "Doppler-time map",
             "Doppler in Hz, positive = approaching",
-            ridges=_strong_ridges(maps, axes),
+            ridges=strong_ridges(maps, axes),
             speed_per_axis=axes.speed_per_hz,
-            half_span=max(_doppler_span(one, axes) for one in both),
+            half_span=max(doppler_span(one, axes) for one in both),
             reference=None if truth is None else truth.doppler_time.numpy(),
-            reference_ridges=None if truth is None else _strong_ridges(truth, axes),
+            reference_ridges=None if truth is None else strong_ridges(truth, axes),
             **pictures.options("doppler_time"),
         ),
         folder / f"doppler_time.{pictures.suffix}",
     )
 
 
-def save_maps(path: Path, maps: RadarMaps, axes: Axes) -> None:
-    """Write maps and their axes as an npz."""
-    np.savez(
-        path,
-        range_time=maps.range_time.numpy(),
-        range_time_mti=maps.range_time_mti.numpy(),
-        doppler_time=maps.doppler_time.numpy(),
-        ridges_hz=axes.doppler_hz[maps.ridges.numpy()],
-        range_m=axes.range_m,
-        doppler_hz=axes.doppler_hz,
-        time_s=axes.time_s,
-        range_time_rate_hz=axes.range_time_rate_hz,
-    )
+def save_maps(path: Path, maps: RadarMaps, axes: Axes, formats: Sequence[str] = ("npz",)) -> None:
+    """Write maps and their axes; ``path`` has no suffix."""
+    arrays = {
+        "range_time": maps.range_time.numpy(),
+        "range_time_mti": maps.range_time_mti.numpy(),
+        "doppler_time": maps.doppler_time.numpy(),
+        "ridges_hz": axes.doppler_hz[maps.ridges.numpy()],
+        "range_m": axes.range_m,
+        "doppler_hz": axes.doppler_hz,
+        "time_s": axes.time_s,
+        "range_time_s": axes.range_time_s(maps.range_time.shape[1]),
+        "range_time_rate_hz": axes.range_time_rate_hz,
+    }
+    save_arrays(path, arrays, formats)
 
 
-def _strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
+def strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
     """Ridges (3, K) in Hz, NaN where one is no more than noise at the floor of the colours."""
     floor = float(maps.doppler_time.max()) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
     return np.where(maps.ridge_magnitudes.numpy() > floor, axes.doppler_hz[maps.ridges.numpy()], np.nan)
 
 
-def _doppler_span(maps: RadarMaps, axes: Axes) -> float:
+def doppler_span(maps: RadarMaps, axes: Axes) -> float:
     """Half of the part of the Doppler axis that has something to show, in Hz."""
     level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB)
     shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB).any(1)]
@@ -210,26 +223,32 @@ def write_doppler_sound(
     write_sound(folder / "doppler.wav", doppler_sound(signal.cpu(), stage.simulator.radar.prf_hz))
 
 
-def write_pose(folder: Path, pose: Pose, fps: float, pictures: Pictures = Pictures()) -> None:
-    """Write ``pose.npz`` and a picture of the skeletons in the world."""
+def write_pose(
+    folder: Path, pose: Pose, fps: float, pictures: Pictures = Pictures(), formats: Sequence[str] = ("npz",)
+) -> None:
+    """Write ``pose.npz`` (and other formats) and a picture of the skeletons in the world."""
     joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
-    np.savez(
-        folder / "pose.npz",
-        joints_m=joints,
-        keypoints_px=pose.keypoints[0].numpy(),
-        keypoint_scores=pose.keypoint_scores[0].numpy(),
-        boxes_px=pose.boxes[0].numpy(),
-        valid=valid,
-        fps=fps,
-    )
+    arrays: dict[str, np.ndarray | float] = {
+        "joints_m": joints,
+        "keypoints_px": pose.keypoints[0].numpy(),
+        "keypoint_scores": pose.keypoint_scores[0].numpy(),
+        "boxes_px": pose.boxes[0].numpy(),
+        "valid": valid,
+        "fps": fps,
+    }
+    save_arrays(folder / "pose", arrays, formats)
     figure = plot.skeleton_figure(joints, valid, fps, subtitle=pictures.subtitle)
     plot.save_figure(figure, folder / f"skeleton.{pictures.suffix}")
 
 
 def write_overlay(
     folder: Path, chunks: Iterable[Tensor], fps: float, pose: Pose, threshold: float, quiet: bool = False
-) -> None:
-    """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons."""
+) -> FilmStrip:
+    """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons.
+
+    Returns:
+        The same film as a report has it.
+    """
     boxes, keypoints = pose.boxes[0].numpy(), pose.keypoints[0].numpy()
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
 
@@ -249,7 +268,11 @@ def write_overlay(
                     index += 1
                     bar.update(1)
 
-    write_video(folder / "overlay.mp4", drawn(), fps)
+    with VideoWriter(folder / "overlay.mp4", fps) as film, FilmStrip(folder, valid.shape[1], fps) as strip:
+        for frame in drawn():
+            film.add(frame)
+            strip.add(frame)
+    return strip
 
 
 def simulate(
@@ -259,14 +282,26 @@ def simulate(
     config: SimulationConfig,
     device: torch.device,
     quiet: bool = False,
-) -> tuple[Pose, RadarMaps]:
-    """Find the people of a source, choose, and simulate their maps; writes the overlay film."""
+) -> tuple[Pose, RadarMaps, FilmStrip]:
+    """Find the people of a source, choose, and simulate their maps; writes the overlay film, and returns it as well."""
     pose = select_people(source.pose(quiet), config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
+    picture(
+        "world",
+        lambda: _figure_pixels(
+            plot.skeleton_figure(pose.joints[0].numpy(), pose.valid[0].numpy(), source.fps)
+        ),
+    )
     torch.manual_seed(config.seed)
     maps = maps_of_pose(stage, pose, source.fps, device, quiet)
-    write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
-    return pose, maps
+    film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
+    return pose, maps, film
+
+
+def _figure_pixels(figure: Any) -> np.ndarray:
+    """A figure as (H, W, 3) uint8 RGB."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
 def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:

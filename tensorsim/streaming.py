@@ -1,19 +1,19 @@
 """Long films, frame by frame, and long motion, pulse by pulse: memory does not grow with their length."""
 
+from functools import partial
+
+import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from tensorsim import plot
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.progress import picture, progress_bar
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, camera_config
-
-
-def progress_bar(name: str, total: int | None, quiet: bool) -> tqdm:
-    """A progress bar of frames."""
-    return tqdm(desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
+from tensorsim.vision.smoothing.even_time import to_even_time
 
 
 def pose_of_film(
@@ -33,7 +33,8 @@ def pose_of_film(
         calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
 
     Returns:
-        The Pose of one clip (B = 1) on the CPU; equal to ``stage(video, fps)`` of the whole film.
+        The Pose of one clip (B = 1) on the CPU, at ``reader.fps`` frames per second; equal to ``stage(video, fps)`` of
+        the whole film, or ``stage(video, fps, times_s=...)`` where its frames are at uneven times.
 
     Raises:
         TensorsimError: the film has fewer than 2 frames.
@@ -42,6 +43,9 @@ def pose_of_film(
     tracks = stage.follow(detections, observed)
     keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet)
     size = reader.height, reader.width
+    if reader.uneven_times_s is not None:
+        times_s = reader.uneven_times_s[None]
+        tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, reader.fps)
     if calibrate:
         stage, _ = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
     pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
@@ -113,9 +117,22 @@ def keypoints_of_film(
             k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
             keypoints.append(k)
             scores.append(s)
+            picture(
+                "film",
+                partial(_drawn, frames, boxes[done:stop], k, s, valid[done:stop], stage.keypoint_threshold),
+            )
             done = stop
             bar.update(frames.shape[0])
     return torch.cat(keypoints).transpose(0, 1).unsqueeze(0), torch.cat(scores).transpose(0, 1).unsqueeze(0)
+
+
+def _drawn(
+    frames: Tensor, boxes: Tensor, keypoints: Tensor, scores: Tensor, valid: Tensor, threshold: float
+) -> np.ndarray:
+    """The last of some frames (n, 3, H, W) with its people."""
+    box, points, point_scores, there = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
+    frame = frames[-1].permute(1, 2, 0).numpy()
+    return plot.draw_people(frame, box, points, point_scores, there, threshold)
 
 
 def maps_of_pose(

@@ -34,6 +34,7 @@ FILES = {
     "doppler_time.png",
     "skeleton.png",
     "overlay.mp4",
+    "report.html",
 }
 
 

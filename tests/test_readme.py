@@ -95,7 +95,7 @@ def test_commands_run_verbatim(tmp_path: Path, shared_data: Path) -> None:
     assert len(commands) >= 5
     for command in commands:
         subprocess.run(command, shell=True, check=True, cwd=tmp_path, env=environment)
-        for folder, files in (("out", 8), ("demo", 11)):
+        for folder, files in (("out", 9), ("demo", 12)):
             if f"--out {folder}/" in command:
                 assert len(list((tmp_path / folder).iterdir())) == files
                 if folder == "out":  # a picture is made of the files in the other

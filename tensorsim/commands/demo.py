@@ -81,14 +81,16 @@ class Demo(NetworkOptions, RadarOptions):
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people, device)
-                pose, maps = results.simulate(source, maps_stage, folder, config, device, self.quiet)
+                pose, maps, strip = results.simulate(source, maps_stage, folder, config, device, self.quiet)
                 torch.manual_seed(config.seed)
                 rate_hz = FILM_FPS * MOMENTS_PER_FRAME
                 joints = true_pose(truth.joints, truth.valid)
                 true_maps = maps_of_pose(true_stage, joints, rate_hz, device, self.quiet)
                 somebody = bool(truth.valid.any() | pose.valid.any())
                 name = f"demo: {ACTIVITIES[activity]}"
-                done = Run(config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device)
+                done = Run(
+                    config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device, strip
+                )
                 label = self.write_results(folder, done, true_maps)
                 write_pose_truth(folder, film, truth.valid)
                 likeness, empty_likeness = likeness_to_truth(maps, true_maps)
@@ -101,7 +103,9 @@ class Demo(NetworkOptions, RadarOptions):
                     "options": self.described(),
                     "warnings": messages,
                 }
-                results.write_summary(folder, label | results.summary_of(source, config, pose, maps) | about)
+                summary = label | results.summary_of(source, config, pose, maps) | about
+                self.write_report(folder, done, summary, true_maps)
+                results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         found = f"{ACTIVITIES[activity]}, {int(pose.valid[0].any(1).sum())} people found"
@@ -109,7 +113,7 @@ class Demo(NetworkOptions, RadarOptions):
 
     def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":
         """The configuration for a film of the demonstration, with the files of its networks."""
-        config = at_display_rate(self.configuration(), self.duration)
+        config = at_display_rate(self.configuration(), self.full_rate)
         if not self.flip_test:
             config = config.replace(pose__flip_test=False)
         return config.replace(tracking__detector=str(detector), pose__network=str(pose_network))

@@ -11,6 +11,7 @@ import tyro
 
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
+from tensorsim.data.array_files import array_formats
 from tensorsim.errors import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
     from tensorsim.config import SimulationConfig
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.recognition import ActivityRecognizer
+    from tensorsim.report import FilmStrip
     from tensorsim.results import Pictures
     from tensorsim.types import Pose, RadarMaps
 
-#: Above this many pulses (16 s in free space) range-time maps are kept at a display rate instead of every pulse.
-FULL_RATE_PULSES = 1 << 17
+#: Columns per second of the range-time maps that are written, unless every pulse is asked for.
 DISPLAY_RATE_HZ = 256.0
 
 #: The field of the configuration that an option sets.
@@ -107,6 +108,10 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     """Draw no ridges over the Doppler-time map."""
     sound: bool = False
     """Write doppler.wav as well, the micro-Doppler as sound: approaching motion left, receding motion right."""
+    full_rate: bool = False
+    """Keep a column of the range-time maps for every pulse, not 256 per second."""
+    save: Annotated[str, tyro.conf.arg(metavar="npz,mat,h5")] = "npz"
+    """Formats of maps and poses: .npz, which is always written, and mat for MATLAB or h5 for HDF5 beside it."""
     device: str = "auto"
     """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
     quiet: bool = False
@@ -126,6 +131,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
             raise TensorsimError(
                 f"--least-probability: got {self.least_probability}, expected a number from 0 to 1"
             )
+        array_formats(self.save)
         if out.exists() and not out.is_dir():
             raise TensorsimError(f"--out: {out} is a file, expected a folder")
 
@@ -176,12 +182,25 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         pose, maps, stage = run.pose, run.maps, run.stage
         label = results.label_of(run.recognizer, maps, pose.valid.shape[2] / run.fps, self.least_probability)
         warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()))
-        pictures = self.pictures(stage, label["label"], run.film, run.somebody)
-        results.write_maps(folder, maps, results.axes_of(stage, maps), truth, pictures)
-        results.write_pose(folder, pose, run.fps, pictures)
+        pictures, formats = (
+            self.pictures(stage, label["label"], run.film, run.somebody),
+            array_formats(self.save),
+        )
+        results.write_maps(folder, maps, results.axes_of(stage, maps), truth, pictures, formats)
+        results.write_pose(folder, pose, run.fps, pictures, formats)
         if self.sound:
             results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
         return label
+
+    def write_report(
+        self, folder: Path, run: "Run", summary: dict[str, Any], truth: "RadarMaps | None" = None
+    ) -> None:
+        """Write ``report.html`` of a run with this summary."""
+        from tensorsim import report, results
+
+        axes = results.axes_of(run.stage, run.maps)
+        pictures = self.pictures(run.stage, summary["label"], run.film, run.somebody)
+        report.write_report(folder, summary, run.pose, run.fps, run.maps, axes, run.strip, pictures, truth)
 
     def configuration(self) -> "SimulationConfig":
         """The configuration of the run: that of ``--config``, with the other options in place of its fields.
@@ -240,6 +259,7 @@ class Run(NamedTuple):
         film: what the people come from, for the titles.
         somebody: whether a person is in the scene.
         device: that ``stage`` is on.
+        strip: the overlay film as a report has it.
     """
 
     config: "SimulationConfig"
@@ -251,18 +271,27 @@ class Run(NamedTuple):
     film: str
     somebody: bool
     device: "torch.device"
+    strip: "FilmStrip"
 
 
-def at_display_rate(config: "SimulationConfig", length_s: float) -> "SimulationConfig":
-    """The configuration for motion of about this many seconds: range-time maps of long motion at a display rate."""
-    long = length_s * config.scene.radar.prf_hz > FULL_RATE_PULSES
-    if config.processing.display_rate_hz is None and long:
+def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "SimulationConfig":
+    """The configuration with range-time maps of a display rate, or of every pulse."""
+    if full_rate:
+        return config.replace(processing__display_rate_hz=None)
+    if config.processing.display_rate_hz is None and config.scene.radar.prf_hz > DISPLAY_RATE_HZ:
         return config.replace(processing__display_rate_hz=DISPLAY_RATE_HZ)
     return config
 
 
+#: Speeds that the radars of the classifiers' training resolve (the through-wall preset: 0.6 m/s), with a margin.
+COARSEST_M_S = 0.8
+
+
 def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
-    """The classifier of the maps of this radar; None if no label is wanted.
+    """The classifier of the maps of this radar; None if no label is wanted or the radar is unlike those of training.
+
+    The pictures of the shipped networks show speeds up to 3.8 m/s, resolved to 0.6 m/s or better. A radar for which
+    faster motion folds, or which resolves speeds less, gets no label but a warning.
 
     Raises:
         TensorsimError: weights that are not there, of another network, or without names of their classes.
@@ -275,14 +304,20 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
         recognizer = ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier)
     except TensorsimError as error:
         raise TensorsimError(f"--classifier: {error}") from None
-    # Faster motion would fold into the picture that the network sees.
-    if config.scene.radar.unambiguous_speed_m_s < 0.9 * recognizer.speed_m_s:
-        warnings.warn(
-            f"no label: the radar sees speeds up to {config.scene.radar.unambiguous_speed_m_s:.2g} m/s, the classifier "
-            f"was trained on speeds up to {recognizer.speed_m_s:.2g} m/s",
-            TensorsimWarning,
-            stacklevel=2,
+    radar, unlike = config.scene.radar, None
+    resolution_m_s = radar.doppler_wavelength_m / 2 / config.processing.window_s
+    if radar.unambiguous_speed_m_s < 0.9 * recognizer.speed_m_s:
+        unlike = (
+            f"sees speeds up to {radar.unambiguous_speed_m_s:.2g} m/s, the classifier was trained on speeds up to "
+            f"{recognizer.speed_m_s:.2g} m/s"
         )
+    elif resolution_m_s > COARSEST_M_S:
+        unlike = (
+            f"resolves speeds {resolution_m_s:.2g} m/s apart, the classifier was trained on radars that resolve "
+            f"{COARSEST_M_S:.2g} m/s or less"
+        )
+    if unlike is not None:
+        warnings.warn(f"no label: the radar {unlike}", TensorsimWarning, stacklevel=2)
         return None
     return recognizer
 

@@ -1,46 +1,72 @@
 """The parameters of the original's control panel as options, under the panel's names."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import tyro
 
 _XYZ = tyro.conf.arg(metavar="X Y Z")
 
-#: The field of the configuration that an option of the panel sets.
-PANEL_FIELDS = {
-    "keypoint_threshold": "pose__keypoint_threshold",
-    "person_weight": "pose__person_weight_kg",
-    "min_detection_size": "tracking__min_box_px",
-    "detection_interval": "tracking__detection_interval",
-    "max_tracks": "tracking__max_tracks",
-    "confirmation_hits": "tracking__confirm_hits",
-    "confirmation_window": "tracking__confirm_window",
-    "deletion_misses": "tracking__delete_misses",
-    "deletion_window": "tracking__delete_window",
-    "assignment_threshold": "tracking__assignment_threshold",
-    "process_noise": "tracking__process_noise",
-    "measurement_noise": "tracking__measurement_noise",
-    "carrier_hz": "scene__radar__carrier_hz",
-    "chirp_s": "scene__radar__chirp_s",
-    "bandwidth_hz": "scene__radar__bandwidth_hz",
-    "prf_hz": "scene__radar__prf_hz",
-    "sample_rate_hz": "scene__radar__sample_rate_hz",
-    "tx_position": "scene__radar__tx_m",
-    "rx_position": "scene__radar__rx_m",
-    "antenna_gain_dbi": "scene__radar__antenna_gain_dbi",
-    "isolation_db": "scene__radar__isolation_db",
-    "wall_permittivity": "scene__wall__relative_permittivity",
-    "wall_loss_tangent": "scene__wall__loss_tangent",
-    "wall_size": "scene__wall__size_m",
-    "wall_center": "scene__wall__center_m",
-    "smoothing_ratio": "smoothing__smoothing_ratio",
-    "range_window": "processing__range_window",
-    "mti": "processing__mti",
-    "stft_window": "processing__window_s",
-    "stft_overlap": "processing__overlap",
-    "ridges": "processing__ridge_count",
-}
+
+class Parameter(NamedTuple):
+    """A parameter of the panel.
+
+    Attributes:
+        group: of the panel.
+        name: in the panel.
+        option: of the command line, with underscores.
+        field: of :class:`~tensorsim.SimulationConfig`, sections joined by two underscores.
+        unit: of the option; "" without.
+    """
+
+    group: str
+    name: str
+    option: str
+    field: str
+    unit: str
+
+
+PANEL = (
+    Parameter("VISION", "Person height", "person_height", "pose__person_height_m", "m"),
+    Parameter("VISION", "Person weight", "person_weight", "pose__person_weight_kg", "kg"),
+    Parameter("VISION", "Initial distance", "initial_distance", "pose__initial_distance_m", "m"),
+    Parameter("VISION", "Keypoint threshold", "keypoint_threshold", "pose__keypoint_threshold", ""),
+    Parameter("VISION", "Minimum detection size", "min_detection_size", "tracking__min_box_px", "px"),
+    Parameter("VISION", "Detection interval", "detection_interval", "tracking__detection_interval", "frames"),
+    Parameter("VISION", "Maximum number of tracks", "max_tracks", "tracking__max_tracks", "people"),
+    Parameter(
+        "VISION", "Confirmation threshold, hits", "confirmation_hits", "tracking__confirm_hits", "frames"
+    ),
+    Parameter(
+        "VISION", "Confirmation threshold, of", "confirmation_window", "tracking__confirm_window", "frames"
+    ),
+    Parameter("VISION", "Deletion threshold, misses", "deletion_misses", "tracking__delete_misses", "frames"),
+    Parameter("VISION", "Deletion threshold, of", "deletion_window", "tracking__delete_window", "frames"),
+    Parameter("VISION", "Assignment threshold", "assignment_threshold", "tracking__assignment_threshold", ""),
+    Parameter("VISION", "Process noise", "process_noise", "tracking__process_noise", "size^2 / frame^3"),
+    Parameter("VISION", "Measurement noise", "measurement_noise", "tracking__measurement_noise", "size^2"),
+    Parameter("RADAR", "Carrier frequency", "carrier_hz", "scene__radar__carrier_hz", "Hz"),
+    Parameter("RADAR", "Chirp duration", "chirp_s", "scene__radar__chirp_s", "s"),
+    Parameter("RADAR", "Bandwidth", "bandwidth_hz", "scene__radar__bandwidth_hz", "Hz"),
+    Parameter("RADAR", "PRF", "prf_hz", "scene__radar__prf_hz", "Hz"),
+    Parameter("RADAR", "Sampling frequency", "sample_rate_hz", "scene__radar__sample_rate_hz", "Hz"),
+    Parameter("RADAR", "Tx position", "tx_position", "scene__radar__tx_m", "m"),
+    Parameter("RADAR", "Rx position", "rx_position", "scene__radar__rx_m", "m"),
+    Parameter("RADAR", "Antenna gain", "antenna_gain_dbi", "scene__radar__antenna_gain_dbi", "dBi"),
+    Parameter("RADAR", "Isolation", "isolation_db", "scene__radar__isolation_db", "dB"),
+    Parameter("RADAR", "SNR", "snr", "scene__snr_db", "dB"),
+    Parameter("WALL", "Relative permittivity", "wall_permittivity", "scene__wall__relative_permittivity", ""),
+    Parameter("WALL", "Loss tangent", "wall_loss_tangent", "scene__wall__loss_tangent", ""),
+    Parameter("WALL", "Wall size", "wall_size", "scene__wall__size_m", "m"),
+    Parameter("WALL", "Wall center", "wall_center", "scene__wall__center_m", "m"),
+    Parameter("PROCESSING", "Smoothing ratio", "smoothing_ratio", "smoothing__smoothing_ratio", "s"),
+    Parameter("PROCESSING", "Range window", "range_window", "processing__range_window", ""),
+    Parameter("PROCESSING", "MTI", "mti", "processing__mti", ""),
+    Parameter("PROCESSING", "STFT window", "stft_window", "processing__window_s", "s"),
+    Parameter("PROCESSING", "STFT overlap", "stft_overlap", "processing__overlap", ""),
+    Parameter("PROCESSING", "Number of ridges", "ridges", "processing__ridge_count", ""),
+    Parameter("PROCESSING", "Denoiser", "denoiser", "processing__denoiser", "file or name"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,3 +135,11 @@ class PanelOptions:
     """Shared part of neighbouring STFT windows. Default: 0.9."""
     ridges: int | None = None
     """Ridges of the Doppler-time map. Default: 3."""
+
+
+#: The field of the configuration that an option of :class:`PanelOptions` sets.
+PANEL_FIELDS = {
+    parameter.option: parameter.field
+    for parameter in PANEL
+    if parameter.option in PanelOptions.__dataclass_fields__
+}

@@ -51,7 +51,7 @@ _MEANT_FOR = {
 class Simulate(NetworkOptions, RadarOptions):
     """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
 
-    Writes maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
+    Writes report.html, maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
     """
 
     source: tyro.conf.Positional[Path]
@@ -115,18 +115,28 @@ class Simulate(NetworkOptions, RadarOptions):
         with collected_warnings() as messages, torch.inference_mode():
             recognizer = load_recognizer(config)
             source, config = self._source(kind, config, device)
-            length_s = 0.0 if source.frame_count is None else source.frame_count / source.fps
-            config = at_display_rate(config, length_s)
+            config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps = results.simulate(source, stage, folder, config, device, self.quiet)
+                pose, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
                 somebody = bool(pose.valid.any())
                 done = Run(
-                    config, stage, recognizer, pose, maps, source.fps, self.source.name, somebody, device
+                    config,
+                    stage,
+                    recognizer,
+                    pose,
+                    maps,
+                    source.fps,
+                    self.source.name,
+                    somebody,
+                    device,
+                    film,
                 )
                 label = self.write_results(folder, done)
                 summary = label | results.summary_of(source, config, pose, maps)
-                results.write_summary(folder, summary | {"options": self.described(), "warnings": messages})
+                summary |= {"options": self.described(), "warnings": messages}
+                self.write_report(folder, done, summary)
+                results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""

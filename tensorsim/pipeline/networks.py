@@ -74,5 +74,9 @@ def pretrained_lifter(people: PoseConfig) -> NearestPoseLifter | TemporalLifter:
         )
     library = None if people.library is None else load_pose_library(people.library)
     return NearestPoseLifter(
-        library, neighbours=people.neighbours, temporal=people.temporal, pitch_rad=people.camera.pitch_rad
+        library,
+        neighbours=people.neighbours,
+        temporal=people.temporal,
+        pitch_rad=people.camera.pitch_rad,
+        roll_rad=people.camera.roll_rad,
     ).eval()

@@ -139,6 +139,7 @@ class RadarSimulator(nn.Module):
         self.fixed_gate_m = None if isinstance(gate_m, float | int) else gate_m
         self.range_profile = RangeProfile(radar, processing.range_window, self.fixed_gate_m)
         self.recorder = Recorder(scene, processing, self.echo, self.range_profile, seed)
+        self.noise = self.recorder.noise
         self.channels, self.has_array = self.recorder.channels, radar.has_array
         self.gate: nn.Module | None = None
         if isinstance(gate_m, float | int):
@@ -300,6 +301,24 @@ class RadarSimulator(nn.Module):
             ridges.magnitudes,
             decibels(levels.signal, noise / (pulses * self.echo.samples))[0].to(whole),
         )
+
+    @torch.no_grad()
+    def advance(self, positions: Tensor, rcs: Tensor, first: int, pending: Pending | None) -> Piece:
+        """Maps of the next pulses of a scene without end.
+
+        The noise is that of an empty scene, see the class, as the power of what is still to come is not known.
+
+        Args:
+            positions: (B, m, S, 3) metres, m above the ``lost_pulses`` of the moving target indicator.
+            rcs: (B, m, S) m^2.
+            first: number of the first of these pulses.
+            pending: of the piece before; None begins.
+        """
+        rcs = check_scene(positions, rcs)
+        pending = self._nothing_pending(positions) if pending is None else pending
+        nothing = torch.zeros(positions.shape[0], dtype=torch.float64)
+        fresh, _ = self.recorder.received(positions, rcs, first, None, Levels(nothing, nothing), [])
+        return self._piece(fresh, positions, rcs, pending)
 
     def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
         """Pieces of a source, checked: number of the first pulse, positions (1, m, S, 3), RCS (1, m, S), way ahead.

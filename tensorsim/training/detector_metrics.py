@@ -121,7 +121,7 @@ def people_in(detector: RTMDet | AcfDetector, sample: Sample) -> tuple[Tensor, T
     """Boxes (n, 4) and scores (n,) of the people that a detector finds in a picture, on the CPU."""
     image = torch.from_numpy(sample.image()).permute(2, 0, 1)[None]
     with torch.no_grad():
-        seen: Detections = detector(image.to(detector.mean.device))
+        seen: Detections = detector(image.to(next(detector.buffers()).device))
     persons = seen.valid[0] & (seen.labels[0] == 0)
     return seen.boxes[0][persons].cpu(), seen.scores[0][persons].cpu()
 
@@ -184,7 +184,7 @@ def tracks_of_film(detector: RTMDet | AcfDetector, path: str | os.PathLike[str],
     reader = VideoReader(path)
     found: list[Detections] = []
     observed: list[bool] = []
-    last, device = torch.empty(0), detector.mean.device
+    last, device = torch.empty(0), next(detector.buffers()).device
     with torch.no_grad():
         for frames in reader.chunks(interval):
             found.append(detector(frames[:1].to(device)))

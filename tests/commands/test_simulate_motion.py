@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.io import loadmat
 
 import tensorsim as ts
 from tensorsim import cli
@@ -52,6 +53,26 @@ def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
     valid = torch.ones(1, 1, 45, dtype=torch.bool)
     expected = ts.PoseToDoppler(simulator)(joints, valid, FPS).doppler_time[0].numpy()
     assert maps["doppler_time"] == pytest.approx(expected, abs=2e-3 * float(expected.max()))
+
+
+def test_maps_at_display_rate_or_of_every_pulse(walk: np.ndarray, tmp_path: Path) -> None:
+    """Columns are root mean squares of the pulses of each; MATLAB's file has the same arrays."""
+    np.savez(tmp_path / "walk.npz", walk=walk[:12], fps=FPS)
+    for name, options in (("few", ["--save", "mat"]), ("all", ["--full-rate"])):
+        arguments = ["simulate", str(tmp_path / "walk.npz"), "--out", str(tmp_path / name), "--quiet"]
+        cli.main([*arguments, "--prf-hz", "2048", "--classifier", "none", *options])
+    few, every = (np.load(tmp_path / name / "maps.npz") for name in ("few", "all"))
+    assert every["range_time"].shape == (200, round(12 / FPS * 2048))
+    assert float(few["range_time_rate_hz"]) == 256.0
+    pulses = every["range_time"][:, : 8 * 100].reshape(200, 100, 8)
+    assert few["range_time"][:, :100] == pytest.approx(np.sqrt((pulses**2).mean(2)), rel=1e-4)
+    times = every["range_time_s"][: 8 * 100].reshape(100, 8)
+    assert few["range_time_s"][:100] == pytest.approx(times.mean(1))
+    assert np.array_equal(few["doppler_time"], every["doppler_time"])
+    mat = loadmat(tmp_path / "few" / "maps.mat", squeeze_me=True)
+    for key in few.files:
+        assert np.array_equal(mat[key], few[key])
+    assert loadmat(tmp_path / "few" / "pose.mat")["joints_m"].shape == (1, 12, 14, 3)
 
 
 def test_place_heading_and_part(walk: np.ndarray, tmp_path: Path) -> None:

@@ -73,6 +73,18 @@ class TestSimulatorOfAnArray(SceneCase):
     def test_exports(self) -> None:
         super().test_exports()
 
+    def test_gradients_against_finite_differences(self) -> None:
+        """With noise of one seed, as for one antenna: magnitudes next to zero have kinks."""
+        module = RadarSimulator(ARRAY, snr_db=10.0).double()
+        p, rcs = self.inputs((), torch.float64)
+
+        def function(p: Tensor, rcs: Tensor) -> list[Tensor]:
+            torch.manual_seed(0)
+            return [x for x in module(p, rcs) if x.requires_grad]
+
+        inputs = (p.requires_grad_(True), rcs.requires_grad_(True))
+        assert torch.autograd.gradcheck(function, inputs, fast_mode=True, rtol=1e-3)
+
 
 def moving(
     azimuth_deg: float, speed_m_s: float, pulses: int, radar: RadarConfig, range_m: float = 3.0

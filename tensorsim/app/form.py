@@ -1,0 +1,149 @@
+"""The controls of the app, made from the options of ``simulate``: groups, units, help, and values back to options."""
+
+import ast
+import inspect
+import textwrap
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, Literal, get_args, get_type_hints
+
+from tensorsim.commands.demo import Demo
+from tensorsim.commands.panel import PANEL
+from tensorsim.commands.simulate import Simulate
+from tensorsim.errors import TensorsimError
+
+#: Options beside those of the panel, by group.
+_MORE = {
+    "SCENE": [
+        "body",
+        "sway",
+        "vital_signs",
+        "multipath",
+        "leakage",
+        "wall_echo",
+        "wall_paths",
+        "integration",
+        "motion",
+        "people",
+        "seed",
+    ],
+    "CAMERA": ["camera_fov", "calibrate", "position", "fps", "start", "end", "stride", "flip_test"],
+    "PICTURES": ["colormap", "dynamic_range", "hide_ridges", "figure_format", "full_rate", "sound"],
+}
+GROUPS = ("VISION", "RADAR", "WALL", "PROCESSING", *_MORE)
+
+
+@dataclass(frozen=True)
+class Control:
+    """A control of the form.
+
+    Attributes:
+        option: of :class:`~tensorsim.commands.simulate.Simulate`.
+        group: of :data:`GROUPS`.
+        label: with its unit.
+        help: what the option does and its default.
+        kind: ``"number"``, ``"integer"``, ``"numbers"`` (some, separated by spaces), ``"choice"``, ``"switch"`` or
+            ``"text"``.
+        choices: of a choice; the empty one leaves the default.
+        default: what the control shows at first.
+    """
+
+    option: str
+    group: str
+    label: str
+    help: str
+    kind: str
+    choices: tuple[str, ...]
+    default: Any
+
+    def value_of(self, given: Any) -> Any:
+        """The value of the option that was given; None where the control was left empty.
+
+        Raises:
+            TensorsimError: numbers that are none.
+        """
+        if self.kind == "switch":
+            return bool(given)
+        if given is None or (isinstance(given, str) and not given.strip()):
+            return None
+        try:
+            if self.kind == "numbers":
+                return tuple(float(part) for part in str(given).replace(",", " ").split())
+            if self.kind == "integer":
+                if float(given) != int(float(given)):
+                    raise ValueError
+                return int(float(given))
+            return float(given) if self.kind == "number" else str(given).strip()
+        except ValueError:
+            expected = "a whole number" if self.kind == "integer" else "numbers"
+            raise TensorsimError(f"{self.label}: got {given!r}, expected {expected}") from None
+
+
+def controls() -> list[Control]:
+    """The controls in the order of their groups."""
+    helps, hints = _field_docstrings(Simulate), get_type_hints(Simulate)
+    defaults = {field.name: field.default for field in fields(Simulate)}
+    named = [(p.option, p.group, p.name + (f" ({p.unit})" if p.unit else "")) for p in PANEL]
+    for group, options in _MORE.items():
+        named += [(option, group, option.replace("_", " ").capitalize()) for option in options]
+    made = []
+    for option, group, label in named:
+        kind, choices = _kind(hints[option])
+        default = None if defaults[option] is MISSING else defaults[option]
+        made.append(Control(option, group, label, helps[option], kind, choices, default))
+    return sorted(made, key=lambda control: GROUPS.index(control.group))
+
+
+def options_of(values: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of the command for the values of the controls by option; those left at their default are not named.
+
+    Raises:
+        TensorsimError: see :meth:`Control.value_of`.
+    """
+    given = {}
+    for control in controls():
+        value = control.value_of(values.get(control.option, control.default))
+        if value is not None and value != control.default:
+            given[control.option] = value
+    return given
+
+
+def for_demo(options: dict[str, Any]) -> dict[str, Any]:
+    """The same options for a generated person.
+
+    Raises:
+        TensorsimError: an option that a film alone has.
+    """
+    unknown = [name for name in options if name not in Demo.__dataclass_fields__]
+    if unknown:
+        raise TensorsimError(
+            f"{unknown[0].replace('_', ' ')}: got it for a generated person, expected it for a film only"
+        )
+    return options
+
+
+def _kind(hint: Any) -> tuple[str, tuple[str, ...]]:
+    """The kind of control of an option of this type, and its choices."""
+    members = [member for member in get_args(hint) if member is not type(None)] or [hint]
+    if getattr(hint, "__origin__", None) is Literal:
+        return "choice", tuple(get_args(hint))
+    if getattr(members[0], "__origin__", None) is Literal:
+        return "choice", ("", *get_args(members[0]))
+    if getattr(members[0], "__origin__", None) is tuple:
+        return "numbers", ()
+    if members[0] is bool:
+        # A switch that may also be left to the scene.
+        return ("choice", ("", "on", "off")) if len(get_args(hint)) > 1 else ("switch", ())
+    return {float: "number", int: "integer"}.get(members[0], "text"), ()
+
+
+def _field_docstrings(cls: type) -> dict[str, str]:
+    """The string below each field of a data class and of its bases."""
+    texts: dict[str, str] = {}
+    for base in reversed(cls.__mro__[:-1]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
+            is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
+                texts[field.target.id] = " ".join(str(text.value.value).split())  # type: ignore[attr-defined]
+    return texts

@@ -1,0 +1,242 @@
+"""The page of the app: controls, what is going on, and the results of one or two runs."""
+
+import html
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gradio as gr
+
+from tensorsim.app.form import GROUPS, Control, controls, for_demo, options_of
+from tensorsim.app.runs import ARCHIVE, Run, Runs
+from tensorsim.commands.demo import Demo
+from tensorsim.commands.simulate import Simulate
+from tensorsim.config import ACTIVITIES
+from tensorsim.errors import TensorsimError
+from tensorsim.radar.presets import PRESETS
+
+#: Kinds of files that can be dropped.
+FILE_TYPES = [".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".m4v", ".bvh", ".npz", ".json"]
+_SCENES = ("free-space", "through-wall")
+_EXAMPLES = {
+    "Walking": ("walking", "free-space", "4"),
+    "Walking behind a wall": ("walking", "through-wall", "4"),
+    "Falling": ("walking to falling", "free-space", "6"),
+}
+CSS = """
+.result iframe { width: 100%; height: 1500px; border: 1px solid #8886; border-radius: 4px; }
+.result { display: flex; flex-wrap: wrap; gap: 0.75rem; }
+.result > section { flex: 1 1 360px; min-width: 0; }
+.result a { margin-right: 0.8rem; }
+.failed { color: #c0261d; font-weight: 600; }
+"""
+
+
+def build(runs: Runs, longest_s: float) -> gr.Blocks:
+    """The page.
+
+    Args:
+        runs: where simulations run.
+        longest_s: longest film in seconds.
+    """
+    made = controls()
+    with gr.Blocks(title="tensorsim", analytics_enabled=False, delete_cache=(600, 3600)) as page:
+        gr.Markdown("# tensorsim\nWhat a radar would have seen of the people in a film.")
+        with gr.Row():
+            with gr.Column(scale=1, min_width=300):
+                film = gr.File(
+                    label=f"Film, up to {longest_s:g} s; motion capture; key points", file_types=FILE_TYPES
+                )
+                activity = gr.Dropdown(
+                    _activities(), value="walking", label="Or an activity of a generated person"
+                )
+                duration = gr.Number(
+                    4.0, label="Length of the generated film (s)", minimum=0.5, maximum=longest_s
+                )
+                scene = gr.Radio(_SCENES, value="free-space", label="Scene")
+                radar = gr.Dropdown(["", *PRESETS], value="", label="Radar preset")
+                paper = gr.Checkbox(label="Formulas of the paper, as printed")
+                inputs = {film, activity, duration, scene, radar, paper}
+                components = {}
+                for group in GROUPS:
+                    with gr.Accordion(group.capitalize(), open=False):
+                        for control in (c for c in made if c.group == group):
+                            components[control.option] = component = _component(control)
+                            inputs.add(component)
+                with gr.Row():
+                    start = gr.Button("Simulate", variant="primary", elem_id="simulate")
+                    compare = gr.Button("Compare", elem_id="compare")
+                    cancel = gr.Button("Cancel", elem_id="cancel")
+                gr.Markdown("Compare runs with the settings of now and keeps the last result beside it.")
+                _examples(activity, scene, duration)
+            with gr.Column(scale=3, min_width=360):
+                status = gr.HTML("Ready.", elem_id="status")
+                with gr.Row(visible=False) as working:
+                    flat = gr.Image(label="Film", interactive=False, buttons=[])
+                    world = gr.Image(label="World of the radar", interactive=False, buttons=[])
+                result = gr.HTML(elem_id="result")
+        running, shown = gr.State(None), gr.State(())
+        outputs = [status, working, flat, world, result, running, shown]
+
+        def simulation(keep: bool) -> Callable[[dict[Any, Any]], Iterator[dict[Any, Any]]]:
+            def simulate(values: dict[Any, Any]) -> Iterator[dict[Any, Any]]:
+                given = {option: values[component] for option, component in components.items()}
+                given |= {"scene": values[scene], "radar": values[radar] or None, "paper": values[paper]}
+                run = runs.start(_command(values[film], values[activity], values[duration], given, longest_s))
+                for update in _followed(run):
+                    yield {
+                        status: update["status"],
+                        working: gr.update(visible=update["running"]),
+                        flat: update["film"],
+                        world: update["world"],
+                        running: run.token,
+                    }
+                if run.error is None:
+                    together = (*(values[shown][-1:] if keep else ()), run.token)
+                    yield {result: _results(runs, together), shown: together}
+
+            return simulate
+
+        for button, keep in ((start, False), (compare, True)):
+            button.click(
+                simulation(keep),
+                inputs | {shown},
+                outputs,
+                concurrency_limit=2,
+                api_visibility="private",
+                show_progress="hidden",
+            )
+        cancel.click(runs.cancel, running, None, concurrency_limit=None, api_visibility="private", queue=False)
+    return page
+
+
+def _activities() -> list[str]:
+    """Names of the activities as ``demo`` takes them."""
+    return [name.split(" ", 1)[1].lower() for name in ACTIVITIES]
+
+
+def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Number) -> None:
+    """Buttons that set activity, scene and length."""
+    gr.Markdown("Examples that need no file:")
+    with gr.Row():
+        for name, values in _EXAMPLES.items():
+            gr.Button(name, size="sm").click(
+                lambda chosen=values: chosen, None, [activity, scene, duration], api_visibility="private", queue=False
+            )
+
+
+def _component(control: Control) -> Any:
+    """The control as a component of Gradio."""
+    common: dict[str, Any] = {"label": control.label, "info": control.help, "elem_id": control.option.replace("_", "-")}
+    if control.kind == "switch":
+        return gr.Checkbox(value=bool(control.default), **common)
+    if control.kind == "choice":
+        return gr.Dropdown(list(control.choices), value=control.default or control.choices[0], **common)
+    # Not a gr.Number: that cannot be left empty, which is the default of the scene.
+    shown = (
+        ""
+        if control.default is None
+        else f"{control.default:g}"
+        if control.kind == "number"
+        else control.default
+    )
+    return gr.Textbox(value=str(shown), placeholder="default", **common)
+
+
+def _command(
+    film: str | None, activity: str, duration: str, values: dict[str, Any], longest_s: float
+) -> Callable[[Path], Any]:
+    """What makes the command of a run for its folder; it raises where the values make none."""
+
+    def command(folder: Path) -> Any:
+        given = options_of(values) | {
+            "scene": values["scene"],
+            "radar": values["radar"],
+            "paper": values["paper"],
+        }
+        given |= {"out": folder, "quiet": True, "save": "mat"}
+        given["multipath"] = {"on": True, "off": False}.get(given.get("multipath", ""))
+        if film is None:
+            return Demo(activity=activity, duration=_length(duration, longest_s), **for_demo(given))
+        _check_length(Path(film), longest_s, given)
+        return Simulate(source=Path(film), **given)
+
+    return command
+
+
+def _length(given: str, longest_s: float) -> float:
+    """Seconds of a generated film."""
+    try:
+        seconds = float(given)
+    except ValueError:
+        raise TensorsimError(f"Length of the generated film: got {given!r}, expected seconds") from None
+    if not 0.5 <= seconds <= longest_s:
+        raise TensorsimError(
+            f"Length of the generated film: got {seconds:g} s, expected 0.5 to {longest_s:g} s"
+        )
+    return seconds
+
+
+def _check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
+    """Refuse a film that would take too long, unless a part of it is chosen."""
+    from tensorsim.data.video import VideoReader
+    from tensorsim.sources import kind_of
+
+    if kind_of(film) != "video":
+        return
+    reader = VideoReader(film, fps=given.get("fps"), start_s=given.get("start"), end_s=given.get("end"))
+    count = reader.frame_count
+    if count is None or count / reader.fps > longest_s:
+        length = "an unknown length" if count is None else f"{count / reader.fps:.1f} s"
+        raise TensorsimError(
+            f"{film.name}: got {length}, expected at most {longest_s:g} s; set Start and End in the group Camera"
+        )
+
+
+def _followed(run: Run) -> Iterator[dict[str, Any]]:
+    """What to show of a run, a few times a second until it ends."""
+    while True:
+        ended = run.finished.wait(0.4)
+        yield {
+            "status": _status(run),
+            "running": not ended,
+            "film": run.pictures.get("film"),
+            "world": run.pictures.get("world"),
+        }
+        if ended:
+            return
+
+
+def _status(run: Run) -> str:
+    """One line on a run."""
+    if run.error is not None:
+        return f'<p class="failed" role="alert">{html.escape(run.error)}</p>'
+    if run.finished.is_set():
+        return f"<p>Done at {time.strftime('%H:%M:%S')}.</p>"
+    share = f"{run.done} of {run.total}" if run.total else str(run.done or "")
+    bar = (
+        f'<progress max="{run.total}" value="{run.done}"></progress>'
+        if run.total
+        else "<progress></progress>"
+    )
+    return f"<p>{html.escape(run.stage)} {share} {bar}</p>"
+
+
+def _results(runs: Runs, tokens: tuple[str, ...]) -> str:
+    """The reports of one run or two, side by side, with everything to download."""
+    parts = []
+    for token in tokens:
+        run = runs.known.get(token)
+        if run is None:
+            continue
+        links = [
+            f'<a href="/runs/{token}/{html.escape(path.name)}" download="{html.escape(path.name)}">'
+            f"{html.escape('everything' if path.name == ARCHIVE else path.name)}</a>"
+            for path in run.files()
+        ]
+        parts.append(
+            f'<section><iframe src="/runs/{token}/report.html" title="report" sandbox="allow-scripts"></iframe>'
+            f"<p>Download: {' '.join(links)}</p></section>"
+        )
+    return f'<div class="result">{"".join(parts)}</div>'

@@ -1,0 +1,134 @@
+"""Runs of the app: one at a time, watched, cancelled on demand, kept in temporary folders for a while."""
+
+import re
+import secrets
+import shutil
+import sys
+import traceback
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import Event, Lock, Thread
+from typing import Any
+
+import numpy as np
+
+from tensorsim.errors import TensorsimError
+from tensorsim.progress import watched
+
+#: Runs that are kept; the oldest is removed for a new one.
+KEPT = 12
+ARCHIVE = "all.zip"
+
+
+class CancelledError(TensorsimError):
+    """The user has cancelled the run."""
+
+
+class Run:
+    """A simulation in a thread of its own.
+
+    Attributes:
+        token: its secret name.
+        folder: of its results, complete once it has succeeded.
+        stage, done, total: what is being done and how far it is.
+        pictures: the newest picture (H, W, 3) uint8 RGB by name, ``"film"`` and ``"world"``.
+        error: one sentence, if it failed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.token, self.folder = folder.name, folder
+        self.stage, self.done = "waiting", 0
+        self.total: int | None = None
+        self.pictures: dict[str, np.ndarray] = {}
+        self.error: str | None = None
+        self.finished, self.cancelled = Event(), Event()
+
+    def advanced(self, stage: str, done: int, total: int | None) -> None:
+        """See :class:`~tensorsim.progress.Watcher`."""
+        self.stage, self.done, self.total = stage, done, total
+        if self.cancelled.is_set():
+            raise CancelledError("cancelled")
+
+    def pictured(self, name: str, draw: Callable[[], np.ndarray]) -> None:
+        """See :class:`~tensorsim.progress.Watcher`."""
+        self.pictures[name] = draw()
+
+    def files(self) -> list[Path]:
+        """The files of the results."""
+        return (
+            sorted(path for path in self.folder.iterdir() if path.is_file()) if self.folder.is_dir() else []
+        )
+
+
+class Runs:
+    """All runs of the app.
+
+    Args:
+        root: a temporary folder, removed by its owner.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.known: OrderedDict[str, Run] = OrderedDict()
+        self.one_at_a_time, self.lock = Lock(), Lock()
+
+    def start(self, command_for: Callable[[Path], Any]) -> Run:
+        """Run ``command_for(folder).run()`` in a thread; a command that cannot be made is an error of the run."""
+        run = Run(self.root / secrets.token_urlsafe(16))
+        with self.lock:
+            self.known[run.token] = run
+            finished = [old for old in self.known.values() if old.finished.is_set()]
+            for old in finished[: max(0, len(self.known) - KEPT)]:
+                del self.known[old.token]
+                shutil.rmtree(old.folder, ignore_errors=True)
+        Thread(target=self._work, args=(run, command_for), daemon=True).start()
+        return run
+
+    def _work(self, run: Run, command_for: Callable[[Path], Any]) -> None:
+        try:
+            with self.one_at_a_time, watched(run):
+                run.advanced("starting", 0, None)
+                command_for(run.folder).run()
+                _add_configuration(run.folder)
+                _add_archive(run.folder)
+        except TensorsimError as error:
+            run.error = self._without_paths(" ".join(str(error).split()))
+        except Exception as error:
+            traceback.print_exc(file=sys.stderr)
+            run.error = f"the simulation failed ({type(error).__name__}); the terminal has the details"
+        finally:
+            run.finished.set()
+
+    def _without_paths(self, message: str) -> str:
+        """A message that names files, but not the temporary folders that they are in."""
+        return re.sub(re.escape(str(self.root.parent)) + r"/([^\s/]+/)*", "", message)
+
+    def cancel(self, token: str | None) -> None:
+        """Cancel a run that may have ended already."""
+        with suppress(KeyError):
+            self.known[token or ""].cancelled.set()
+
+    def file(self, token: str, name: str) -> Path | None:
+        """The file of a run with this name, None if there is none: nothing else can be read."""
+        run = self.known.get(token)
+        if run is None or not run.finished.is_set():
+            return None
+        return next((path for path in run.files() if path.name == name), None)
+
+
+def _add_configuration(folder: Path) -> None:
+    """Write the configuration of the run as YAML, for ``--config``."""
+    from tensorsim.config import SimulationConfig
+
+    SimulationConfig.from_yaml(folder / "summary.json").to_yaml(folder / "configuration.yaml")
+
+
+def _add_archive(folder: Path) -> None:
+    """Put all files into one."""
+    files = sorted(path for path in folder.iterdir() if path.is_file())
+    with zipfile.ZipFile(folder / ARCHIVE, "w", zipfile.ZIP_STORED) as archive:
+        for path in files:
+            archive.write(path, path.name)

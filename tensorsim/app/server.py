@@ -1,0 +1,62 @@
+"""The server of the app: the page, and the files of its runs."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tensorsim.app.runs import Runs
+from tensorsim.errors import TensorsimError
+
+
+@contextmanager
+def application(largest_mb: float, longest_s: float) -> Iterator[Any]:
+    """The ASGI application; its uploads and results are removed with it.
+
+    Args:
+        largest_mb: size of the largest upload in megabytes.
+        longest_s: longest film in seconds.
+
+    Raises:
+        TensorsimError: gradio is not installed.
+    """
+    with tempfile.TemporaryDirectory(prefix="tensorsim-app-") as scratch:
+        # Gradio reads these when it is imported: uploads are below the folder that is removed, and nobody is called.
+        os.environ["GRADIO_TEMP_DIR"] = str(Path(scratch) / "uploads")
+        os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
+        try:
+            import gradio as gr
+            from fastapi import FastAPI, HTTPException
+            from fastapi.responses import FileResponse
+        except ImportError as error:
+            raise TensorsimError(
+                f'app: gradio cannot be imported ({error}), expected it installed: pip install "tensorsim[app]"'
+            ) from None
+        from tensorsim.app.page import CSS, build
+
+        root = Path(scratch) / "runs"
+        root.mkdir()
+        runs = Runs(root)
+        server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+        @server.get("/runs/{token}/{name}")
+        def result(token: str, name: str) -> FileResponse:
+            path = runs.file(token, name)
+            if path is None:
+                raise HTTPException(404)
+            return FileResponse(path)
+
+        theme = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["monospace"])
+        yield gr.mount_gradio_app(
+            server,
+            build(runs, longest_s),
+            path="/",
+            server_name="127.0.0.1",
+            max_file_size=f"{largest_mb:g}mb",
+            theme=theme,
+            css=CSS,
+            ssr_mode=False,
+            footer_links=[],
+        )

@@ -1,0 +1,41 @@
+"""``tensorsim app``: the simulation in a browser."""
+
+import sys
+from dataclasses import dataclass
+
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class App:
+    """Open the app: drop a film or choose an activity, change the parameters of the panel, look at the results.
+
+    Needs gradio: pip install "tensorsim[app]". Only this machine can open the page unless --host says otherwise.
+    """
+
+    host: str = "127.0.0.1"
+    """Address to listen at."""
+    port: int = 7860
+    """Port to listen at."""
+    largest_mb: float = 200.0
+    """Size of the largest film in megabytes."""
+    longest_s: float = 60.0
+    """Length of the longest film in seconds."""
+
+    def run(self) -> None:
+        """Do it."""
+        if not 1 <= self.port < 65536:
+            raise TensorsimError(f"--port: got {self.port}, expected a number from 1 to 65535")
+        for name, value in (("largest-mb", self.largest_mb), ("longest-s", self.longest_s)):
+            if not 0 < value < float("inf"):
+                raise TensorsimError(f"--{name}: got {value}, expected a positive number")
+        from tensorsim.app.server import application
+
+        with application(self.largest_mb, self.longest_s) as app:
+            import uvicorn
+
+            print(f"tensorsim: http://{self.host}:{self.port}/ (Ctrl-C ends)", file=sys.stderr)
+            server = uvicorn.Server(uvicorn.Config(app, self.host, self.port, log_level="warning"))
+            server.run()
+            if not server.started:
+                raise TensorsimError(f"--port: {self.port} cannot be used, expected a free one")

@@ -1,0 +1,134 @@
+"""``tensorsim live``: what a radar would see of the people before a camera, as it happens."""
+
+import sys
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
+from tensorsim.commands.options import RadarOptions, load_recognizer
+from tensorsim.errors import TensorsimError, collected_warnings
+from tensorsim.limits import check_range
+
+if TYPE_CHECKING:
+    from tensorsim.live import LiveFrame, LiveSimulator
+    from tensorsim.live.camera import Camera
+
+#: Options of other commands that say nothing of a live simulation.
+_UNUSED = (
+    "figure_format",
+    "hide_ridges",
+    "sound",
+    "full_rate",
+    "save",
+    "motion",
+    "device",
+    "denoiser",
+    "people",
+)
+
+
+@dataclass(frozen=True)
+class Live(NetworkOptions, RadarOptions):
+    """Simulate the radar from a camera as it films, and show it in a page on this machine.
+
+    The page has the camera's picture with the people in it, the Doppler-time map that scrolls, and the labels. Frames
+    that come faster than they can be worked on are dropped and counted. Ends with the film, or with Ctrl-C.
+    """
+
+    camera: str
+    """Number of a camera, address of a stream (rtsp://...), or a film that is played like a camera."""
+    person_height: tuple[float, ...] = (1.80, 1.70)
+    """Body heights in metres in order of appearance; the last one serves the rest."""
+    fps: float | None = None
+    """Frames per second, instead of what the source announces."""
+    every_frame: bool = False
+    """Of a film, take every frame, however long that takes, instead of dropping frames to keep up with its time."""
+    seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Stop after so much time of the film."""
+    port: int | None = 8787
+    """Port of the page at 127.0.0.1; 0 takes a free one, none shows no page."""
+    record: Path | None = None
+    """Film of what the page shows, ending in .webm or .mp4."""
+
+    def run(self) -> None:
+        """Do it."""
+        self._check()
+        config = self.configuration().replace(pose__person_height_m=self.person_height)
+        config = config if self.flip_test else config.replace(pose__flip_test=False)
+        networks = default_networks(
+            self.detector or config.tracking.detector, self.pose or config.pose.network
+        )
+
+        import torch
+
+        from tensorsim.live import LiveSimulator
+        from tensorsim.live.camera import Camera
+
+        torch.manual_seed(config.seed)
+        with collected_warnings() as messages:
+            camera = Camera(self.camera, self.fps, self.every_frame)
+            recognizer = load_recognizer(config)
+            live = LiveSimulator(
+                config,
+                camera.fps,
+                *load_networks(*networks, config.pose.flip_test),
+                recognizer,
+                self.least_probability,
+            )
+            for message in messages:
+                print(f"tensorsim: warning: {message}", file=sys.stderr)
+            with suppress(KeyboardInterrupt):
+                self._play(live, camera)
+        seconds = (live.index + 1) / live.fps
+        print(f"{self.camera}: {seconds:.1f} s, {live.appeared} people, {camera.dropped} frames dropped")
+
+    def _play(self, live: "LiveSimulator", camera: "Camera") -> None:
+        """Simulate frame by frame, and show and record what comes out."""
+        from tensorsim import plot
+        from tensorsim.data.video import VideoWriter
+        from tensorsim.live.page import serving
+        from tensorsim.live.view import LiveView
+
+        view = LiveView(live, plot.MapStyle(self.colormap, self.dynamic_range))
+        with ExitStack() as stack:
+            page = None if self.port is None else stack.enter_context(serving(self.port))
+            if page is not None:
+                print(f"showing http://127.0.0.1:{page.port}/ (Ctrl-C ends)", file=sys.stderr)
+            film = None if self.record is None else stack.enter_context(VideoWriter(self.record, camera.fps))
+            for frame, dropped in camera.frames():
+                for _ in range(dropped):
+                    live.miss()
+                new = live.push(frame)
+                picture = view.draw(new, frame.permute(1, 2, 0).numpy(), camera.dropped)
+                if page is not None:
+                    page.show(picture)
+                if film is not None:
+                    film.add(picture)
+                self._say(new, camera)
+                if self.seconds is not None and new.time_s >= self.seconds:
+                    break
+
+    def _say(self, new: "LiveFrame", camera: "Camera") -> None:
+        """Print a label when there is one."""
+        if new.label is not None and not self.quiet:
+            label = f"{new.label.label} ({new.label.probability:.2f})"
+            print(f"{new.label.end_s:8.1f} s  {label:<34} dropped {camera.dropped}")
+
+    def _check(self) -> None:
+        """Refuse options that cannot work, before anything heavy is imported."""
+        for field in fields(self):
+            if field.name in _UNUSED and getattr(self, field.name) != field.default:
+                raise TensorsimError(f"--{field.name.replace('_', '-')}: got it for live, which does without")
+        super().check(Path(self.record or ".").parent)
+        for value in self.person_height:
+            check_range(value, "body height", "--person-height")
+        if self.fps is not None:
+            check_range(self.fps, "frame rate", "--fps")
+        if self.port is not None and not 0 <= self.port < 65536:
+            raise TensorsimError(f"--port: got {self.port}, expected a number from 0 to 65535")
+        if self.record is not None and self.record.suffix.lower() not in (".mp4", ".webm"):
+            raise TensorsimError(f"--record: got {self.record}, expected a name ending in .mp4 or .webm")

@@ -1,0 +1,63 @@
+"""Named arrays in files: NumPy's .npz, MATLAB's .mat, HDF5."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tensorsim.errors import TensorsimError
+
+ARRAY_FORMATS = ("npz", "mat", "h5")
+
+
+def array_formats(text: str) -> tuple[str, ...]:
+    """The formats of a list such as ``"mat,h5"``, NumPy's first: it is always written.
+
+    Raises:
+        TensorsimError: an unknown format, or one whose library is not installed.
+    """
+    names = [name.strip() for name in text.split(",")]
+    unknown = [name for name in names if name not in ARRAY_FORMATS]
+    if unknown:
+        raise TensorsimError(f"--save: got {unknown[0]!r}, expected formats of {', '.join(ARRAY_FORMATS)}")
+    if "h5" in names:
+        _h5py()
+    return tuple(name for name in ARRAY_FORMATS if name == "npz" or name in names)
+
+
+def save_arrays(path: Path, arrays: dict[str, np.ndarray | float], formats: Sequence[str] = ("npz",)) -> None:
+    """Write arrays under their names, compressed, once per format.
+
+    In MATLAB a vector becomes a column and a boolean array a logical one; HDF5 has one data set per array.
+
+    Args:
+        path: without its suffix.
+        arrays: by name.
+        formats: of :data:`ARRAY_FORMATS`.
+
+    Raises:
+        TensorsimError: h5py is not installed.
+    """
+    if "npz" in formats:
+        named: dict[str, Any] = {name: np.asarray(x) for name, x in arrays.items()}
+        np.savez_compressed(path.with_suffix(".npz"), **named)
+    if "mat" in formats:
+        from scipy.io import savemat
+
+        savemat(path.with_suffix(".mat"), arrays, do_compression=True, oned_as="column")
+    if "h5" in formats:
+        with _h5py().File(path.with_suffix(".h5"), "w") as file:
+            for name, x in arrays.items():
+                compression = {} if np.ndim(x) == 0 else {"compression": "gzip"}
+                file.create_dataset(name, data=np.asarray(x), **compression)
+
+
+def _h5py() -> Any:
+    try:
+        import h5py
+    except ImportError as error:
+        raise TensorsimError(
+            f"--save h5: h5py cannot be imported ({error}), expected it installed: pip install h5py"
+        ) from None
+    return h5py

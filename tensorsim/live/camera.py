@@ -1,0 +1,155 @@
+"""Frames as they come: from a camera, a stream, or a film that is played like one."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Condition, Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tensorsim.data.video import VideoReader
+from tensorsim.errors import TensorsimError, check_positive
+
+#: Frames that wait for the consumer; older ones are dropped.
+WAITING = 2
+_STREAMS = ("rtsp://", "rtsps://", "rtmp://", "http://", "https://", "udp://", "tcp://")
+
+
+class Grabbed(NamedTuple):
+    """A frame (3, H, W) uint8 RGB, and how many frames before it were dropped."""
+
+    frame: Tensor
+    dropped: int
+
+
+class Camera:
+    """Frames of a camera at a constant rate; those that come while the consumer is busy are dropped and counted.
+
+    Args:
+        source: the number of a camera, the address of a stream, or a file.
+        fps: frames per second, instead of those that the source announces (30 where it announces none).
+        every_frame: of a file, wait for the consumer instead of dropping frames; the film takes as long as it takes.
+        loops: of a file, how often it is played.
+
+    Attributes:
+        fps: frames per second.
+        dropped: frames so far.
+
+    Raises:
+        TensorsimError: a source that cannot be opened, or ``every_frame`` of one that does not wait.
+    """
+
+    def __init__(
+        self, source: str, fps: float | None = None, every_frame: bool = False, loops: int = 1
+    ) -> None:
+        if fps is not None:
+            check_positive(fps, "fps")
+        self.source, self.every_frame, self.loops, self.dropped = source, every_frame, loops, 0
+        self.is_file = not source.isdecimal() and not source.lower().startswith(_STREAMS)
+        if not self.is_file and every_frame:
+            raise TensorsimError(
+                f"--every-frame: got the camera {source}, expected a file: others do not wait"
+            )
+        if self.is_file:
+            self.reader = VideoReader(Path(source), fps=fps)
+            self.fps = self.reader.fps
+        else:
+            self.capture, self.fps = _opened(source, fps)
+
+    def frames(self) -> Iterator[Grabbed]:
+        """The frames until the source ends.
+
+        Raises:
+            TensorsimError: a camera or stream that stops.
+        """
+        if self.every_frame:
+            for frame in self._film():
+                yield Grabbed(frame, 0)
+            return
+        waiting: deque[tuple[int, Tensor | None]] = deque(maxlen=WAITING)
+        arrived = Condition()
+        state = {"ended": False, "closed": False}
+        thread = Thread(target=self._grab, args=(waiting, arrived, state), daemon=True)
+        thread.start()
+        last = -1
+        try:
+            while True:
+                with arrived:
+                    arrived.wait_for(lambda: waiting or state["ended"])
+                    if not waiting:
+                        break
+                    index, grabbed = waiting.popleft()
+                if grabbed is None:
+                    raise TensorsimError(f"{self.source}: the camera gave no more frames")
+                missing, last = index - last - 1, index
+                self.dropped += missing
+                yield Grabbed(grabbed, missing)
+        finally:
+            state["closed"] = True
+            thread.join(timeout=2.0)
+
+    def _grab(
+        self, waiting: deque[tuple[int, Tensor | None]], arrived: Condition, state: dict[str, bool]
+    ) -> None:
+        """Put frames with their numbers into the queue as they come; the work of a thread."""
+        start = time.monotonic()
+        numbered = enumerate(self._film()) if self.is_file else self._live(start)
+        for index, frame in numbered:
+            if self.is_file:
+                time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
+            with arrived:
+                waiting.append((index, frame))
+                arrived.notify()
+            if state["closed"]:
+                break
+        with arrived:
+            state["ended"] = True
+            arrived.notify()
+
+    def _film(self) -> Iterator[Tensor]:
+        for _ in range(self.loops):
+            for chunk in self.reader.chunks(1):
+                yield chunk[0]
+
+    def _live(self, start: float) -> Iterator[tuple[int, Tensor | None]]:
+        """Frames numbered by the time at which they came; None once there are no more."""
+        import cv2
+
+        last = -1
+        try:
+            while True:
+                found, frame = self.capture.read()
+                if not found:
+                    yield last + 1, None
+                    return
+                last = max(last + 1, round((time.monotonic() - start) * self.fps))
+                yield last, _planes(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+        finally:
+            self.capture.release()
+
+
+def _planes(image: np.ndarray) -> Tensor:
+    return torch.from_numpy(image).permute(2, 0, 1).contiguous()
+
+
+def _opened(source: str, fps: float | None) -> tuple[Any, float]:
+    """The capture of a camera or stream, and its frames per second."""
+    import cv2
+    from cv2.utils import logging
+
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    finally:
+        logging.setLogLevel(level)
+    if not capture.isOpened():
+        raise TensorsimError(
+            f"--camera: {source} cannot be opened, expected a camera's number, a stream or a film"
+        )
+    announced = capture.get(cv2.CAP_PROP_FPS)
+    return capture, fps or (announced if 1 <= announced <= 240 else 30.0)

@@ -1,0 +1,203 @@
+"""Causal poses: key points of one frame to joints in the world, filtered with what came before only."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import coco_to_body
+from tensorsim.vision.lifting.metric_pose import MetricPose, lowered, lowest_ankle
+from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict, kalman_update
+
+#: Variance of a position of which nothing is known, in variances of a measurement.
+_WIDE = 1e4
+
+
+class PoseState(NamedTuple):
+    """What is known of P people from earlier frames.
+
+    Attributes:
+        size: logarithm of the height in pixels of the standing body (P, 1), filtered.
+        joints: (P, 14, 3) m, filtered.
+        lows: (P, n) heights of the lower ankle in the last frames, the newest last; NaN where there was none.
+        shown: (P, 14, 3) m, the joints given out last.
+        hidden: (P, 14) frames since each joint was seen.
+        frames: (P,) usable frames so far.
+        good: (P,) of them those in which the pose network saw a person.
+        missed: (P,) frames since the last usable one.
+    """
+
+    size: KalmanState
+    joints: KalmanState
+    lows: Tensor
+    shown: Tensor
+    hidden: Tensor
+    frames: Tensor
+    good: Tensor
+    missed: Tensor
+
+
+class CausalPose(nn.Module):
+    """Lifts, places and filters people frame by frame.
+
+    Every frame is lifted alone; the size of the body, and with it the range, and each joint go through the forward
+    Kalman filter of constant velocity; the floor is a low quantile of the lower ankle in the last frames. A joint that
+    hides briefly is predicted, over a longer gap that of the matched pose replaces it.
+
+    Args:
+        lifter: joints (P, T, 14, 2), weights -> Lifted, each frame alone (``temporal=0``).
+        metric_pose: places them; of a calibrated camera, so that it estimates no floor.
+        fps: frames per second.
+        keypoint_threshold, fewest_joints, least_score, brief_gap_s, top_speed_m_s: see
+            :class:`~tensorsim.VideoToPose`.
+    """
+
+    def __init__(
+        self,
+        lifter: nn.Module,
+        metric_pose: MetricPose,
+        fps: float,
+        keypoint_threshold: float = 0.3,
+        fewest_joints: int = 5,
+        least_score: float = 0.5,
+        brief_gap_s: float = 0.25,
+        top_speed_m_s: float = 12.0,
+    ) -> None:
+        super().__init__()
+        self.lifter, self.metric_pose, self.fps = lifter, metric_pose, fps
+        self.keypoint_threshold, self.fewest_joints = keypoint_threshold, fewest_joints
+        self.least_score, self.top_speed_m_s = least_score, top_speed_m_s
+        self.brief_gap = int(brief_gap_s * fps)
+        self.floor_frames = max(1, int(metric_pose.floor_window_s * fps))
+        self.floor_quantile = 0.15
+        # Gain -3 dB at 1 Hz: sizes of 4 % error, somebody who starts to walk within half a second.
+        self.size_density, self.size_noise, self.size_speed = 0.1, 0.04**2, 0.3
+        self.unknown = 0.1 * _WIDE * self.size_noise  # variance from which a size is not known
+        # Gain -3 dB at 4 Hz: m^2/s^3, and 3 cm of error of the key points, see noise.keypoint_noise.
+        self.joint_density, self.joint_noise, self.initial_speed = 27.0, 0.03**2, 3.0
+
+    def begin(self, people: int) -> PoseState:
+        """The state of people who were never seen."""
+        zeros = torch.zeros(people, 14, 3, dtype=torch.float64)
+        never = torch.zeros(people, dtype=torch.int64)
+        return PoseState(
+            _unknown(zeros[:, 0, :1], self.size_noise, self.size_speed),
+            _unknown(zeros, self.joint_noise, self.initial_speed),
+            torch.full((people, self.floor_frames), float("nan"), dtype=torch.float64),
+            zeros,
+            torch.full((people, 14), 10**6),
+            never,
+            never,
+            never + 10**6,
+        )
+
+    def forward(
+        self, state: PoseState, keypoints: Tensor, scores: Tensor, there: Tensor, height: int, width: int
+    ) -> PoseState:
+        """The state after a frame.
+
+        Args:
+            state: of P people.
+            keypoints: (P, 17, 2) pixels.
+            scores: (P, 17).
+            there: (P,) bool, whose key points these are; the others are predicted.
+            height, width: of the picture.
+        """
+        body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
+        reliable = (body_scores >= self.keypoint_threshold) & there[:, None]
+        body_scores = body_scores * reliable
+        usable = there & (reliable.sum(dim=-1) >= self.fewest_joints)
+        lifted = self.lifter(body[:, None], body_scores[:, None])
+
+        whole = usable & (reliable.sum(dim=-1) >= self.metric_pose.whole_body_joints)
+        whole = whole & (lifted.distance[:, 0] < self.metric_pose.poor_fit)
+        first = whole & (state.size.p00[:, 0] >= self.unknown)
+        size = self._filtered(
+            state.size,
+            lifted.scale.clamp(min=1.0).log(),
+            self.size_density,
+            self.size_noise,
+            self.size_speed,
+            whole[:, None],
+            first[:, None],
+        )
+        usable = usable & (size.p00[:, 0] < self.unknown)
+        placed, seen = self.metric_pose(
+            body[:, None],
+            body_scores[:, None],
+            lifted._replace(scale=size.position.exp().to(lifted.scale)),
+            usable[:, None],
+            height,
+            width,
+            self.fps,
+        )
+        placed, seen = placed[:, 0].double(), seen[:, 0]
+        low = torch.where(usable, lowest_ankle(placed), torch.nan)
+        lows = torch.cat([state.lows[:, 1:], low[:, None]], dim=-1)
+        placed = lowered(placed, torch.nanquantile(lows, self.floor_quantile, dim=-1).nan_to_num())
+        return self._after(state, placed, seen, usable, scores, size, lows)
+
+    def _after(
+        self,
+        state: PoseState,
+        placed: Tensor,
+        seen: Tensor,
+        usable: Tensor,
+        scores: Tensor,
+        size: KalmanState,
+        lows: Tensor,
+    ) -> PoseState:
+        """The state after joints (P, 14, 3) that were placed in the world."""
+        hidden = torch.where(seen, 0, state.hidden + 1)
+        measured = usable[:, None] & (seen | (hidden > self.brief_gap))
+        newly = usable & (state.frames == 0)
+        joints = self._filtered(
+            state.joints,
+            placed,
+            self.joint_density,
+            self.joint_noise,
+            self.initial_speed,
+            measured[..., None],
+            (newly[:, None] & measured)[..., None],
+        )
+        missed = torch.where(usable, 0, state.missed + 1)
+        # Over a longer gap a prediction would drift away: there the body stays where it is.
+        step = (joints.position - state.shown) * (missed <= self.brief_gap)[:, None, None]
+        length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+        limit = (self.top_speed_m_s / self.fps / length.clamp(min=1e-9)).clamp(max=1.0)
+        shown = torch.where(newly[:, None, None], joints.position, state.shown + step * limit)
+        strong = (scores >= self.keypoint_threshold).to(scores.dtype)
+        mean = (scores * strong).sum(dim=-1) / strong.sum(dim=-1).clamp(min=1.0)
+        good = state.good + (usable & (mean >= self.least_score)).to(torch.int64)
+        return PoseState(
+            size, joints, lows, shown, hidden, state.frames + usable.to(torch.int64), good, missed
+        )
+
+    def present(self, state: PoseState) -> Tensor:
+        """Who is in the scene, (P,) bool: seen just now, and a person in at least a quarter of the frames."""
+        return (state.frames > 0) & (state.missed <= self.brief_gap) & (4 * state.good >= state.frames)
+
+    def _filtered(
+        self,
+        state: KalmanState,
+        measured: Tensor,
+        density: float,
+        noise: float,
+        speed: float,
+        valid: Tensor,
+        first: Tensor,
+    ) -> KalmanState:
+        """Prediction by a frame and update; where ``first``, the filter begins with this measurement."""
+        q, r = (torch.full([1], value, dtype=torch.float64) for value in (density, noise))
+        predicted = constant_velocity_predict(state, q, 1 / self.fps)
+        begun = _unknown(measured.double(), noise, speed)
+        prior = KalmanState(*(torch.where(first, a, b) for a, b in zip(begun, predicted, strict=True)))
+        return kalman_update(prior, measured.double(), r, valid.double())
+
+
+def _unknown(place: Tensor, noise: float, speed: float) -> KalmanState:
+    """A state (..., D) at a place of which nothing is known, with velocities within ``speed``."""
+    wide = torch.full_like(place[..., :1], _WIDE * noise)
+    return KalmanState(
+        place, torch.zeros_like(place), wide, torch.zeros_like(wide), torch.full_like(wide, speed**2)
+    )

@@ -1,0 +1,105 @@
+"""Tracking frame by frame: the association of :class:`~tensorsim.vision.GNNTracker` without its look ahead."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.geometry.boxes import center_to_xyxy, xyxy_to_center
+from tensorsim.types import Detections
+from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict
+from tensorsim.vision.tracking.tracker import GNNTracker, _Living
+
+
+class OnlineTracks(NamedTuple):
+    """The n tracks that may still be matched.
+
+    Attributes:
+        living: their boxes and hits.
+        confirmed: (n,) bool.
+        strong_hits: (n,) detections of at least the start score so far.
+        born: tracks that were ever started; ``living.rows`` are their numbers.
+    """
+
+    living: _Living
+    confirmed: Tensor
+    strong_hits: Tensor
+    born: int
+
+
+class OnlineTracker(GNNTracker):
+    """A :class:`~tensorsim.vision.GNNTracker` that is given one frame at a time.
+
+    Detections belong to the same tracks as in the whole clip. Boxes are filtered, not smoothed; somebody is a person
+    from the moment on at which a track is confirmed and has its ``min_hits``, and of more than ``max_tracks`` the
+    oldest count. The state is handed in and out.
+    """
+
+    def begin(self) -> OnlineTracks:
+        """The state before the first frame."""
+        nothing = torch.zeros(0, dtype=torch.int64)
+        living = self._start(nothing, torch.zeros(0, 4, dtype=torch.float64))
+        return OnlineTracks(living, torch.zeros(0, dtype=torch.bool), nothing, 0)
+
+    def step(self, state: OnlineTracks, detections: Detections | None) -> OnlineTracks:
+        """The state after a frame: its detections (K, ...), or None where the detector was not run."""
+        predicted = constant_velocity_predict(state.living.box, self._process_noise(), 1.0)
+        living = state.living._replace(box=predicted)
+        if detections is None:
+            return state._replace(living=living)
+        box, score = self._usable(detections)
+        strong = score >= self.start_score
+        column = self._assign(living, box, score, state.confirmed)
+        hit = column >= 0
+        strong_hits = state.strong_hits + (hit & _taken(strong, column)).to(torch.int64)
+        living = self._correct(living, xyxy_to_center(box), column)
+        confirmed = state.confirmed | (living.history[:, : self.confirm_window].sum(-1) >= self.confirm_hits)
+        misses = living.age.clamp(max=self.delete_window) - living.history[:, : self.delete_window].sum(-1)
+        alive = torch.where(confirmed, misses < self.delete_misses, living.age < self.confirm_window)
+
+        new = self._newcomers(box, strong, column[hit])
+        numbers = torch.arange(new.shape[0]) + state.born
+        start = self._start(numbers, xyxy_to_center(box[new]))
+        return OnlineTracks(
+            _joined(living, alive, start),
+            torch.cat([confirmed[alive], torch.full((new.shape[0],), self.confirm_hits == 1)]),
+            torch.cat([strong_hits[alive], torch.ones_like(numbers)]),
+            state.born + new.shape[0],
+        )
+
+    def people(self, state: OnlineTracks) -> tuple[list[int], Tensor]:
+        """Numbers of the tracks that are people, oldest first, and their boxes (P, 4) ``xyxy`` float64."""
+        is_person = state.confirmed & (state.strong_hits >= self.min_hits)
+        chosen = torch.nonzero(is_person).flatten()[: self.max_tracks]
+        place = state.living.box.position[chosen]
+        place = torch.cat([place[:, :2], place[:, 2:].clamp(min=self.min_box_px)], dim=-1)
+        return state.living.rows[chosen].tolist(), center_to_xyxy(place)
+
+    def _usable(self, detections: Detections) -> tuple[Tensor, Tensor]:
+        """Boxes (k, 4) of the detections that count, best first, and their scores (k,)."""
+        boxes, scores = detections.boxes.detach().cpu().double(), detections.scores.detach().cpu().double()
+        usable = (
+            detections.valid.cpu()
+            & (detections.labels == 0).cpu()
+            & (scores >= self.faint_score)
+            & (boxes[..., 2:] - boxes[..., :2] >= self.min_box_px).all(-1)
+        )
+        best_first = scores.argsort(descending=True, stable=True)
+        index = best_first[usable[best_first]]
+        return boxes[index], scores[index]
+
+
+def _taken(strong: Tensor, column: Tensor) -> Tensor:
+    """Of each track, whether its detection (n,), -1 without, is a strong one."""
+    return torch.cat([strong, strong.new_zeros(1)])[column]
+
+
+def _joined(living: _Living, alive: Tensor, start: _Living) -> _Living:
+    """The tracks that are still alive and those that begin."""
+    box = KalmanState(*(torch.cat([a[alive], b]) for a, b in zip(living.box, start.box, strict=True)))
+    return _Living(
+        torch.cat([living.rows[alive], start.rows]),
+        box,
+        torch.cat([living.history[alive], start.history]),
+        torch.cat([living.age[alive], start.age]),
+    )

@@ -1,0 +1,105 @@
+"""The picture of a live simulation: the camera's frame with people, the scrolling map, labels over time."""
+
+import numpy as np
+import torch
+
+from tensorsim import plot
+from tensorsim.live.labels import LastColumns, LiveLabel
+from tensorsim.live.simulator import LiveFrame, LiveSimulator
+
+WIDTH, MAP_HEIGHT, STRIP_HEIGHT = 640, 240, 26
+#: Seconds of the map that are shown.
+SHOWN_S = 10.0
+_COLOURS = ((70, 110, 180), (170, 100, 60), (80, 140, 80), (150, 80, 150), (120, 120, 60), (60, 130, 140))
+
+
+class LiveView:
+    """Draws what a :class:`~tensorsim.LiveSimulator` gives, frame by frame.
+
+    Args:
+        simulator: whose frames are drawn.
+        style: colours and dynamic range.
+        top_speed_m_s: the map shows Doppler of speeds up to this.
+    """
+
+    def __init__(
+        self, simulator: LiveSimulator, style: plot.MapStyle | None = None, top_speed_m_s: float = 6.0
+    ) -> None:
+        style = plot.MapStyle() if style is None else style
+        radar = simulator.radar.simulator
+        self.threshold = simulator.config.pose.keypoint_threshold
+        self.range_db = style.dynamic_range_db
+        self.table = (plot.colormap(style.colormap)(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
+        self.rows = np.abs(simulator.doppler_hz) <= 2 * top_speed_m_s / radar.radar.doppler_wavelength_m
+        self.top_hz = float(simulator.doppler_hz[self.rows].max())
+        self.columns = round(SHOWN_S * radar.doppler.frame_rate_hz)
+        self.map = LastColumns(self.columns)
+        self.labels: list[LiveLabel] = []
+
+    def draw(self, new: LiveFrame, image: np.ndarray, dropped: int) -> np.ndarray:
+        """The picture (H, 640, 3) uint8 RGB of a frame (h, w, 3) uint8 RGB."""
+        self.map.push(new.doppler_time[torch.from_numpy(self.rows)])
+        if new.label is not None:
+            self.labels.append(new.label)
+        self.labels = [label for label in self.labels if label.end_s > new.time_s - SHOWN_S]
+        return np.concatenate([self._film(new, image, dropped), self._map(new), self._strip(new)])
+
+    def _film(self, new: LiveFrame, image: np.ndarray, dropped: int) -> np.ndarray:
+        import cv2
+
+        if new.people:
+            boxes, keypoints, scores = (
+                torch.stack([getattr(person, name) for person in new.people]).float().numpy()
+                for name in ("box", "keypoints", "scores")
+            )
+            image = plot.draw_people(
+                image, boxes, keypoints, scores, np.ones(len(new.people), bool), self.threshold
+            )
+        small = cv2.resize(image, (WIDTH, round(image.shape[0] * WIDTH / image.shape[1])))
+        text = f"{new.time_s:.1f} s   delay {new.delay_s:.2f} s   dropped {dropped}"
+        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(small, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, thickness, cv2.LINE_AA)
+        return small
+
+    def _map(self, new: LiveFrame) -> np.ndarray:
+        """The last seconds of the Doppler-time map, now at the right edge."""
+        import cv2
+
+        shown = np.zeros((int(self.rows.sum()), self.columns), np.float32)
+        if self.map.parts:
+            last = self.map.result().numpy()
+            shown[:, self.columns - last.shape[1] :] = last
+        level = plot.decibels(shown, self.range_db) / self.range_db + 1
+        small = cv2.resize(level[::-1], (WIDTH, MAP_HEIGHT), interpolation=cv2.INTER_AREA)
+        picture = self.table[(small * 255).astype(np.uint8)]
+        cv2.line(picture, (0, MAP_HEIGHT // 2), (WIDTH, MAP_HEIGHT // 2), (150, 150, 150), 1)
+        for text, y in (
+            (f"+{self.top_hz:.0f} Hz, approaching", 14),
+            (f"-{self.top_hz:.0f} Hz", MAP_HEIGHT - 6),
+        ):
+            cv2.putText(
+                picture, text, (6, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA
+            )
+        return picture
+
+    def _strip(self, new: LiveFrame) -> np.ndarray:
+        """Labels, each where its last second is."""
+        import cv2
+
+        strip = np.full((STRIP_HEIGHT, WIDTH, 3), 40, np.uint8)
+
+        def at(time_s: float) -> int:
+            return round((1 - (new.time_s - time_s) / SHOWN_S) * WIDTH)
+
+        for before, label in zip([None, *self.labels], self.labels, strict=False):
+            left = at(label.end_s - 1.0 if before is None else before.end_s)
+            right = WIDTH if label is self.labels[-1] else at(label.end_s)
+            colour = _COLOURS[sum(map(ord, label.label)) % len(_COLOURS)]
+            cv2.rectangle(strip, (left, 0), (right, STRIP_HEIGHT), colour, -1)
+            if before is None or before.label != label.label:
+                text = f"{label.label} {100 * label.probability:.0f} %"
+                place = (max(left, 0) + 4, STRIP_HEIGHT - 8)
+                cv2.putText(
+                    strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA
+                )
+        return strip

@@ -1,0 +1,253 @@
+"""The app: values of its controls become options, runs are kept apart and can be cancelled, a real browser uses it."""
+
+import io
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from tensorsim.app.form import GROUPS, controls, for_demo, options_of
+from tensorsim.app.runs import KEPT, Run, Runs
+from tensorsim.commands.panel import PANEL
+from tensorsim.commands.simulate import Simulate
+from tensorsim.errors import TensorsimError
+from tensorsim.progress import picture, progress_bar
+from tests.browser import chromium
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_parameter_of_the_panel_has_a_control_with_unit_and_help() -> None:
+    made = {control.option: control for control in controls()}
+    for parameter in PANEL:
+        control = made[parameter.option]
+        assert control.group == parameter.group
+        assert control.label.startswith(parameter.name)
+        assert parameter.unit in control.label
+        assert control.help
+    assert [group for group in GROUPS if not any(c.group == group for c in made.values())] == []
+
+
+def test_values_of_controls_become_options() -> None:
+    values = {
+        "prf_hz": 4096,
+        "person_height": "1.75, 1.6",
+        "wall_size": "5 0.3 2.5",
+        "ridges": 2,
+        "range_window": "hann",
+        "vital_signs": True,
+        "flip_test": False,
+        "carrier_hz": None,
+        "denoiser": " ",
+        "mti": "",
+    }
+    options = options_of(values)
+    assert options == {
+        "prf_hz": 4096.0,
+        "person_height": (1.75, 1.6),
+        "wall_size": (5.0, 0.3, 2.5),
+        "ridges": 2,
+        "range_window": "hann",
+        "vital_signs": True,
+        "flip_test": False,
+    }
+    command = Simulate(source=Path("film.mp4"), out=Path("out"), scene="through-wall", **options)
+    config = command.configuration()
+    assert config.scene.radar.prf_hz == 4096.0
+    assert config.scene.wall is not None
+    assert config.scene.wall.size_m[1] == 0.3
+    assert options_of({}) == {}
+    with pytest.raises(TensorsimError, match=r"Person height \(m\): got 'tall', expected numbers"):
+        options_of({"person_height": "tall"})
+    with pytest.raises(TensorsimError, match=r"Number of ridges: got 2.5, expected a whole number"):
+        options_of({"ridges": 2.5})
+    with pytest.raises(TensorsimError, match="initial distance: got it for a generated person"):
+        for_demo({"initial_distance": (4.0,)})
+
+
+class Work:
+    """Stands in for a command: counts, draws and writes."""
+
+    def __init__(self, folder: Path, steps: int = 3, error: Exception | None = None) -> None:
+        self.folder, self.steps, self.error = folder, steps, error
+
+    def run(self) -> None:
+        from tensorsim.config import SimulationConfig
+        from tensorsim.files import complete_or_nothing, write_json
+
+        with complete_or_nothing(self.folder) as scratch:
+            bar = progress_bar("radar", self.steps, quiet=True)
+            for _ in range(self.steps):
+                bar.update(1)
+                picture("film", lambda: np.zeros((2, 3, 3), np.uint8))
+                time.sleep(0.005)
+            if self.error is not None:
+                raise self.error
+            write_json(scratch / "summary.json", {"config": SimulationConfig().to_document(), "files": []})
+
+
+def ended(run: Run) -> Run:
+    assert run.finished.wait(20)
+    return run
+
+
+def test_runs_are_watched_and_their_files_are_all_that_can_be_read(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    runs = Runs(tmp_path / "runs")
+    run = ended(runs.start(Work))
+    assert (run.error, run.stage, run.done, run.total) == (None, "radar", 3, 3)
+    assert run.pictures["film"].shape == (2, 3, 3)
+    assert [path.name for path in run.files()] == ["all.zip", "configuration.yaml", "summary.json"]
+    assert runs.file(run.token, "summary.json") == run.folder / "summary.json"
+    for token, name in ((run.token, "../runs"), (run.token, "/etc/passwd"), ("..", "runs"), ("", "")):
+        assert runs.file(token, name) is None
+
+
+def test_a_run_can_be_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
+    runs = Runs(tmp_path)
+    run = runs.start(lambda folder: Work(folder, steps=10_000))
+    while run.done < 2:
+        time.sleep(0.005)
+    runs.cancel(run.token)
+    runs.cancel("unknown")
+    runs.cancel(None)
+    assert ended(run).error == "cancelled"
+    assert run.done < 10_000
+    assert run.files() == []
+
+
+def test_failures_are_one_sentence_without_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "runs").mkdir()
+    runs = Runs(tmp_path / "runs")
+    message = f"{tmp_path}/uploads/ab12/film.mp4: OpenCV cannot read this,\nexpected a video"
+    run = ended(runs.start(lambda folder: Work(folder, error=TensorsimError(message))))
+    assert run.error == "film.mp4: OpenCV cannot read this, expected a video"
+    broken = ended(runs.start(lambda folder: Work(folder, error=RuntimeError("inner"))))
+    assert broken.error == "the simulation failed (RuntimeError); the terminal has the details"
+    assert "inner" in capsys.readouterr().err
+
+
+def test_old_runs_are_removed(tmp_path: Path) -> None:
+    runs = Runs(tmp_path)
+    made = [ended(runs.start(Work)) for _ in range(KEPT + 2)]
+    assert len(runs.known) == KEPT
+    assert [run.folder.is_dir() for run in made[:3]] == [False, False, True]
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    """The address of ``tensorsim app`` in a process of its own, with its temporary folders in ``tmp_path``."""
+    pytest.importorskip("gradio")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    arguments = ["-m", "tensorsim.cli", "app", "--port", str(port), "--longest-s", "5", "--largest-mb", "1"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path), "OMP_NUM_THREADS": "2"}
+    process = subprocess.Popen([sys.executable, *arguments], env=environment, cwd=ROOT)
+    address = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(600):
+            time.sleep(0.2)
+            try:
+                urllib.request.urlopen(address, timeout=2).read()
+                break
+            except OSError:
+                assert process.poll() is None, "the app has ended"
+        yield address
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(timeout=30)
+    assert list(tmp_path.glob("tensorsim-app-*")) == [], "temporary files are removed"
+
+
+def status_of(address: str) -> int:
+    try:
+        return int(urllib.request.urlopen(address, timeout=10).status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+@pytest.mark.slow
+def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
+    """Opens; runs the example; changes a wall and compares; downloads a .mat; a broken film is one sentence."""
+    shots = Path(os.environ.get("TENSORSIM_SCREENSHOTS", tmp_path))
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(2000))
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 1400, "height": 1000}, accept_downloads=True)
+        elsewhere: list[str] = []
+        page.on(
+            "request",
+            lambda r: None if r.url.startswith((server, "data:", "blob:")) else elsewhere.append(r.url),
+        )
+        page.set_default_timeout(180_000)
+        page.goto(server)
+        page.get_by_role("button", name="Simulate").wait_for()
+
+        page.get_by_label("Length of the generated film (s)").fill("1")
+        page.get_by_label("Length of the generated film (s)").press("Tab")
+        page.click("#simulate")
+        page.locator("#status progress").wait_for()
+        page.locator("#result iframe").wait_for()
+        report = page.frame_locator("#result iframe").first
+        report.locator("body[data-ready=yes]").wait_for()
+        assert report.locator("#people tr").count() == 2
+        page.screenshot(path=shots / "app_1400.png")
+
+        page.get_by_label("through-wall").check()
+        page.get_by_role("button", name="Wall").click()
+        page.locator("#wall-permittivity").locator("input, textarea").fill("4")
+        page.locator("#wall-permittivity").locator("input, textarea").press("Tab")
+        page.click("#compare")
+        page.locator("#result section").nth(1).wait_for()
+        sources = [frame.get_attribute("src") for frame in page.locator("#result iframe").all()]
+        wall = report_text(server, sources[1])
+        assert '"relative_permittivity":4.0,"loss_tangent":0.03' in wall, (
+            "what is left empty keeps its default"
+        )
+        assert '"wall":null' in report_text(server, sources[0])
+
+        with page.expect_download() as download:
+            page.locator("#result section").nth(1).get_by_role("link", name="maps.mat").click()
+        maps = loadmat(io.BytesIO(Path(download.value.path()).read_bytes()))
+        assert maps["doppler_time"].shape == (maps["doppler_hz"].size, maps["time_s"].size)
+        page.set_viewport_size({"width": 420, "height": 900})
+        page.wait_for_timeout(500)
+        page.screenshot(path=shots / "app_420.png")
+        page.locator("#result iframe").last.scroll_into_view_if_needed()
+        page.wait_for_timeout(500)
+        page.screenshot(path=shots / "app_420_result.png")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 420
+
+        page.locator("input[type=file]").first.set_input_files(broken)
+        page.get_by_text("broken.mp4").first.wait_for()
+        page.click("#simulate")
+        sentence = page.locator("#status .failed")
+        sentence.wait_for()
+        assert re.fullmatch(r"broken\.mp4: OpenCV cannot read this, expected a video", sentence.inner_text())
+        assert elsewhere == [], "nothing is asked of the network"
+
+    for path in ("/etc/passwd", str(ROOT / "README.md"), str(broken)):
+        assert status_of(f"{server}/gradio_api/file={path}") in (403, 404)
+    token = str(sources[0]).split("/")[2]
+    for name in ("%2e%2e/%2e%2e/etc/passwd", "..%2fother", "no.npz"):
+        assert status_of(f"{server}/runs/{token}/{name}") == 404
+    assert status_of(f"{server}/runs/{token}/all.zip") == 200
+
+
+def report_text(server: str, source: Any) -> str:
+    return urllib.request.urlopen(f"{server}{source}", timeout=10).read().decode()

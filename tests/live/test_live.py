@@ -1,0 +1,349 @@
+"""Live equals the causal stages on the whole film, with a bounded delay and memory; drops are counted."""
+
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from scipy.interpolate import BSpline
+from torch import Tensor
+
+import tensorsim as ts
+from tensorsim import cli
+from tensorsim.body.skeleton import coco_to_body
+from tensorsim.commands import live as live_command
+from tensorsim.data.video import VideoReader, write_video
+from tensorsim.errors import TensorsimError
+from tensorsim.live import LiveFrame, LiveSimulator
+from tensorsim.live.camera import Camera
+from tensorsim.live.page import serving
+from tensorsim.live.radar import LiveRadar, cubic_b_spline
+from tensorsim.live.tracking import OnlineTracker
+from tensorsim.recognition.timeline import WINDOW_S
+from tensorsim.types import Detections
+from tensorsim.vision.lifting.metric_pose import lowered, lowest_ankle
+from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.smoothing.kalman import KalmanSmoother, smooth_constant_velocity
+from tensorsim.vision.smoothing.outliers import limit_speed
+from tests.film import STANDING, RectangleDetector, StandingPose, film, walker
+
+FPS, FRAMES = 10.0, 60
+CONFIG = ts.SimulationConfig.through_wall().replace(scene__snr_db=None, pose__flip_test=False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small_library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Every 40th pose of the shipped library: the tables of all of them take seconds to make."""
+    global CONFIG
+    path = tmp_path_factory.mktemp("library") / "poses.safetensors"
+    save_file({"poses": load_pose_library()[::40].clone()}, path)
+    whole, CONFIG = CONFIG, CONFIG.replace(pose__library=str(path))
+    yield
+    CONFIG = whole
+
+
+def networks() -> tuple[RectangleDetector, StandingPose]:
+    return RectangleDetector(), StandingPose()
+
+
+def simulator(**options: Any) -> LiveSimulator:
+    return LiveSimulator(CONFIG, FPS, *networks(), **options)
+
+
+@pytest.fixture(scope="module")
+def walk() -> Tensor:
+    """Frames (T, 3, H, W) of somebody who walks away."""
+    return film(*walker(FRAMES, FPS, 3.0, 0.6, 0.3))
+
+
+@pytest.fixture(scope="module")
+def pushed(walk: Tensor) -> list[LiveFrame]:
+    live = simulator()
+    return [live.push(frame) for frame in walk]
+
+
+@pytest.fixture(scope="module")
+def clip(walk: Tensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("film") / "walk.mp4"
+    write_video(path, walk.permute(0, 2, 3, 1).numpy(), FPS)
+    return path
+
+
+def test_tracks_are_those_of_the_whole_clip_so_far() -> None:
+    """The last frame of a smoothed track is its filtered one: the tracker on the first t frames is a reference."""
+    range_m, x_m = (
+        torch.cat(pair)
+        for pair in zip(walker(30, FPS, 4.0, 0.5, -0.6), walker(30, FPS, 6.0, -0.5, 0.6), strict=True)
+    )
+    detections = RectangleDetector()(film(range_m, x_m))
+    tracker, online = ts.vision.GNNTracker(), OnlineTracker()
+    state = online.begin()
+    for t in range(30):
+        looked = t % 2 == 0
+        state = online.step(state, Detections(*(field[t] for field in detections)) if looked else None)
+        if t not in (20, 24, 28):
+            continue
+        observed = torch.arange(t + 1) % 2 == 0
+        first = Detections(*(field[None, : t + 1] for field in detections))
+        tracks = tracker(first, observed)
+        numbers, boxes = online.people(state)
+        assert len(numbers) == tracks.boxes.shape[1] == 2
+        assert torch.allclose(boxes.float(), tracks.boxes[0, :, -1], atol=0.05)
+
+
+def test_weak_detections_make_nobody() -> None:
+    online = OnlineTracker()
+    state = online.begin()
+    box = torch.tensor([[10.0, 10.0, 50.0, 110.0]])
+    weak = Detections(
+        box, torch.tensor([0.4]), torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.bool)
+    )
+    for _ in range(20):
+        state = online.step(state, weak)
+    assert online.people(state)[0] == []
+
+
+def test_poses_are_those_of_the_causal_stages_on_the_whole_film() -> None:
+    """The same stages, each on all frames at once: lifter, forward filter of the size, metric pose, floor, filter."""
+    stage = simulator().poses[0]
+    turn = torch.Generator().manual_seed(0)
+    size = torch.linspace(180, 120, 40)[:, None, None]
+    keypoints = torch.tensor(STANDING) * size + torch.tensor([150.0, 30.0])
+    keypoints = keypoints + torch.randn(keypoints.shape, generator=turn)
+    scores = torch.full((40, 17), 0.9)
+    scores[12:14, 9] = 0.1  # a wrist hides for a moment, then an ankle for long
+    scores[20:32, 15] = 0.1
+    state, shown = stage.begin(1), []
+    with torch.no_grad():
+        for t in range(40):
+            state = stage(state, keypoints[t : t + 1], scores[t : t + 1], torch.tensor([True]), 240, 320)
+            shown.append(state.shown[0])
+
+        body, body_scores = coco_to_body(keypoints, scores)
+        reliable = body_scores >= 0.3
+        lifted = stage.lifter(body[None], (body_scores * reliable)[None])
+        density, noise = (
+            torch.full([1], x, dtype=torch.float64) for x in (stage.size_density, stage.size_noise)
+        )
+        whole = (reliable.sum(-1) >= 10) & (lifted.distance[0] < 0.25)
+        assert bool(whole.all())
+        logarithm = lifted.scale[0].log().double()[:, None]
+        size = smooth_constant_velocity(logarithm, whole, density, noise, stage.size_speed, 1 / FPS, False)
+        alone = lifted._replace(**{name: getattr(lifted, name)[0][:, None, None] for name in lifted._fields})
+        alone = alone._replace(scale=size.exp().float()[:, None])
+        placed, seen = stage.metric_pose(
+            body[:, None, None],
+            (body_scores * reliable)[:, None, None],
+            alone,
+            torch.ones(40, 1, 1) > 0,
+            240,
+            320,
+            FPS,
+        )
+        placed, seen = placed[:, 0, 0], seen[:, 0, 0]
+        low = lowest_ankle(placed)
+        window = stage.floor_frames
+        floor = torch.stack([torch.quantile(low[max(0, t + 1 - window) : t + 1], 0.15) for t in range(40)])
+        placed = lowered(placed, floor)
+        hidden = torch.zeros(14)
+        measured = torch.zeros(40, 14, dtype=torch.bool)
+        for t in range(40):
+            hidden = torch.where(seen[t], 0, hidden + 1)
+            measured[t] = seen[t] | (hidden > stage.brief_gap) | (t == 0)
+        smoother = KalmanSmoother(
+            stage.joint_density / 30.0**3, stage.joint_noise, "forward", stage.initial_speed
+        )
+        expected = limit_speed(smoother(placed, measured, FPS), FPS, stage.top_speed_m_s)
+    assert torch.allclose(torch.stack(shown).float(), expected, atol=2e-4)
+
+
+def test_spline_is_that_of_scipy() -> None:
+    knots = np.random.default_rng(0).normal(size=(9, 3))
+    spline = BSpline(np.arange(-3.0, 10.0), knots, 3)  # knot k of the curve is control point k + 1
+    u = np.linspace(0, 0.99, 7)
+    for k in range(6):
+        part = cubic_b_spline(torch.from_numpy(knots[k : k + 4]), torch.from_numpy(u))
+        assert np.allclose(part.numpy(), spline(k + u), atol=1e-12)
+
+
+def test_maps_are_those_of_the_whole_motion() -> None:
+    motion = ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=2.0, rate_hz=20.0)
+    joints = motion.joints[0].double()
+    config = CONFIG.replace(scene__radar__prf_hz=512.0, processing__display_rate_hz=128.0)
+    stage = ts.PoseToDoppler.from_config(config)
+    radar = LiveRadar(stage, 20.0)
+    with torch.no_grad():
+        parts = [radar.push({0: (frame, True)}) for frame in joints]
+        # All moments of the curve at once; before the first frame the person stands, and fades in.
+        still = torch.cat([joints[:1].expand(3, 14, 3), joints])
+        level = torch.tensor([0.0, 0.0, 0.0, 0.5] + [1.0] * (len(joints) - 1)).double()
+        time_s = torch.arange(radar.pulse) / 512.0 * 20.0
+        knots = np.arange(-5.0, len(still) - 1)
+        curves = [
+            BSpline(knots, x.flatten(1).numpy() if x.dim() > 1 else x.numpy(), 3) for x in (still, level)
+        ]
+        place, fade = (torch.from_numpy(curve(time_s.numpy())) for curve in curves)
+        points, rcs = stage.scatterers(place.reshape(1, 1, -1, 14, 3), fade.reshape(1, 1, -1))
+        maps = stage.simulator(points, rcs)
+    assert radar.pulse == round(38 / 20 * 512)
+    for name in ("doppler_time", "range_time", "range_time_mti"):
+        live = torch.cat([getattr(part, name) for part in parts], dim=-1)
+        expected = getattr(maps, name)[0][:, : live.shape[-1]]
+        assert expected.shape[-1] - live.shape[-1] <= 1, "but for what fills no column"
+        assert torch.allclose(live, expected[:, : live.shape[-1]], atol=1e-4 * float(expected.max()))
+
+
+def test_a_file_as_a_camera_equals_its_frames(clip: Path) -> None:
+    camera = Camera(str(clip), every_frame=True)
+    played, given = simulator(), simulator()
+    frames = [frame for chunk in VideoReader(clip).chunks(7) for frame in chunk]
+    ours = [played.push(frame) for frame, _ in camera.frames()]
+    theirs = [given.push(frame) for frame in frames]
+    assert len(ours) == len(theirs) == FRAMES
+    for a, b in zip(ours, theirs, strict=True):
+        assert torch.equal(a.doppler_time, b.doppler_time)
+        assert [p.number for p in a.people] == [p.number for p in b.people]
+        assert all(torch.equal(p.joints, q.joints) for p, q in zip(a.people, b.people, strict=True))
+    assert camera.dropped == 0
+
+
+def test_somebody_walks_away_and_is_seen_by_the_radar(pushed: list[LiveFrame]) -> None:
+    last = pushed[-1]
+    assert [person.number for person in last.people] == [1]
+    hips = torch.stack([frame.people[0].joints[8] for frame in pushed[30:]])
+    speed = (hips[-1, 1] - hips[0, 1]) / (len(hips) - 1) * FPS
+    assert float(speed) == pytest.approx(0.6, abs=0.1)
+    receding = torch.cat([frame.doppler_time for frame in pushed[30:]], dim=-1).square().sum(-1)
+    assert float(receding[: len(receding) // 2].sum()) > 20 * float(receding[len(receding) // 2 :].sum())
+    centres = torch.cat([frame.doppler_time_s for frame in pushed])
+    assert torch.allclose(centres.diff(), centres.diff().mean().expand(len(centres) - 1))
+
+
+def test_delay_is_bounded(pushed: list[LiveFrame]) -> None:
+    assert max(frame.delay_s for frame in pushed[5:]) < 0.5
+
+
+def test_missed_frames_are_bridged_and_counted(walk: Tensor) -> None:
+    live = simulator()
+    for index, frame in enumerate(walk):
+        new = live.miss() if index % 3 == 2 else live.push(frame)
+    assert live.missed == FRAMES // 3
+    assert new.number == FRAMES - 1
+    assert new.people[0].present
+    assert float(new.people[0].joints[8, 1]) == pytest.approx(3.0 + 0.6 * 5.9, abs=0.4)
+
+
+def test_somebody_who_leaves_is_forgotten(walk: Tensor) -> None:
+    live = simulator()
+    for frame in walk[:30]:
+        live.push(frame)
+    assert len(live.radar.people) == 1
+    for _ in range(120):
+        new = live.push(torch.zeros_like(walk[0]))
+    assert (new.people, live.states, live.radar.people) == ([], {}, {})
+    assert float(new.doppler_time.max()) == 0.0
+
+
+def test_labels_come_once_a_second(walk: Tensor) -> None:
+    recognizer = ts.recognition.ActivityRecognizer(
+        CONFIG.scene.radar, ts.recognition.SPGNet(2), size=32, speed_m_s=2.0, class_names=("a", "b")
+    ).eval()
+    live = simulator(recognizer=recognizer)
+    labels = [new.label for new in map(live.push, walk) if new.label]
+    assert [round(label.end_s) for label in labels] == [4, 5]
+    assert all(label.end_s - label.start_s == pytest.approx(WINDOW_S) for label in labels)
+    assert live.labels is not None
+    kept = sum(part.shape[-1] for part in live.labels.doppler_time.parts)
+    assert kept <= live.labels.doppler_time.columns + 20
+
+
+def test_what_needs_the_whole_film_is_refused(walk: Tensor) -> None:
+    for changes in (
+        {"pose__initial_distance_m": (4.0,)},
+        {"pose__calibrate": True},
+        {"pose__people": "nearest"},
+        {"smoothing__smoothing_ratio": 0.25},
+        {"processing__mti": "mean"},
+        {"scene__sway": True},
+    ):
+        with pytest.raises(TensorsimError, match="live: got"):
+            LiveSimulator(CONFIG.replace(**changes), FPS, *networks())
+    with pytest.raises(TensorsimError, match=r"frame: got torch\.float32 of shape"):
+        simulator().push(walk[0].float())
+
+
+def test_frames_that_come_too_fast_are_dropped_and_counted(clip: Path) -> None:
+    camera = Camera(str(clip), fps=200.0)
+    indices, last = [], -1
+    for _, dropped in camera.frames():
+        last += 1 + dropped
+        indices.append(last)
+        time.sleep(0.02)
+    assert camera.dropped > 0
+    assert len(indices) + camera.dropped == last + 1 <= FRAMES
+
+
+def test_cameras_that_cannot_be_opened(tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="no such file"):
+        Camera(str(tmp_path / "no.mp4"))
+    with pytest.raises(TensorsimError, match="--camera: 97 cannot be opened"):
+        Camera("97")
+    with pytest.raises(TensorsimError, match="--every-frame: got the camera 0"):
+        Camera("0", every_frame=True)
+
+
+def test_the_page_streams_pictures_to_this_machine_only() -> None:
+    import cv2
+
+    with serving(0) as page:
+        address = f"http://127.0.0.1:{page.port}"
+        assert b"/live.mjpg" in urllib.request.urlopen(f"{address}/", timeout=5).read()
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{address}/../etc/passwd", timeout=5)
+        threading.Timer(0.1, page.show, [np.full((20, 30, 3), 200, np.uint8)]).start()
+        stream = urllib.request.urlopen(f"{address}/live.mjpg", timeout=5)
+        assert stream.readline() == b"--frame\r\n"
+        assert stream.readline() == b"Content-Type: image/jpeg\r\n"
+        stream.readline()
+        picture = cv2.imdecode(np.frombuffer(stream.read(len(page.latest)), np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape == (20, 30, 3)
+        with pytest.raises(TensorsimError, match=f"--port: {page.port} cannot be used"), serving(page.port):
+            pass
+
+
+def test_command(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = tmp_path / "w.onnx"
+    weights.write_text("")
+    monkeypatch.setattr(live_command, "load_networks", lambda *_: networks())
+    arguments = [
+        "live",
+        "--camera",
+        str(clip),
+        "--detector",
+        str(weights),
+        "--pose",
+        str(weights),
+        "--port",
+        "0",
+    ]
+    arguments += ["--scene", "through-wall", "--every-frame", "--record", str(tmp_path / "live.webm")]
+    cli.main([*arguments, "--seconds", "5.2"])
+    said = capsys.readouterr()
+    assert "5.3 s, 1 people, 0 frames dropped" in said.out
+    assert "dropped 0" in said.out.splitlines()[0], "a label after four seconds"
+    assert "showing http://127.0.0.1:" in said.err
+    film = VideoReader(tmp_path / "live.webm")
+    assert (film.width, film.height) == (640, 480 + 240 + 26)
+    assert sum(chunk.shape[0] for chunk in film.chunks(16)) == 53
+    with pytest.raises(SystemExit):
+        cli.main([*arguments, "--sound"])
+    assert "--sound: got it for live" in capsys.readouterr().err

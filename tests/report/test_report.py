@@ -1,0 +1,186 @@
+"""The report: what the page is told equals the run, it stays small, and a real browser plays it without a network."""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import tensorsim as ts
+from tensorsim.data.video import VideoReader
+from tensorsim.plot import decibels
+from tensorsim.report import FilmStrip, write_report
+from tensorsim.report import film as film_module
+from tensorsim.report.page import STORED_DB, timeline_content
+from tensorsim.results import Axes, Pictures, axes_of, people_of
+from tensorsim.types import Pose, RadarMaps
+from tests.browser import chromium
+
+FPS, FRAMES = 20.0, 40
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[Pose, RadarMaps, Axes, dict[str, Any]]:
+    """Somebody who walks, seen through a wall, and nobody as a second person."""
+    motion = ts.motion.ActivityGenerator().generate(
+        "walking", batch=1, seed=1, duration_s=FRAMES / FPS, rate_hz=FPS
+    )
+    joints = torch.stack([torch.zeros(FRAMES, 14, 3), motion.joints[0].float()])[None]
+    valid = torch.stack([torch.zeros(FRAMES, dtype=torch.bool), motion.valid[0]])[None]
+    config = ts.SimulationConfig.through_wall().replace(scene__radar__prf_hz=256.0)
+    stage = ts.PoseToDoppler.from_config(config)
+    maps = RadarMaps(*(field[0] for field in stage(joints, valid, FPS)))
+    blank = torch.zeros(1, 2, FRAMES, 17, 2)
+    pose = Pose(torch.zeros(1, 2, FRAMES, 4), blank, blank[..., 0], joints, valid)
+    document = config.to_document()
+    summary = {
+        "label": "S8 Walking",
+        "probabilities": {"S8 Walking": 0.75, "S1 Empty": 0.25},
+        "timeline": [{"start_s": 0.0, "end_s": 2.0, "label": "S8 Walking", "probability": 0.75}],
+        "people": people_of(pose, FPS),
+        "warnings": ["</script><script>document.title = 'broken out'</script>"],
+        "config": document,
+        **{part: document["scene"][part] for part in ("radar", "wall")},
+    }
+    return pose, maps, axes_of(stage, maps), summary
+
+
+def strip(folder: Path, frames: int = FRAMES) -> FilmStrip:
+    with FilmStrip(folder, frames, FPS) as film:
+        for index in range(frames):
+            film.add(np.full((180, 640, 3), 5 * index % 256, np.uint8))
+    return film
+
+
+def written(
+    folder: Path, run: tuple[Pose, RadarMaps, Axes, dict[str, Any]], film: FilmStrip
+) -> dict[str, Any]:
+    pose, maps, axes, summary = run
+    write_report(folder, summary, pose, FPS, maps, axes, film, Pictures(subtitle="a walk"))
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    content: dict[str, Any] = json.loads(page.split('id="content">')[1].split("</script>")[0])
+    return content
+
+
+def picture(data: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_content_equals_the_run(tmp_path: Path, run: tuple[Pose, RadarMaps, Axes, dict[str, Any]]) -> None:
+    pose, maps, axes, summary = run
+    content = written(tmp_path, run, strip(tmp_path))
+    people = content["people"]
+    assert people["numbers"] == [2], "somebody who is never there is left out"
+    joints = np.frombuffer(base64.b64decode(people["joints_cm"]), "<i2").reshape(1, FRAMES, 14, 3)
+    assert np.abs(joints / 100 - pose.joints[0, 1:].numpy()).max() <= 0.0051
+    assert len(content["film"]["pictures"]) == FRAMES
+    assert picture(content["film"]["pictures"][7]).shape == (135, 480, 3)
+    assert abs(int(picture(content["film"]["pictures"][7]).mean()) - 35) <= 1
+    doppler, moving, still = content["maps"]
+    expected = decibels(maps.range_time.numpy(), STORED_DB)
+    shown = picture(still["png"])[::-1] / 255 * STORED_DB - STORED_DB
+    assert np.abs(shown - expected).max() < 0.5 * STORED_DB / 255 + 1e-4
+    assert (still["start_s"], still["end_s"]) == (0.0, pytest.approx(2.0))
+    assert moving["start_s"] == pytest.approx(0.5 / 256)
+    rows = picture(doppler["png"]).shape[0]
+    assert doppler["high"] - doppler["low"] == pytest.approx(rows * np.diff(axes.doppler_hz)[0])
+    assert content["scene"]["wall"]["size_m"] == [5.0, 0.24, 2.5]
+    assert content["summary"]["warnings"] == summary["warnings"]
+
+
+def test_windows_that_overlap_become_stretches_that_do_not() -> None:
+    windows = [{"start_s": float(k), "end_s": k + 4.0, "label": str(k), "probability": 0.5} for k in range(3)]
+    parts = timeline_content(windows, 6.0)
+    assert [(part["start_s"], part["end_s"]) for part in parts] == [(0.0, 2.5), (2.5, 3.5), (3.5, 6.0)]
+    assert timeline_content([], 6.0) == []
+
+
+def test_ten_seconds_of_noise_stay_below_15_megabytes(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (720, 1280, 3), np.uint8)
+    with FilmStrip(tmp_path, 300, 30.0) as film:
+        for _ in range(3):
+            film.add(noise)
+    assert 300 * max(map(len, film.pictures)) < 12e6
+
+
+def test_a_long_film_is_beside_the_page(
+    tmp_path: Path,
+    run: tuple[Pose, RadarMaps, Axes, dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(film_module, "MOST_FRAMES", 10)
+    content = written(tmp_path, run, strip(tmp_path))
+    assert content["film"]["pictures"] == []
+    assert content["film"]["beside"] == "report.webm"
+    beside = VideoReader(tmp_path / "report.webm")
+    assert sum(frames.shape[0] for frames in beside.chunks(8)) == FRAMES
+    assert beside.fps == pytest.approx(FPS)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_browser_plays_it(
+    tmp_path: Path,
+    run: tuple[Pose, RadarMaps, Axes, dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    beside: bool,
+) -> None:
+    if beside:
+        monkeypatch.setattr(film_module, "MOST_FRAMES", 10)
+    written(tmp_path, run, strip(tmp_path))
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 420, "height": 900})
+        errors: list[str] = []
+        requests: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text))
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto((tmp_path / "report.html").as_uri())
+        page.wait_for_selector("body[data-ready=yes]")
+        assert page.title() == "tensorsim report"
+        assert page.inner_text("#warnings li").startswith("</script>")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 420, "wider than a telephone"
+
+        dark = page.evaluate("document.querySelector('#maps canvas').toDataURL()")
+        page.select_option("#colours", "gray")
+        assert page.evaluate("document.querySelector('#maps canvas').toDataURL()") != dark
+        before = page.evaluate("document.querySelector('#scene').toDataURL()")
+        page.mouse.move(*centre(page, "#scene"))
+        page.mouse.down()
+        page.mouse.move(30, 500)
+        assert page.evaluate("document.querySelector('#scene').toDataURL()") != before, "it turns"
+        page.mouse.up()
+
+        page.click("#play")
+        for _ in range(100):  # the page's own policy forbids the library's waiting
+            page.wait_for_timeout(50)
+            if float(page.input_value("#time")) > 0.5:
+                break
+        page.click("#play")
+        stopped = float(page.input_value("#time"))
+        page.wait_for_timeout(300)
+        shown_s = page.evaluate(FILM_TIME, FPS)
+        assert shown_s == pytest.approx(stopped, abs=0.11), "the film is where the cursor is"
+        assert errors == []
+        assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
+
+
+#: Seconds that the shown picture is from: of the film beside, or by the grey of the pictures in the page.
+FILM_TIME = """(fps) => {
+  const video = document.querySelector("#film video");
+  if (video) return video.currentTime;
+  const canvas = document.querySelector("#film canvas");
+  return (canvas.getContext("2d").getImageData(50, 50, 1, 1).data[0] / 5 + 0.5) / fps;
+}"""
+
+
+def centre(page: Any, selector: str) -> tuple[float, float]:
+    page.locator(selector).scroll_into_view_if_needed()
+    box = page.locator(selector).bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
