@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import tensorsim as ts
-from tensorsim.recognition import SPGNet
+from tensorsim.recognition import SPGNet, SPNet
 from tensorsim.recognition.map_image import MapToImage
 
 #: Stages and inputs; the first dimension of the first input may have another size.
@@ -19,7 +19,14 @@ STAGES: dict[str, tuple[nn.Module, Tensor, Tensor]] = {
         torch.rand(2, 256, 40),
         torch.rand(5, 256, 40),
     ),
-    "recogniser": (SPGNet(3), torch.rand(2, 1, 32, 32), torch.rand(5, 1, 32, 32)),
+    "light recogniser": (SPGNet(3), torch.rand(2, 1, 32, 32), torch.rand(5, 1, 32, 32)),
+    "recogniser": (SPNet(3), torch.rand(2, 1, 64, 64), torch.rand(5, 1, 64, 64)),
+    "denoiser": (ts.enhance.DnCNN(depth=3), torch.rand(2, 1, 32, 32), torch.rand(5, 1, 32, 32)),
+    "moving target indicator": (
+        ts.export.ComplexPairs(ts.radar.MovingTargetIndicator()),
+        torch.randn(2, 64, 20, 2),
+        torch.randn(5, 64, 20, 2),
+    ),
 }
 
 
