@@ -18,6 +18,7 @@ from tensorsim.commands.evaluate_classifier import EvaluateClassifier
 from tensorsim.commands.evaluate_denoiser import EvaluateDenoiser
 from tensorsim.commands.evaluate_detector import EvaluateDetector
 from tensorsim.commands.evaluate_films import EvaluateFilms
+from tensorsim.commands.evaluate_lifter import EvaluateLifter
 from tensorsim.commands.evaluate_measured import EvaluateMeasured
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.evaluate_truth import EvaluateTruth
@@ -30,6 +31,7 @@ from tensorsim.commands.train_acf import TrainAcf
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
@@ -69,6 +71,7 @@ COMMANDS: dict[str, Any] = {
             "pose": EvaluatePose,
             "films": EvaluateFilms,
             "camera": EvaluateCamera,
+            "lifter": EvaluateLifter,
             "denoiser": EvaluateDenoiser,
             "classifier": EvaluateClassifier,
             "measured": EvaluateMeasured,
@@ -82,6 +85,7 @@ COMMANDS: dict[str, Any] = {
             "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
+            "everyday": TrainEveryday,
             "acf": TrainAcf,
         },
     ),

@@ -1,5 +1,6 @@
 """Export to TorchScript and ONNX files that run where tensorsim is not installed."""
 
+import logging
 import os
 import warnings
 from collections.abc import Sequence
@@ -71,7 +72,9 @@ def to_onnx(
         )
     training = [part for part in module.modules() if part.training]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter about its own parts
+        # Of the exporter about its own parts.
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
         try:
             program = torch.onnx.export(
                 module.eval(),

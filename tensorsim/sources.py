@@ -71,7 +71,7 @@ def film_source(
         reader.fps,
         reader.frame_count,
         lambda quiet: pose_of_film(stage, reader, device, quiet, calibrate),
-        lambda: reader.chunks(8),
+        lambda: reader.even_chunks(8),
         stage.keypoint_threshold,
         {},
     )

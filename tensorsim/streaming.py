@@ -13,6 +13,7 @@ from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.progress import picture, progress_bar
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, camera_config
+from tensorsim.vision.smoothing.even_time import to_even_time
 
 
 def pose_of_film(
@@ -32,7 +33,8 @@ def pose_of_film(
         calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
 
     Returns:
-        The Pose of one clip (B = 1) on the CPU; equal to ``stage(video, fps)`` of the whole film.
+        The Pose of one clip (B = 1) on the CPU, at ``reader.fps`` frames per second; equal to ``stage(video, fps)`` of
+        the whole film, or ``stage(video, fps, times_s=...)`` where its frames are at uneven times.
 
     Raises:
         TensorsimError: the film has fewer than 2 frames.
@@ -41,6 +43,9 @@ def pose_of_film(
     tracks = stage.follow(detections, observed)
     keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet)
     size = reader.height, reader.width
+    if reader.uneven_times_s is not None:
+        times_s = reader.uneven_times_s[None]
+        tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, reader.fps)
     if calibrate:
         stage, _ = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
     pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
@@ -125,8 +130,9 @@ def _drawn(
     frames: Tensor, boxes: Tensor, keypoints: Tensor, scores: Tensor, valid: Tensor, threshold: float
 ) -> np.ndarray:
     """The last of some frames (n, 3, H, W) with its people."""
-    people = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
-    return plot.draw_people(frames[-1].permute(1, 2, 0).numpy(), *people, threshold)
+    box, points, point_scores, there = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
+    frame = frames[-1].permute(1, 2, 0).numpy()
+    return plot.draw_people(frame, box, points, point_scores, there, threshold)
 
 
 def maps_of_pose(

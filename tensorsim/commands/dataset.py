@@ -64,11 +64,14 @@ class DatasetBuild:
 class DatasetExample:
     """Print a small recipe with comments: two activities, 8 samples."""
 
+    large: bool = False
+    """One for training instead: the 12 activities of 100 people, seen by three radars, 1200 samples."""
+
     def run(self) -> None:
         """Do it."""
-        from tensorsim.data.sets.example import EXAMPLE
+        from tensorsim.data.sets.example import EXAMPLE, LARGE_EXAMPLE
 
-        print(EXAMPLE, end="")
+        print(LARGE_EXAMPLE if self.large else EXAMPLE, end="")
 
 
 @dataclass(frozen=True)

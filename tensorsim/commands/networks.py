@@ -34,7 +34,7 @@ def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path
     Raises:
         TensorsimError: none of these is there.
     """
-    return _located("detector", detector, "RTMDet"), _located("pose", pose, "HRNet", "CPM")
+    return _located("detector", detector, "RTMDet", "AcfDetector"), _located("pose", pose, "HRNet", "CPM")
 
 
 def _located(role: str, source: str | None, *networks: str) -> Path:
@@ -56,10 +56,9 @@ def load_networks(detector: Path, pose: Path, flip_test: bool, engine: str = "to
     Raises:
         TensorsimError: files that are damaged, unsafe or of another network.
     """
-    from tensorsim.pipeline import pretrained_pose
-    from tensorsim.vision.detection.rtmdet import RTMDet
+    from tensorsim.pipeline.networks import pretrained_detector, pretrained_pose
 
-    networks = RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test)
+    networks = pretrained_detector(detector), pretrained_pose(pose, flip_test)
     if engine == "torch":
         return networks
     from tensorsim.vision.onnx_engine import in_onnxruntime

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tensorsim.data.frame_times import nearest_frames
 from tensorsim.data.video import VideoReader
 
 
@@ -30,7 +31,9 @@ def read_video(
 ) -> Clip:
     """Read a film, or a part of it, into memory: 0.9 MB per frame of 640x480 pixels.
 
-    ``tensorsim simulate`` and :class:`VideoReader` read films of any length in pieces.
+    ``tensorsim simulate`` and :class:`VideoReader` read films of any length in pieces. Of a film whose frames are at
+    uneven times, the frames nearest to even times are taken, so that it has its true duration; ``simulate`` is more
+    accurate there, since it interpolates between frames.
 
     Args:
         path, fps, start_s, end_s, stride: see :class:`VideoReader`.
@@ -47,4 +50,7 @@ def read_video(
         (torch.Size([1, 30, 3, 48, 64]), 30.0)
     """
     reader = VideoReader(path, fps, start_s, end_s, stride)
-    return Clip(torch.cat(list(reader.chunks(64))).unsqueeze(0), reader.fps)
+    video = torch.cat(list(reader.chunks(64)))
+    if reader.uneven_times_s is not None:
+        video = video[nearest_frames(reader.uneven_times_s, reader.fps)]
+    return Clip(video.unsqueeze(0), reader.fps)

@@ -13,15 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tensorsim.data.frame_times import nearest_frames, unevenness_s
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.limits import RANGES, check_range
 
 #: A file that announces so many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
-#: Frames that are this many seconds and this many frames away from even time are said to be uneven.
-_UNEVEN_S, _UNEVEN_FRAMES = 0.05, 1.5
 
-#: How films begin, and where: FFmpeg would also open playlists, which name further files and addresses.
+#: First bytes of films, and where they are: FFmpeg would also open playlists, which name further files and addresses.
 _CONTAINERS = (
     *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")),  # mp4, mov, 3gp
     (8, b"AVI "),
@@ -42,8 +41,9 @@ _CONTAINERS = (
 class VideoReader:
     """A film as chunks of frames; every pass over it starts anew, so it can be read several times.
 
-    Frame k is at ``k / fps`` of the file. Frames are decoded one after the other from the first, also to
-    reach ``start_s``: seeking is not exact in every format. Frames are turned upright as the file says.
+    Frames are counted as if frame k were at ``k / fps`` of the file; ``uneven_times_s`` says where they really are.
+    Frames are decoded one after the other from the first, also to reach ``start_s``: seeking is not exact in every
+    format. Frames are turned upright as the file says.
 
     Args:
         path: a file that OpenCV decodes (mp4, avi, gif, ...).
@@ -57,6 +57,9 @@ class VideoReader:
         height, width: of the frames, in pixels.
         frame_count: frames to expect by what the file announces, None if it does not say; the film may have
             fewer.
+        uneven_times_s: (n,) float64 times in seconds of the frames that were read, known once all have been, where they
+            are not evenly spaced (a GIF with a pause, a telephone that saves power); None where they are, or where
+            ``fps`` was given.
 
     Example:
         >>> reader = VideoReader("clip.mp4", start_s=1.0)
@@ -79,27 +82,9 @@ class VideoReader:
         stride: int = 1,
     ) -> None:
         self.path = Path(path)
-        if fps is not None:
-            check_positive(fps, "fps")
-            check_range(fps, "frame rate", "fps")
-        if stride < 1:
-            raise TensorsimError(f"stride: got {stride}, expected 1 or more")
-        check_range(stride, "stride", "stride")
         start_s = 0.0 if start_s is None else start_s
-        if not 0 <= start_s < math.inf:
-            raise TensorsimError(f"start_s: got {start_s}, expected a number of seconds from 0 on")
-        if end_s is not None and not end_s > start_s:
-            raise TensorsimError(
-                f"end_s: got {end_s}, expected a number of seconds above the start, {start_s}"
-            )
-        check_range(start_s, "time", "start_s")
-        if not self.path.exists():
-            raise TensorsimError(f"{self.path}: no such file, expected a video")
-        if not self.path.is_file():
-            raise TensorsimError(f"{self.path}: got a folder, expected a video file")
-        if not _begins_like_a_film(self.path):
-            raise TensorsimError(f"{self.path}: OpenCV cannot read this, expected a video")
-
+        _check_cut(fps, start_s, end_s, stride)
+        _check_is_film(self.path)
         with self._opened() as capture:
             file_fps, announced = _properties(capture)
             if fps is None and not 0 < file_fps < ABSURD_FPS:
@@ -130,6 +115,7 @@ class VideoReader:
         self.width: int = frame.shape[1]
         for side in (self.height, self.width):
             check_range(side, "image side", f"{self.path}: frames of {self.width}x{self.height} pixels")
+        self.uneven_times_s: Tensor | None = None
         self._announced = announced
         self.frame_count = (
             None if announced is None else max(1, -(-(self._stop(announced) - self._first) // stride))
@@ -139,8 +125,8 @@ class VideoReader:
         """The frames in order, at most ``size`` at a time: (n, 3, H, W) uint8 RGB on the CPU, n >= 1.
 
         A film that ends before the frames that its file announces (a cut-off download) gives what is there,
-        with a TensorsimWarning. Frames at uneven times (a GIF with a pause, a telephone that saves power) are
-        given as they come, with a TensorsimWarning: what follows takes their rate as constant.
+        with a TensorsimWarning. Frames at uneven times are given as they come, with a TensorsimWarning, and
+        ``uneven_times_s`` has their times afterwards; :meth:`even_chunks` gives them at even times.
 
         Raises:
             TensorsimError: a size below 1, or a film whose frames change their size.
@@ -148,6 +134,22 @@ class VideoReader:
         if size < 1:
             raise TensorsimError(f"chunks: got a size of {size} frames, expected 1 or more")
         return self._chunks(size)
+
+    def even_chunks(self, size: int) -> Iterator[Tensor]:
+        """As :meth:`chunks`; of a film whose ``uneven_times_s`` are known, the frames nearest to even times.
+
+        A frame that is shown for long is repeated, one that is shown briefly may be left out.
+        """
+        if self.uneven_times_s is None:
+            yield from self.chunks(size)
+            return
+        index = nearest_frames(self.uneven_times_s, self.fps)
+        done = 0
+        for frames in self.chunks(size):
+            here = index[(index >= done) & (index < done + frames.shape[0])] - done
+            for part in here.split(size):
+                yield frames[part]
+            done += frames.shape[0]
 
     def _chunks(self, size: int) -> Iterator[Tensor]:
         import cv2
@@ -158,7 +160,6 @@ class VideoReader:
             filled = 0
             times_s: list[float] = []
             while (self._end is None or index < self._end) and capture.grab():
-                times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
                 if (index - self._first) % self._stride == 0:
                     found, frame = capture.retrieve()
                     if not found:
@@ -168,6 +169,7 @@ class VideoReader:
                             f"{self.path}: frame {index} has shape {frame.shape}, "
                             f"expected {buffer.shape[1:]} as the first"
                         )
+                    times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
                     cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled])
                     filled += 1
                 index += 1
@@ -176,7 +178,7 @@ class VideoReader:
                     filled = 0
             if filled:
                 yield _planes(buffer[:filled])
-        self._check_times(np.array(times_s))
+        self._keep_times(torch.tensor(times_s, dtype=torch.float64))
         if self._announced is not None:
             expected = self._stop(self._announced)
             # Containers count by duration and are often a frame or two off.
@@ -188,18 +190,17 @@ class VideoReader:
                     stacklevel=2,
                 )
 
-    def _check_times(self, times_s: np.ndarray) -> None:
-        """Warn of frames that are not at even times, where the file states times and its rate is taken."""
-        if self._fps_of_file is None or len(times_s) < 3 or not np.all(np.diff(times_s) > 0):
-            return
-        late_s = np.abs(times_s - times_s[0] - np.arange(len(times_s)) / self._fps_of_file).max()
-        if late_s > max(_UNEVEN_S, _UNEVEN_FRAMES / self._fps_of_file):
-            steps_s = np.diff(times_s)
-            usual = steps_s[steps_s < 1.5 * np.median(steps_s)].mean()
+    def _keep_times(self, times_s: Tensor) -> None:
+        """Keep the times of frames that are not evenly spaced, and warn."""
+        late_s = 0.0 if self._fps_of_file is None else unevenness_s(times_s, self.fps)
+        self.uneven_times_s = times_s if late_s else None
+        if late_s:
+            steps_s = times_s.diff()
+            usual = steps_s[steps_s < 1.5 * steps_s.median()].mean()
             warnings.warn(
-                f"{self.path}: its frames are up to {late_s:.2f} s away from the constant {self._fps_of_file:g} frames "
-                f"per second that it announces and that speeds are computed with; by its own times it mostly has "
-                f"{1 / usual:.3g}: give that as fps, or convert it (ffmpeg -i IN -fps_mode cfr OUT)",
+                f"{self.path}: its frames are up to {late_s:.2f} s away from the constant {self.fps:g} frames per "
+                f"second that it announces (mostly there are {1 / usual:.3g}): motion is interpolated to even times; "
+                "give fps to take the frames as evenly spaced",
                 TensorsimWarning,
                 stacklevel=3,
             )
@@ -306,6 +307,31 @@ def _frames_in(path: Path) -> int | None:
         return _properties(capture)[1] if capture.isOpened() else None
     finally:
         capture.release()
+
+
+def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: int) -> None:
+    """Refuse arguments of a reader that are out of range."""
+    if fps is not None:
+        check_positive(fps, "fps")
+        check_range(fps, "frame rate", "fps")
+    if stride < 1:
+        raise TensorsimError(f"stride: got {stride}, expected 1 or more")
+    check_range(stride, "stride", "stride")
+    if not 0 <= start_s < math.inf:
+        raise TensorsimError(f"start_s: got {start_s}, expected a number of seconds from 0 on")
+    if end_s is not None and not end_s > start_s:
+        raise TensorsimError(f"end_s: got {end_s}, expected a number of seconds above the start, {start_s}")
+    check_range(start_s, "time", "start_s")
+
+
+def _check_is_film(path: Path) -> None:
+    """Refuse what is no file, or begins like no film."""
+    if not path.exists():
+        raise TensorsimError(f"{path}: no such file, expected a video")
+    if not path.is_file():
+        raise TensorsimError(f"{path}: got a folder, expected a video file")
+    if not _begins_like_a_film(path):
+        raise TensorsimError(f"{path}: OpenCV cannot read this, expected a video")
 
 
 def _begins_like_a_film(path: Path) -> bool:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from tensorsim.training.denoiser_scores import COLUMNS, scores
 from tensorsim.training.maps import SCENES
 
 #: Echo models of the through-wall scene by name.
-ECHOES: dict[str, dict[str, bool]] = {
+ECHOES: dict[str, dict[str, Any]] = {
     "without wall attenuation": {"wall_attenuation": False},
     "without multipath": {"multipath": False},
     "without both": {"wall_attenuation": False, "multipath": False},

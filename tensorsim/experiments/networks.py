@@ -145,7 +145,8 @@ def networks_report(config: NetworksConfig, work: Work) -> Report:
     def found(name: str, scene: str) -> list[float]:
         return [accuracy(r, ratio) for t, r in results.items() if (t.network, t.scene) == (name, scene)]
 
-    rows, shown = [], {}
+    rows: list[list[Any]] = []
+    shown: dict[str, dict[str, tuple[float, float]]] = {}
     for name in config.networks:
         entry = find_classifier(name)
         network = entry.build(len(ACTIVITIES), 1, config.size)
@@ -204,7 +205,8 @@ def snr_report(config: NetworksConfig, work: Work) -> Report:
     ratios = sorted(config.snr_db, reverse=True)
     tables, drawn = [], {}
     for scene in config.scenes:
-        rows, curves = [], {}
+        rows: list[list[Any]] = []
+        curves: dict[str, list[float]] = {}
         for name in config.networks:
             of_network = [r for t, r in results.items() if (t.network, t.scene) == (name, scene)]
             numbers = [mean_and_spread([accuracy(r, ratio) for r in of_network]) for ratio in ratios]

@@ -1,5 +1,7 @@
 """All experiments in one report."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -7,6 +9,8 @@ from typing import TYPE_CHECKING
 from tensorsim.experiments.work import Report, Table, Work
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tensorsim.experiments.catalogue import Experiment
 
 
@@ -23,7 +27,7 @@ class PaperConfig:
     data: str = ""
 
 
-def paper_report(config: PaperConfig, work: Work, experiments: "Mapping[str, Experiment]") -> Report:
+def paper_report(config: PaperConfig, work: Work, experiments: Mapping[str, Experiment]) -> Report:
     """The reports of the experiments under one roof; each has its own settings."""
     from dataclasses import replace
 
@@ -31,7 +35,7 @@ def paper_report(config: PaperConfig, work: Work, experiments: "Mapping[str, Exp
         "The experiments of RadHARSimulator V2 (arXiv 2511.09022), made again on declared data with declared figures."
     ]
     tables: list[Table] = []
-    drawn = {}
+    drawn: dict[str, Figure] = {}
     for name, experiment in experiments.items():
         settings = experiment.quick() if config.quick else experiment.config()
         if name == "real":

@@ -7,6 +7,7 @@ one ratio, from the same people and motion.
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -113,7 +114,7 @@ class RangeAndRidges:
 
     def __init__(self, scene: str, size: int) -> None:
         preset = PRESETS[scene]
-        options = {"engine": "range-bins", "near_bins": 4, "display_rate_hz": 256.0}
+        options: dict[str, Any] = {"engine": "range-bins", "near_bins": 4, "display_rate_hz": 256.0}
         self.simulator = RadarSimulator(
             preset.radar, preset.wall, multipath=preset.wall is not None, snr_db=SNR_DB, **options
         )

@@ -89,7 +89,7 @@ def real_report(config: RealConfig, work: Work) -> Report:
         accuracy = work.kept("real", settings, make)["accuracy"]
         found.setdefault((name, measured.name), []).append(100 * accuracy)
     means = {key: mean_and_spread(values) for key, values in found.items()}
-    rows = []
+    rows: list[list[Any]] = []
     for name in config.networks:
         numbers = [means[name, measured.name] for measured in sets]
         rows.append([find_classifier(name).title, *(x for pair in numbers for x in pair)])

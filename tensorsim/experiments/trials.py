@@ -9,9 +9,10 @@ import io
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -226,16 +227,34 @@ def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -
     """
     for trial in trials:
         trial.check()
-    found: dict[int, dict[str, Any]] = {}
-    for trial in trials:
-        trial.pictures(work).prepare(trial.clips + trial.test_clips, trial.inputs)
+    kept = [_kept(trial, ratios, work) for trial in trials]
+    waiting = [k for k, result in enumerate(kept) if result is None]
+    found = {k: result for k, result in enumerate(kept) if result is not None}
+    for k in waiting:
+        trials[k].pictures(work).prepare(trials[k].clips + trials[k].test_clips, trials[k].inputs)
     pool = ProcessPoolExecutor(work.jobs, mp_context=get_context("spawn"), max_tasks_per_child=1)
-    with tqdm(total=len(trials), desc="trainings", unit="training", disable=work.quiet) as bar:
+    with tqdm(total=len(waiting), desc="trainings", unit="training", disable=work.quiet) as bar:
         try:
-            futures = {pool.submit(_one_thread, trial, ratios, work): k for k, trial in enumerate(trials)}
+            futures = {pool.submit(_one_thread, trials[k], ratios, work): k for k in waiting}
             for future in as_completed(futures):
                 found[futures[future]] = future.result()
                 bar.update()
+        except BrokenProcessPool:
+            raise TensorsimError(
+                "a training ended without a result: was it killed, or out of memory?"
+            ) from None
+        except BaseException:
+            for child in active_children():  # they would train to their end
+                child.terminate()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     return [found[k] for k in range(len(trials))]
+
+
+def _kept(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, Any] | None:
+    """The result of a trial if all of it is there."""
+    path = work.cache / "trials" / trial.name / "result.json"
+    result = read_result(path) if path.is_file() else {}
+    complete = {f"{ratio:g}" for ratio in ratios} <= set(result.get("confusion", ()))
+    return result if complete else None

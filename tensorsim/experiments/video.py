@@ -24,14 +24,15 @@ from tensorsim.radar.presets import PRESETS
 from tensorsim.registry import find
 from tensorsim.render.renderer import PersonRenderer
 from tensorsim.training.maps import SCENES
-from tensorsim.types import Tracks
 from tensorsim.vision.detection.acf import AcfDetector
 from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.tracking.mosse import MosseTracker
 
 FULL = "RTMDet, GNN, HRNet, matching"
 MOSSE = "RTMDet, MOSSE"
 ACF = "ACF, GNN"
+TCN = "TCN (TemporalLifter)"
 #: Published weights that a row needs, and its name.
 BY_NAME = {"cpm-coco": "CPM, matching"}
 
@@ -78,68 +79,71 @@ class VideoConfig:
         }
 
 
+#: From frames (T, 3, H, W) and the height of the person in metres to joints (P, T, 14, 3) and presence (P, T).
+Chain = Callable[[Tensor, float], tuple[Tensor, Tensor]]
+
+
 class Watcher:
-    """The chains that are compared, each from frames to the people observed in the picture.
+    """The chains that are compared, each from frames to joints; all know the camera and the height of the person.
 
     Attributes:
-        chains: by name: frames (T, 3, H, W) -> :class:`~tensorsim.evaluation.films.Observed`.
+        chains: by name.
         missing: rows that are left out, and why.
     """
 
     def __init__(self) -> None:
         self.detector = RTMDet.from_pretrained()
-        pose = pretrained_pose()
-        self.stages: dict[str, VideoToPose] = {FULL: _stage(self.detector, pose)}
-        self.chains: dict[str, Callable[[Tensor], Observed]] = {
-            FULL: self._by_stage(FULL),
-            MOSSE: self._by_mosse,
-        }
+        self.pose = pretrained_pose()
+        self.chains: dict[str, Chain] = {FULL: _matched(self.detector, self.pose), MOSSE: self._by_mosse}
+        self.missing: dict[str, str] = {}
         try:
-            acf = AcfDetector.from_pretrained()
-            self.stages[ACF] = _stage(acf, pose)
-            self.chains[ACF] = self._by_stage(ACF)
-            without_acf = {}
+            self.chains[ACF] = _matched(AcfDetector.from_pretrained(), self.pose)
         except TensorsimError as error:
-            without_acf = {ACF: f"{error}; train them with `tensorsim train acf`"}
-        self.missing = without_acf | {
-            "TCN": "VideoPose3D: no weights are shipped, and none trained here; the published ones are "
-            "videopose3d-h36m-243 and others of `tensorsim models list`"
-        }
+            self.missing[ACF] = f"{error}; train them with `tensorsim train acf`"
+        try:
+            TemporalLifter.from_pretrained()
+            self.chains[TCN] = self._by_tcn
+        except TensorsimError as error:
+            self.missing[TCN] = f"{error}; train them with `tensorsim train lifter`"
         for name, row in BY_NAME.items():
             if find(name).path.is_file():
-                self.stages[row] = _stage(self.detector, pretrained_pose(name))
-                self.chains[row] = self._by_stage(row)
+                self.chains[row] = _matched(self.detector, pretrained_pose(name))
             else:
                 self.missing[row] = f"needs the published weights: tensorsim models fetch {name}"
 
-    def _by_stage(self, name: str) -> Callable[[Tensor], Observed]:
-        def watch(frames: Tensor) -> Observed:
-            seen = self.stages[name](frames[None], FPS)
-            return Observed(seen.boxes[0], seen.valid[0], seen.keypoints[0], seen.keypoint_scores[0])
+    def _by_tcn(self, frames: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
+        lifter = TemporalLifter.from_pretrained(None, CAMERA, (height_m,))
+        return _joints(
+            VideoToPose(self.detector, self.pose, (height_m,), camera=CAMERA, lifter=lifter), frames
+        )
 
-        return watch
-
-    def _by_mosse(self, frames: Tensor) -> Observed:
+    def _by_mosse(self, frames: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
         """RTMDet starts the filters in the first frame in which it sees somebody."""
         for first in range(0, len(frames), 2):
             start = self.detector(frames[first : first + 1])
             if bool((start.valid & (start.scores >= 0.5)).any()):
                 break
         tracks = MosseTracker()(frames[None, first:], start)
-        return _observed(self.stages[FULL], frames, tracks, first)
+        before = torch.zeros(tracks.valid.shape[1], first, dtype=torch.bool)
+        boxes = torch.cat([tracks.boxes.new_zeros(len(before), first, 4), tracks.boxes[0]], dim=1)
+        valid = torch.cat([before, tracks.valid[0]], dim=1)
+        stage = VideoToPose(self.detector, self.pose, (height_m,), camera=CAMERA).eval()
+        keypoints, scores = stage.estimate(frames, boxes.transpose(0, 1), valid.transpose(0, 1))
+        return Observed(boxes, valid, keypoints.transpose(0, 1), scores.transpose(0, 1)).lifted_by(stage)
 
 
-def _stage(detector: nn.Module, pose: nn.Module) -> VideoToPose:
-    return VideoToPose(detector, pose, camera=CAMERA).eval()
+def _matched(detector: nn.Module, pose: nn.Module) -> Chain:
+    """The chain with nearest matching."""
+
+    def watch(frames: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
+        return _joints(VideoToPose(detector, pose, (height_m,), camera=CAMERA), frames)
+
+    return watch
 
 
-def _observed(stage: VideoToPose, frames: Tensor, tracks: Tracks, first: int) -> Observed:
-    """Tracks from frame ``first`` on with the key points of the stage's pose network."""
-    before = torch.zeros(tracks.valid.shape[1], first, dtype=torch.bool)
-    boxes = torch.cat([tracks.boxes.new_zeros(len(before), first, 4), tracks.boxes[0]], dim=1)
-    valid = torch.cat([before, tracks.valid[0]], dim=1)
-    keypoints, scores = stage.estimate(frames, boxes.transpose(0, 1), valid.transpose(0, 1))
-    return Observed(boxes, valid, keypoints.transpose(0, 1), scores.transpose(0, 1))
+def _joints(stage: VideoToPose, frames: Tensor) -> tuple[Tensor, Tensor]:
+    seen = stage.eval()(frames[None], FPS)
+    return seen.joints[0], seen.valid[0]
 
 
 def video_report(config: VideoConfig, work: Work) -> Report:
@@ -180,7 +184,7 @@ def _film(clip: ActivityClip, other: ActivityClip, watcher: Watcher, pipelines: 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TensorsimWarning)
         for name, watch in watcher.chains.items():
-            found, valid = pipelines.lifted(setting, clip, watch(frames))
+            found, valid = watch(frames, clip.height_m)
             maps = {s: pipelines.maps(setting, s, clip, found, valid) for s in pipelines.scenes}
             cells[name] = {"scores": scores(maps), "pose": pose_errors(found, valid, clip)}
         cells["empty map"] = {"scores": scores({s: truth[s].empty() for s in truth}), "pose": {}}

@@ -140,18 +140,21 @@ class VideoToDoppler(nn.Module):
         """
         return cls(RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test), **options).eval()
 
-    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Simulation:
+    def forward(
+        self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
+    ) -> Simulation:
         """Simulate what the radar sees of clips.
 
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
             lengths: (B,) frames of each clip when the shorter ones are padded.
+            times_s: (B, T) seconds of frames that are not evenly spaced.
 
         Raises:
             TensorsimError: see :class:`VideoToPose` and :class:`PoseToDoppler`.
         """
-        pose = self.video_to_pose(video, fps, lengths)
+        pose = self.video_to_pose(video, fps, lengths, times_s)
         if not torch.jit.is_scripting():
             warn_of_empty_clips(pose.valid)
         maps = self.pose_to_doppler(pose.joints, pose.valid, fps)
@@ -233,9 +236,11 @@ class VideoToActivity(nn.Module):
             ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier),
         ).eval()
 
-    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Recognition:
+    def forward(
+        self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
+    ) -> Recognition:
         """Clips (B, T, 3, H, W) to people, maps and logits; arguments and errors of :class:`VideoToDoppler`."""
-        found = self.video_to_doppler(video, fps, lengths)
+        found = self.video_to_doppler(video, fps, lengths, times_s)
         logits = self.recognizer(
             RadarMaps(
                 found.range_time,

@@ -8,17 +8,18 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
-from tensorsim.pipeline.networks import pretrained_lifter, pretrained_pose, top_down
+from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
-from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps
+from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
+from tensorsim.vision.smoothing.sides import SteadySides
 from tensorsim.vision.tracking.tracker import GNNTracker
 
 
@@ -95,12 +96,15 @@ class VideoToPose(nn.Module):
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
         self.metric_pose = metric_pose
+        self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
         self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
+        #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
+        self.noise_share = 0.1
         #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
         self.top_speed_m_s = 12.0
         #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
@@ -122,7 +126,7 @@ class VideoToPose(nn.Module):
         """
         tracking, people, smoothing = config.tracking, config.pose, config.smoothing
         if detector is None:
-            detector = RTMDet.from_pretrained(tracking.detector)
+            detector = pretrained_detector(tracking.detector)
         if pose is None:
             pose = pretrained_pose(people.network, people.flip_test)
         return cls(
@@ -173,20 +177,24 @@ class VideoToPose(nn.Module):
         if isinstance(lifter, TemporalLifter):
             other.temporal = lifter.seen_by(camera)
         else:
-            other.lifter = lifter.tilted(camera.pitch_rad)
+            other.lifter = lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
-    def forward(self, video: Tensor, fps: float, lengths: Tensor | None = None) -> Pose:
+    def forward(
+        self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
+    ) -> Pose:
         """Estimate the people of whole clips.
 
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
             lengths: (B,) frames of each clip when the shorter ones are padded; None takes all T.
+            times_s: (B, T) seconds, increasing, of frames that are not evenly spaced: the people are interpolated to
+                ``fps`` frames per second, see :func:`~tensorsim.vision.smoothing.even_time.to_even_time`. None: even.
 
         Raises:
-            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive.
+            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive, times that do not increase.
         """
         check_rank(video, 5, "video", "(B, T, 3, H, W)")
         check_size(video, 2, 3, "video", "(B, T, 3, H, W)")
@@ -209,6 +217,8 @@ class VideoToPose(nn.Module):
         keypoints, scores = self.estimate(frames, boxes, valid)
         keypoints = keypoints.reshape(b, t, people, 17, 2).transpose(1, 2)
         scores = scores.reshape(b, t, people, 17).transpose(1, 2)
+        if times_s is not None:
+            tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, fps)
         return self.lift(tracks, keypoints, scores, height, width, fps)
 
     def frames_present(self, clips: int, frames: int, lengths: Tensor | None, device: torch.device) -> Tensor:
@@ -298,6 +308,7 @@ class VideoToPose(nn.Module):
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
+        keypoints, scores = self.sides(keypoints, scores, tracks.valid, fps)
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         # Joints below the threshold have no weight in the match: the network guesses what it cannot see.
         reliable = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
@@ -309,7 +320,7 @@ class VideoToPose(nn.Module):
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
             lifted = self.temporal.in_picture(found, body_scores, height, width)
-            body, noise = lifted.keypoints, found.deviation
+            body, noise = lifted.keypoints, self.noise_share * found.deviation
         else:
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)

@@ -142,6 +142,7 @@ class RadarSimulator(nn.Module):
         self.fixed_gate_m = None if isinstance(gate_m, float | int) else gate_m
         self.range_profile = RangeProfile(radar, processing.range_window, self.fixed_gate_m)
         self.recorder = Recorder(scene, processing, self.echo, self.range_profile, seed)
+        self.noise = self.recorder.noise
         self.channels, self.has_array = self.recorder.channels, radar.has_array
         self.gate: nn.Module | None = None
         if isinstance(gate_m, float | int):

@@ -52,7 +52,7 @@ class AcfSettings:
     positives: int = 3000
     negatives: int = 3000
     learning_rate: float = 0.5
-    false_per_picture: float = 0.3
+    false_per_picture: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ def crop(image: npt.NDArray[np.uint8], box: Floats, mirrored: bool) -> npt.NDArr
     import cv2
 
     scale = PERSON_HEIGHT / float(box[3] - box[1])
-    source = image
+    source: npt.NDArray[Any] = image
     # Averages first: bilinear interpolation alone would alias.
     if scale < 0.5:
         source = cv2.resize(image, None, fx=2 * scale, fy=2 * scale, interpolation=cv2.INTER_AREA)
@@ -112,7 +112,11 @@ def window_features(crops: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.fl
 
 
 def boost(
-    features: npt.NDArray[np.float32], labels: npt.NDArray[np.int64], rounds: int, settings: AcfSettings
+    features: npt.NDArray[np.float32],
+    labels: npt.NDArray[np.int64],
+    rounds: int,
+    settings: AcfSettings,
+    quiet: bool = True,
 ) -> AcfDetector:
     """A detector of ``rounds`` trees that tells windows with people (label 1) from others (0).
 
@@ -132,7 +136,14 @@ def boost(
         max_depth=2,
         max_features=max(1, features.shape[1] // 16),
         random_state=settings.seed,
-    ).fit(features, labels)
+    )
+    with tqdm(total=rounds, desc="trees", unit="tree", disable=quiet) as bar:
+
+        def count(*_: Any) -> bool:
+            bar.update()
+            return False  # go on
+
+        model.fit(features, labels, monitor=count)
     detector = AcfDetector(rounds)
     share = float(labels.mean())
     for k, tree in enumerate(model.estimators_[:, 0]):
@@ -193,7 +204,7 @@ class AcfTrainer:
                 negative = np.concatenate([negative, found])
             features = np.concatenate([positive, negative])
             labels = np.repeat(np.array([1, 0]), [len(positive), len(negative)])
-            detector = boost(features, labels, rounds, self.settings)
+            detector = boost(features, labels, rounds, self.settings, self.quiet)
         assert detector is not None
         self.calibrate(detector)
         return detector

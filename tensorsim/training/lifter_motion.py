@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -74,25 +74,26 @@ def fall_any_way(time: Tensor, who: People) -> Act:
     way = 2 * math.pi * torch.remainder(who.gait_phase * 7.0, 1.0)[:, None]
     lean, roll = 88 * torch.cos(way), 88 * torch.sin(way)
     give = bell(time, 0.0 * v(1.0), v(1.1) / rate)
-    arms, spread, fold = v(90.0) - 40, v(40.0), v(60.0) - 20
-    legs, knees = v(30.0) - 10, v(45.0) - 15
+    # Arms lie on the floor, beside the body or over the head; nothing bends into the floor.
+    overhead = (torch.remainder(who.gait_phase * 29.0, 1.0) < 0.3)[:, None]
+    arms = torch.where(overhead, v(165.0), v(60.0) - 60)
+    spread, fold = (3 * v(45.0) - 90) * torch.cos(way).square(), (v(60.0) - 40) * torch.cos(way).square()
+    supine = 0.5 * (1 - torch.cos(way))
+    legs = supine.square() * (3 * v(35.0) - 70)
+    knees = 1.6 * legs + (1 - supine) * (v(60.0) - 48)
     rest = 1 - 0.6 * down
     bend = v(55.0) - 10
     pose = make_pose(
         time,
         who,
         lean=lean * down,
-        pitch=(v(40.0) - 34) * down + v(12.0) * give,
+        pitch=(v(40.0) - 40) * down + v(12.0) * give,
         twist=(v(40.0) - 40) * down,
         nod=(v(60.0) - 60) * down,
-        hip=(
-            rest * REST_HIP + legs * down + (bend + 10) * give, rest * REST_HIP + 0.5 * legs * down + bend * give
-        ),
-        knee=(
-            rest * REST_KNEE + knees * down + 1.2 * bend * give, rest * REST_KNEE + 0.6 * knees * down + bend * give
-        ),
-        flexion=(2 + arms * down, 2 + 0.7 * arms * down),
-        abduction=(8 + spread * down, 8 + 0.8 * spread * down),
+        hip=(rest * REST_HIP + legs * down + (bend + 10) * give, rest * REST_HIP + 0.8 * legs * down + bend * give),
+        knee=(rest * REST_KNEE + knees * down + 1.2 * bend * give, rest * REST_KNEE + 0.8 * knees * down + bend * give),
+        flexion=(2 + arms * down, 2 + 0.9 * arms * down),
+        abduction=(8 + spread * down, 8 + 0.7 * spread * down),
         elbow=(12 + fold * down, 12 + 0.8 * fold * down),
     )  # fmt: skip
     pose = pose._replace(roll=pose.roll + torch.deg2rad(roll * down))
@@ -185,7 +186,8 @@ def _captured(
     sequences: list[tuple[Tensor, float]], count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Pieces of captured motion at 0.75 to 1.3 of its speed, of bodies with other proportions and sizes."""
-    pieces, heights = [], []
+    pieces: list[Tensor] = []
+    heights: list[float] = []
     while len(pieces) < count:
         lengths = torch.tensor([len(joints) / fps for joints, fps in sequences]).clamp(max=12.0)
         joints, fps = sequences[int(torch.multinomial(lengths, 1, generator=generator))]
@@ -229,7 +231,7 @@ def _batches(
 
 
 def build_pool(
-    path: Path,
+    path: Path | None,
     count: int,
     motions: tuple[Path, ...] = (),
     seed: int = 0,
@@ -239,7 +241,7 @@ def build_pool(
     """The motions of a file, made and stored first if it is not there.
 
     Args:
-        path: ``.pt`` file.
+        path: ``.pt`` file; None stores nothing.
         count: motions of all kinds.
         motions: motion capture files. Without any, the other kinds share.
         seed: of everything random.
@@ -249,9 +251,9 @@ def build_pool(
     Raises:
         TensorsimError: a damaged file, or one of other motions.
     """
-    settings = {"count": count, "seed": seed, "held_out": held_out}
+    settings: dict[str, Any] = {"count": count, "seed": seed, "held_out": held_out}
     settings |= {"motions": [file.name for file in motions]}
-    if path.is_file():
+    if path is not None and path.is_file():
         try:
             stored = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:
@@ -274,7 +276,8 @@ def build_pool(
                 kinds.append(torch.full((len(made),), list(KINDS).index(kind)))
                 bar.update(len(made))
     pool = MotionPool(torch.cat(joints), torch.cat(heights), torch.cat(kinds))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with complete_file(path) as scratch:
-        torch.save(pool._asdict() | {"settings": settings}, scratch)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with complete_file(path) as scratch:
+            torch.save(pool._asdict() | {"settings": settings}, scratch)
     return pool

@@ -199,6 +199,9 @@ def _missed(
     error = error + 0.005 * good * draw.normal(1, 17, 2)
     wild = draw.spells(frames, 0.10, 0.03, 0.5, 17).transpose(1, 2)
     error = error + 0.12 * wild[..., None] * draw.correlated(frames, 0.5 * fps, 17, 2)
+    # Bodies come out a little small: faces low and ankles high, by 1 % on rendered films.
+    size = -0.010 + 0.012 * draw.normal(1, 1, 1)
+    error = error + size * (points - points.mean(dim=2, keepdim=True)) / unit[..., None, None]
     found = points + unit[..., None, None] * error
 
     other = points[:, :, list(MIRRORED)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from tensorsim.data import video
+from tensorsim.data import read_video, video
 from tensorsim.data.video import VideoReader, write_video
 from tensorsim.errors import TensorsimError, TensorsimWarning, collected_warnings
 
@@ -287,11 +287,42 @@ def test_uneven_times_are_said(tmp_path: Path) -> None:
     durations = [40] * 20
     durations[8] = 2000
     pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=durations)
-    with pytest.warns(TensorsimWarning, match=r"a\.gif: .* up to [12]\.\d+ s away .* mostly has 25:"):
+    with pytest.warns(
+        TensorsimWarning, match=r"a\.gif: .* up to [12]\.\d+ s away .* \(mostly there are 25\)"
+    ):
         read(tmp_path / "a.gif")
     # Before the pause all is even, and a rate that is given is taken.
     assert len(read(tmp_path / "a.gif", fps=25.0)) == 20
     assert len(read(tmp_path / "a.gif", fps=25.0, end_s=0.2)) == 5
+
+
+@pytest.mark.filterwarnings("ignore:.* its frames are up to")
+def test_frames_at_even_times(tmp_path: Path) -> None:
+    """A pause of two seconds repeats its frame; frames that come faster than the rate are left out."""
+    image = pytest.importorskip("PIL.Image")
+    durations = [100] * 5 + [2000] + [100] * 4
+    pictures = [image.fromarray(picture(i)) for i in range(10)]
+    path = tmp_path / "pause.gif"
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations)
+    reader = VideoReader(path)
+    assert reader.uneven_times_s is None  # not read yet
+    frames = torch.cat(list(reader.chunks(4)))
+    times = np.concatenate([[0.0], np.cumsum(durations[:-1]) / 1000])
+    np.testing.assert_allclose(reader.uneven_times_s, times, atol=1e-6)
+    even = [
+        int(np.abs(times - k / reader.fps).argmin()) for k in range(int(times[-1] * reader.fps + 1e-3) + 1)
+    ]
+    for size in (3, 100):
+        chunks = list(reader.even_chunks(size))
+        assert max(len(chunk) for chunk in chunks) <= size
+        assert torch.equal(torch.cat(chunks), frames[even])
+    assert even.count(5) + even.count(6) > 4
+    clip = read_video(path)
+    assert torch.equal(clip.video[0], frames[even])
+    assert clip.video.shape[1] / clip.fps == pytest.approx(times[-1], abs=1.01 / clip.fps)
+    given = VideoReader(path, fps=10.0)
+    assert sum(len(chunk) for chunk in given.even_chunks(4)) == 10
+    assert given.uneven_times_s is None
 
 
 def test_playlists_are_not_opened(clip: Path) -> None:
@@ -356,7 +387,9 @@ def test_real_films(shared_data: Path, name: str, height: int, width: int, frame
     uneven = {"walk_away_1person_16fps.gif": "15", "hug_2people_28fps.mp4": "30"}  # by the times in the files
     with collected_warnings() as messages:
         assert sum(chunk.shape[0] for chunk in reader.chunks(16)) == frames
-    assert [f"mostly has {uneven[name]}:" in message for message in messages] == [True] * (name in uneven)
+    assert [f"(mostly there are {uneven[name]})" in message for message in messages] == [True] * (
+        name in uneven
+    )
 
 
 # ---- write_video -----------------------------------------------------------------------------------------

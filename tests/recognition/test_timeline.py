@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
-from tensorsim.results import label_of
 from tensorsim.recognition.timeline import NOT_SURE, label_windows, scene_probabilities, window_starts
+from tensorsim.results import label_of
 from tensorsim.types import RadarMaps
 
 RADAR = ts.RadarConfig.through_wall()
@@ -110,7 +110,7 @@ class Fixed(nn.Module):
     in_channels = 1
 
     def forward(self, pictures: Tensor) -> Tensor:
-        return torch.tensor([1.0, 3.0, 0.0]).expand(pictures.shape[0], 3)
+        return torch.tensor([1.0, 3.0, 0.0]).expand(*pictures.shape[:-3], 3)
 
 
 def test_the_summary_has_the_label_and_every_probability() -> None:

@@ -1,4 +1,4 @@
-"""A small recipe with comments, which runs as it is."""
+"""Recipes with comments, which run as they are: a small one, and one for training a classifier."""
 
 EXAMPLE = """\
 # A recipe of a labelled data set. Build it: tensorsim dataset build RECIPE.yaml --out DIR --workers 2
@@ -45,4 +45,25 @@ split:
 storage:
   format: webdataset      # or hdf5, mat, png
   shard_samples: 4
+"""
+
+LARGE_EXAMPLE = """\
+# 1200 samples of the 12 activities, each seen by three radars through walls at right angles and in front.
+# Build it: tensorsim dataset build RECIPE.yaml --out DIR --workers 2
+# Train on it: tensorsim train classifier --data DIR --network spgnet --epochs 20 --out OUT
+name: three-radars
+seed: 0
+duration_s: 4.0
+sources:
+  - kind: generated
+    people: 100        # everybody does every activity
+variations:
+  snr_db: [10.0, 50.0]
+radars:
+  - {name: front, preset: through-wall}
+  - {name: left, preset: through-wall, x_m: -4.0, y_m: 4.0, yaw_deg: -90.0}
+  - {name: right, preset: through-wall, x_m: 4.0, y_m: 4.0, yaw_deg: 90.0}
+outputs:
+  kinds: [doppler_time]
+  size: [128, 128]     # rows, columns
 """

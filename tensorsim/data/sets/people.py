@@ -79,16 +79,25 @@ class PeopleFinder:
         return Motion(pose.joints[0], pose.valid[0], found.fps)
 
     def _of_film(self, file: Path) -> Motion:
-        kept = None if self.cache is None else self.cache / f"{self._digest(file)}.npz"
-        if kept is not None and kept.is_file():
-            with np.load(kept) as arrays:
-                joints, valid = torch.from_numpy(arrays["joints"]), torch.from_numpy(arrays["valid"])
-                return Motion(joints, valid, float(arrays["fps"]))
-        motion = self._found(file)
-        if kept is not None:
+        """The people of a film, kept for the next time; so is the reason if there are none."""
+        if self.cache is None:
+            return self._found(file)
+        kept = self.cache / f"{self._digest(file)}.npz"
+        failed = kept.with_suffix(".txt")
+        if failed.is_file():
+            raise TensorsimError(f"{file}: {failed.read_text(encoding='utf-8')}")
+        if not kept.is_file():
+            try:
+                motion = self._found(file)
+            except TensorsimError as error:
+                with complete_file(failed) as scratch:
+                    scratch.write_text(str(error).removeprefix(f"{file}: "), encoding="utf-8")
+                raise
             with complete_file(kept) as scratch, scratch.open("wb") as target:
                 np.savez(target, joints=motion.joints.numpy(), valid=motion.valid.numpy(), fps=motion.fps)
-        return motion
+        with np.load(kept) as arrays:
+            joints, valid = torch.from_numpy(arrays["joints"]), torch.from_numpy(arrays["valid"])
+            return Motion(joints, valid, float(arrays["fps"]))
 
     def _found(self, file: Path) -> Motion:
         from tensorsim.data.video import VideoReader

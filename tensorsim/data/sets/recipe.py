@@ -177,8 +177,8 @@ class DatasetRecipe:
         radars: that observe the scene.
         scene: propagation and noise for all radars; its radar and wall come from ``radars``.
         processing: signal to maps.
-        gate_people: outputs without a range axis are made of those range bins of ``processing.range_gate_m`` that people
-            reach in the sample: several times faster, and with the noise of these bins alone.
+        gate_people: outputs without a range axis are made of those range bins of ``processing.range_gate_m`` that
+            people reach in the sample: several times faster, and with the noise of these bins alone.
         outputs: arrays of a sample.
         split: into training, validation and test.
         storage: files.

@@ -18,8 +18,8 @@ from tensorsim.data.sets.scene import Scene, seen_from
 from tensorsim.data.sets.variations import Variation, seed_of
 from tensorsim.errors import collected_warnings
 from tensorsim.pipeline.maps import PoseToDoppler
+from tensorsim.radar.processing.ambiguity import gate_around
 from tensorsim.recognition.map_image import MapToImage
-
 
 #: How far a body reaches beyond its joints, range bins beside it, and what bounces inside a wall add to the range.
 _BODY_M, _MARGIN_BINS, _WALL_M = 0.2, 5, 2.0
@@ -42,7 +42,8 @@ class Synthesized(NamedTuple):
 def view_config(recipe: DatasetRecipe, view: RadarView, variation: Variation) -> SimulationConfig:
     """The simulation of one radar for one sample."""
     config = recipe.simulation(view)
-    scene = replace(config.scene, body=variation.body, sway=variation.sway, vital_signs=variation.vital_signs)
+    body = cast(Body, variation.body)
+    scene = replace(config.scene, body=body, sway=variation.sway, vital_signs=variation.vital_signs)
     if variation.snr_db is not None:
         scene = replace(scene, snr_db=variation.snr_db)
     if scene.wall is not None:
@@ -62,15 +63,12 @@ def people_gate(config: SimulationConfig, scene: Scene) -> tuple[float, float] |
     gate, radar = config.processing.range_gate_m, config.scene.radar
     if isinstance(gate, float | int) or not bool(scene.valid.any()):
         return gate
-    points = scene.joints[scene.valid].double()
-    tx, rx = (points.new_tensor(antenna) for antenna in (radar.tx_positions_m[0], radar.rx_positions_m[0]))
-    ranges = ((points - tx).norm(dim=-1) + (points - rx).norm(dim=-1)) / 2
     margin = _BODY_M + _MARGIN_BINS * radar.range_resolution_m
+    near, far = gate_around(scene.joints[scene.valid].double(), radar, margin)
     behind = _WALL_M if config.scene.wall is not None else 0.0
-    near, far = float(ranges.min()) - margin, float(ranges.max()) + margin + behind
     low, high = (0.0, math.inf) if gate is None else gate
     last = (radar.samples_per_chirp // 2 - 1) * radar.range_resolution_m
-    return max(low, min(near, last - margin)), min(high, far, last)
+    return max(low, min(near, last - margin)), min(high, far + behind, last)
 
 
 @torch.no_grad()
@@ -119,7 +117,7 @@ def _pair_outputs(
     magnitudes: dict[str, Tensor] = {}
     if kinds & set(outputs.SIGNALS):
         target = simulator.echo.target_echo(points, rcs)
-        signal = simulator.noise(simulator.echo(points, rcs), target)
+        signal = simulator.recorder.noise(simulator.echo(points, rcs), target)
         profiles = simulator.range_profile(signal)
         moving = simulator.mti(profiles)
         found["if_signal"] = outputs.stored_signal(signal[0])

@@ -26,7 +26,7 @@ from tensorsim.evaluation.measured.motions import (
     stage_people,
     walk_to_and_fro,
 )
-from tensorsim.evaluation.measured.training import drop_cells, shift
+from tensorsim.evaluation.measured.training import drop_cells, shift, warp
 from tensorsim.motion.exercises import drink, fall_down, pick_up
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import PeopleConfig
@@ -200,11 +200,20 @@ def pictures(masks: Tensor) -> Tensor:
 
 def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
     """Pictures moved in time, thickened, thinned, and with cells missing."""
-    count = shown.shape[0]
     shown = shift(shown, 14, -1, generator)
     shown = shift(shown, 1, -2, generator)
-    chance = torch.rand(count, 1, 1, 1, generator=generator)
+    return drop_cells(thicken(shown, generator), 0.03, generator)
+
+
+def augment_measured(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Measured pictures, which are few and less varied than simulated ones: at other tempos and speeds as well."""
+    shown = warp(shown, generator, time=0.2, doppler=0.12, later=0.4)
+    return drop_cells(thicken(shown, generator), 0.1, generator)
+
+
+def thicken(shown: Tensor, generator: torch.Generator) -> Tensor:
+    """Pictures of which some are wider along Doppler and some narrower."""
+    chance = torch.rand(shown.shape[0], 1, 1, 1, generator=generator)
     thick = F.max_pool2d(shown, (3, 1), 1, (1, 0))
     thin = -F.max_pool2d(-shown, (3, 1), 1, (1, 0))
-    shown = torch.where(chance < 0.25, thick, torch.where(chance > 0.85, thin, shown))
-    return drop_cells(shown, 0.03, generator)
+    return torch.where(chance < 0.25, thick, torch.where(chance > 0.85, thin, shown))

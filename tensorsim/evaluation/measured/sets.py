@@ -33,6 +33,7 @@ class MeasuredSet:
         pictures: maps -> pictures (N, 1, rows, columns).
         augment: changes of pictures in training.
         weights: name of the shipped weights.
+        augment_measured: changes of measured pictures in training.
     """
 
     name: str
@@ -45,6 +46,7 @@ class MeasuredSet:
     pictures: Callable[[Tensor], Tensor]
     augment: Augment
     weights: str
+    augment_measured: Augment
 
     def load(self, folder: Path) -> tuple[Tensor, Tensor]:
         """Pictures (N, 1, H, W) and labels (N,) of this set in a folder of measured sets.
@@ -109,6 +111,7 @@ SETS: tuple[MeasuredSet, ...] = (
         glasgow.pictures,
         glasgow.augment,
         "measured-glasgow",
+        glasgow.augment_measured,
     ),
     MeasuredSet(
         "kmkim_cw24_iq",
@@ -121,6 +124,7 @@ SETS: tuple[MeasuredSet, ...] = (
         sense2gol.pictures,
         sense2gol.augment,
         "measured-kmkim",
+        sense2gol.augment,
     ),
     MeasuredSet(
         "radhar_points",
@@ -133,5 +137,6 @@ SETS: tuple[MeasuredSet, ...] = (
         radhar.pictures,
         radhar.augment,
         "measured-radhar",
+        radhar.augment,
     ),
 )

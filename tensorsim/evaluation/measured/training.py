@@ -16,6 +16,24 @@ def shift(shown: Tensor, most: int, dim: int, generator: torch.Generator) -> Ten
     return torch.stack([torch.roll(picture, int(k), dim) for picture, k in zip(shown, by, strict=True)])
 
 
+def warp(shown: Tensor, generator: torch.Generator, *, time: float, doppler: float, later: float) -> Tensor:
+    """Pictures (B, C, H, W), each stretched and moved at random, bilinearly; edges are continued.
+
+    Args:
+        shown: the pictures.
+        generator: of the draw.
+        time, doppler: largest change of the scale of columns and rows about the middle.
+        later: largest shift along the columns, as a share of half their number.
+    """
+    count = shown.shape[0]
+    draw = 2 * torch.rand(3, count, generator=generator) - 1
+    turn = torch.zeros(count, 2, 3)
+    turn[:, 0, 0], turn[:, 1, 1] = 1 + time * draw[0], 1 + doppler * draw[1]
+    turn[:, 0, 2] = later * draw[2]
+    grid = F.affine_grid(turn, list(shown.shape), align_corners=False)
+    return F.grid_sample(shown, grid, padding_mode="border", align_corners=False)
+
+
 def drop_cells(shown: Tensor, most: float, generator: torch.Generator) -> Tensor:
     """Pictures (B, C, H, W), each without a random share, up to ``most``, of its cells."""
     share = most * torch.rand(shown.shape[0], 1, 1, 1, generator=generator)

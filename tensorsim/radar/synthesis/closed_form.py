@@ -147,8 +147,8 @@ class RangeBinSynthesizer(nn.Module):
             fraction of the window's energy in the other bins, averaged over fractions of a bin. 0 for all bins.
 
     Raises:
-        TensorsimError: ``near_bins`` or ``energy_stride`` below 1, an echo with several antennas or a closed Airy slab; see
-            :class:`~tensorsim.radar.EchoSynthesizer`.
+        TensorsimError: ``near_bins`` or ``energy_stride`` below 1, an echo with several antennas or a closed Airy
+            slab; see :class:`~tensorsim.radar.EchoSynthesizer`.
     """
 
     table: Tensor

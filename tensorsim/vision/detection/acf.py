@@ -52,12 +52,12 @@ def suppress(boxes: Tensor, scores: Tensor, overlap: float, most: int) -> Tensor
 
     None shares more than ``overlap`` of the area of the smaller of the two with a better one.
     """
-    order = scores.argsort(dim=0, descending=True, stable=True)
+    order: list[int] = scores.argsort(dim=0, descending=True, stable=True).tolist()
     kept: list[int] = []
     left = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-    for i in order.tolist():
+    for i in order:
         if len(kept) < most and bool(left[i]):
-            kept.append(int(i))
+            kept.append(i)
             smaller = torch.minimum(box_area(boxes), box_area(boxes[i]))
             left = left & (box_intersection(boxes, boxes[i]) <= overlap * smaller)
     return torch.tensor(kept, dtype=torch.int64, device=boxes.device)

@@ -98,12 +98,9 @@ def pyramid(
     height, width = images.shape[-2], images.shape[-1]
     levels: list[Tensor] = []
     scales: list[float] = []
-    octave = 0
-    while True:
-        exact = 2.0 ** (octaves_up - octave)
+    exact = 2.0**octaves_up
+    while height * exact >= cell * rows and width * exact >= cell * columns:
         h, w = int(height * exact), int(width * exact)
-        if h < cell * rows or w < cell * columns:
-            return levels, scales
         whole = images
         if exact != 1.0:
             whole = F.interpolate(images, [h, w], mode="bilinear", align_corners=False, antialias=exact < 1)
@@ -115,4 +112,5 @@ def pyramid(
                 level = channels if step == 0 else rescaled(channels, cells[0], cells[1], ratio)
                 levels.append(level)
                 scales.append(exact * ratio)
-        octave += 1
+        exact = exact / 2
+    return levels, scales

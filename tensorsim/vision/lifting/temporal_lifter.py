@@ -99,7 +99,7 @@ class TemporalLifter(nn.Module):
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
         #: Frames before and after one that have a say in its result.
-        self.reach = self.network.reach + RADIUS
+        self.reach = self.network.reach + 2 * RADIUS  # the size of the body is about its averaged direction
         camera = CameraConfig() if camera is None else camera
         self.focal_px, self.center_px = camera.focal_px, camera.center_px
         self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths

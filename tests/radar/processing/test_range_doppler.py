@@ -73,6 +73,18 @@ class TestSimulatorOfAnArray(SceneCase):
     def test_exports(self) -> None:
         super().test_exports()
 
+    def test_gradients_against_finite_differences(self) -> None:
+        """With noise of one seed, as for one antenna: magnitudes next to zero have kinks."""
+        module = RadarSimulator(ARRAY, snr_db=10.0).double()
+        p, rcs = self.inputs((), torch.float64)
+
+        def function(p: Tensor, rcs: Tensor) -> list[Tensor]:
+            torch.manual_seed(0)
+            return [x for x in module(p, rcs) if x.requires_grad]
+
+        inputs = (p.requires_grad_(True), rcs.requires_grad_(True))
+        assert torch.autograd.gradcheck(function, inputs, fast_mode=True, rtol=1e-3)
+
 
 def moving(
     azimuth_deg: float, speed_m_s: float, pulses: int, radar: RadarConfig, range_m: float = 3.0
@@ -85,7 +97,7 @@ def moving(
     return (middle + distance[:, None] * line)[:, None]
 
 
-@pytest.mark.parametrize(("azimuth_deg", "speed_m_s"), [(20.0, 2.0), (-35.0, 2.0), (10.0, -3.0)])
+@pytest.mark.parametrize(("azimuth_deg", "speed_m_s"), [(20.0, 4.0), (-35.0, 4.0), (10.0, -4.0)])
 def test_a_target_of_known_range_speed_and_angle(azimuth_deg: float, speed_m_s: float) -> None:
     """Through the whole chain: simulator, canceller, cube, CFAR, points; a row of 8 with transmitters in turn."""
     simulator = RadarSimulator(SceneConfig(TDM, snr_db=10.0))
@@ -97,7 +109,7 @@ def test_a_target_of_known_range_speed_and_angle(azimuth_deg: float, speed_m_s: 
     found = PointDetector(TDM, points=3)(channels)
     assert bool(found.valid[:, 0].all())
     range_m = 3.0 - speed_m_s * 850 / TDM.prf_hz
-    assert float(found.range_m[:, 0].mean()) == pytest.approx(range_m, abs=0.09)
+    assert float(found.range_m[:, 0].mean()) == pytest.approx(range_m, abs=0.15)
     assert float(found.speed_m_s[:, 0].mean()) == pytest.approx(speed_m_s, abs=0.03)
     sine = math.sin(math.radians(azimuth_deg))
     assert found.sine[:, 0].tolist() == pytest.approx([sine] * len(found.sine), abs=0.02)
@@ -105,13 +117,13 @@ def test_a_target_of_known_range_speed_and_angle(azimuth_deg: float, speed_m_s: 
     degrees = torch.arange(-60.0, 61.0, 1.0)
     angles = RangeDopplerAngle(TDM, torch.deg2rad(degrees), overlap=0.0)(channels[:, :800])[0]
     near, doppler, direction = np.unravel_index(int(angles.argmax()), angles.shape)
-    assert near * TDM.range_resolution_m == pytest.approx(3.0 - speed_m_s * 400 / TDM.prf_hz, abs=0.09)
-    assert float(degrees[direction]) == pytest.approx(azimuth_deg, abs=1.5)
+    assert near * TDM.range_resolution_m == pytest.approx(3.0 - speed_m_s * 400 / TDM.prf_hz, abs=0.15)
+    assert float(degrees[direction]) == pytest.approx(azimuth_deg, abs=1.0)
     # Without compensation the motion between the transmitters would be taken for a direction.
     angles = RangeDopplerAngle(TDM, torch.deg2rad(degrees), overlap=0.0)
     angles.cube.turn_cycles.zero_()
     wrong = int(angles(channels[:, :800])[0, near, doppler].argmax())
-    assert abs(float(degrees[wrong]) - azimuth_deg) > 3
+    assert abs(float(degrees[wrong]) - azimuth_deg) > 2.5
 
 
 def test_the_maps_of_an_array_are_those_of_its_antennas() -> None:

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.geometry.boxes import box_iou
 from tensorsim.training.acf import AcfSettings, boost, crop, upright_boxes, window_features
 from tensorsim.training.shards import POINTS, Sample
 from tensorsim.vision.detection.acf import COLUMNS, ROWS, AcfDetector, evaluate_trees, suppress
@@ -95,16 +96,18 @@ def test_triangle_filter_is_that_of_opencv() -> None:
 
 
 def test_approximated_channels_are_near_computed_ones() -> None:
+    """The power law gives the mean of gradients that the smaller image has; without it there are too few."""
     image = scenery(320, 256)
     small = F.interpolate(image, (226, 181), mode="bilinear", align_corners=False, antialias=True)
-    computed = aggregate_channels(small)
-    approximated = rescaled(aggregate_channels(image), *computed.shape[-2:], 2**-0.5)
-    colour, edges = (
-        float((approximated[:, part] - computed[:, part]).norm() / computed[:, part].norm())
-        for part in (slice(0, 3), slice(3, 4))
-    )
-    assert colour < 0.02
-    assert edges < 0.25
+    computed, whole = aggregate_channels(small), aggregate_channels(image)
+
+    def edges(exponent: float) -> float:
+        found = rescaled(whole, computed.shape[-2], computed.shape[-1], 2**-0.5, exponent)
+        assert_same(found[:, :3].mean(), computed[:, :3].mean(), atol=0.01)
+        return float(found[:, 3].mean() / computed[:, 3].mean())
+
+    assert edges(0.11) == pytest.approx(1, abs=0.015)
+    assert edges(0.0) < 0.98
 
 
 def test_levels_of_the_pyramid() -> None:
@@ -179,6 +182,7 @@ def sample_of(image: np.ndarray, box: list[float], tmp_path: Path) -> Sample:
     return Sample("0", boxes, points, np.ones(1, np.float32), True, path)
 
 
+@pytest.mark.slow
 def test_boosted_trees_find_what_they_were_shown(tmp_path: Path) -> None:
     """Trained on drawn figures and empty grounds, the detector finds a figure of another size in its place."""
     rng = np.random.default_rng(0)
@@ -195,8 +199,10 @@ def test_boosted_trees_find_what_they_were_shown(tmp_path: Path) -> None:
         empty.append(crop(ground(260, 200), np.array([60, 50, 110, 170], np.float32), False))
         figure(image, left, top, height)
         people.append(crop(image, np.array([left, top, left + height // 3, top + height], np.float32), False))
-        off = np.array([left + 30, top + 40, left + 30 + height // 3, top + 40 + height], np.float32)
-        empty.append(crop(image, off, False))
+        for right, down, size in ((30, 40, 1.0), (0, -30, 1.0), (0, 0, 0.6), (0, 30, 0.6), (-20, -20, 1.6)):
+            corner = np.array([left + right, top + down])
+            box = np.array([*corner, *(corner + size * np.array([height // 3, height]))], np.float32)
+            empty.append(crop(image, box, False))
     features = np.concatenate([window_features(people), window_features(empty)])
     labels = np.repeat([1, 0], [len(people), len(empty)])
     settings = AcfSettings(rounds=(16,))
@@ -215,9 +221,8 @@ def test_boosted_trees_find_what_they_were_shown(tmp_path: Path) -> None:
     figure(image, 120, 70, 180)
     found = detector(torch.from_numpy(image).permute(2, 0, 1)[None])
     assert bool(found.valid[0, 0])
-    middle = (found.boxes[0, 0, :2] + found.boxes[0, 0, 2:]) / 2
-    assert_same(middle, torch.tensor([150.0, 160.0]), atol=0.12)
-    assert float(found.boxes[0, 0, 3] - found.boxes[0, 0, 1]) == pytest.approx(180, rel=0.15)
+    truth = torch.tensor([[150 - 0.5 * 0.41 * 180, 70, 150 + 0.5 * 0.41 * 180, 250]])
+    assert float(box_iou(found.boxes[0, :1], truth)) > 0.5
 
 
 def test_crop_has_the_person_in_the_middle() -> None:

@@ -1,0 +1,68 @@
+"""``tensorsim evaluate lifter``: how well both lifters lift people whom neither has seen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tensorsim.commands.options import check_seed
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True)
+class EvaluateLifter:
+    """Print errors of the temporal and the nearest lifter: from key points to smooth joints, camera and height known.
+
+    Generated people have other seeds than those of training; of motion capture, every second sequence was never
+    trained on.
+
+    Attributes:
+        motion: motion capture files (.npz, .bvh).
+        films: folder films/ of `tensorsim evaluate truth --settings c`: key points of networks on rendered films.
+        weights: of the temporal lifter, a path or name. Default: the shipped one.
+        motions: held-out motions that views are drawn from.
+        seed: of motions, cameras and errors; one that was not trained on.
+        quiet: no progress bar.
+    """
+
+    motion: tuple[Path, ...] = ()
+    films: Path | None = None
+    weights: str | None = None
+    motions: int = 400
+    seed: int = 1234
+    quiet: bool = False
+
+    def run(self) -> None:
+        """Do it."""
+        check_seed(self.seed)
+        if self.motions < 100:
+            raise TensorsimError(f"--motions: got {self.motions}, expected at least 100")
+        if self.films is not None and not self.films.is_dir():
+            raise TensorsimError(f"--films: got {self.films}, expected a folder")
+
+        from tensorsim.training import lifter_scores as scores
+        from tensorsim.training.lifter_motion import build_pool
+        from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+
+        lifters = {
+            "temporal": scores.temporal(TemporalLifter.from_pretrained(self.weights)),
+            "nearest": scores.nearest,
+        }
+        pool = build_pool(None, self.motions, self.motion, self.seed, held_out=True, quiet=self.quiet)
+        rows = {"generated, errors": (("activities", "exercises"), True), "falls, errors": (("falls",), True)}
+        if self.motion:
+            rows = {
+                "captured, exact": (("captures",), False),
+                "captured, errors": (("captures",), True),
+            } | rows
+        header = "| people | lifter | " + " | ".join(scores.LiftErrors._fields) + " |"
+        print(header.replace("_", " ") + "\n| --- | --- |" + " ---: |" * len(scores.LiftErrors._fields))
+        for name, (kinds, errors) in rows.items():
+            for lifter, make in lifters.items():
+                self._print(name, lifter, scores.judge(make, scores.views(pool, kinds, errors, self.seed)))
+        if self.films is not None:
+            for lifter, make in lifters.items():
+                self._print("rendered films", lifter, scores.judge(make, scores.watched(self.films)))
+
+    @staticmethod
+    def _print(people: str, lifter: str, errors: tuple[float, ...]) -> None:
+        """A row of the table."""
+        print(f"| {people} | {lifter} | " + " | ".join(f"{x:.2f}" for x in errors) + " |", flush=True)

@@ -1,0 +1,91 @@
+"""Clips per second of data sets: `python -m tests.benchmarks.bench_dataset [--cpu] [--samples N]`.
+
+In one run: samples of 4 s with one radar in free space and behind a wall (clips per second of one core), three radars
+at one place each against three runs with one, two processes against one, and the growth of memory with the number of
+samples. `--cpu` takes processor time instead of wall time, for a machine that is busy with other work; it leaves out
+two processes.
+"""
+
+import argparse
+import resource
+import statistics
+import tempfile
+from pathlib import Path
+
+import torch
+
+from tensorsim.data.sets.build import build_dataset
+from tensorsim.data.sets.engines import Processes, Serial
+from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, StorageConfig
+from tensorsim.data.sets.samples import make_sample
+from tests.benchmarks.timing import Clock, chosen_clock, host, seconds
+
+VIEWS = (
+    RadarView("front", "through-wall"),
+    RadarView("left", "through-wall", -4.0, 4.0, -90.0),
+    RadarView("right", "through-wall", 4.0, 4.0, 90.0),
+)
+
+
+def recipe(*views: RadarView, people: int = 10) -> DatasetRecipe:
+    """All activities of some people, 4 s each."""
+    return DatasetRecipe(
+        sources=(SourceConfig(people=people),), radars=views, storage=StorageConfig(shard_samples=16)
+    )
+
+
+def rate(plan: Plan, samples: int, clock: Clock) -> float:
+    """Samples per second, from the median time of one."""
+    make_sample(plan, 0, "warm-up")
+    times = [seconds(lambda n=n: make_sample(plan, n, ""), clock) for n in range(samples)]  # type: ignore[misc]
+    return 1 / statistics.median(times)
+
+
+def peak_mb() -> float:
+    """Largest memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=24)
+    parser.add_argument("--cpu", action="store_true")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    clock = chosen_clock()
+    print(host())
+    for preset, count in (
+        ("through-wall", arguments.samples),
+        ("free-space", max(2, arguments.samples // 6)),
+    ):
+        one = rate(Plan(recipe(RadarView("front", preset))), count, clock)
+        print(f"{preset}: {one:.1f} clips of 4 s per second and core")
+    single = [rate(Plan(recipe(view)), arguments.samples, clock) for view in VIEWS]
+    together = rate(Plan(recipe(*VIEWS)), arguments.samples, clock)
+    runs = sum(1 / one for one in single)
+    print(
+        f"3 radars: {1 / together:.3f} s for a sample with all, {runs:.3f} s for three with one: {runs * together:.2f}"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        memory = []
+        for people in (4, 8, 16):
+            build_dataset(
+                recipe(VIEWS[0], people=people), Path(folder) / f"serial{people}", Serial(), quiet=True
+            )
+            memory.append(peak_mb())
+        print("peak memory after 48, 96, 192 samples:", ", ".join(f"{mb:.0f} MB" for mb in memory))
+        if not arguments.cpu:
+            times = {}
+            for workers in (1, 2):
+                out = Path(folder) / f"workers{workers}"
+                build = recipe(VIEWS[0], people=32)
+                times[workers] = seconds(
+                    lambda o=out, b=build, w=workers: build_dataset(b, o, Processes(w), quiet=True)
+                )  # type: ignore[misc]
+            print(f"2 workers against 1: {times[1] / times[2]:.2f} times as fast")
+
+
+if __name__ == "__main__":
+    main()

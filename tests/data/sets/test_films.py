@@ -1,0 +1,118 @@
+"""Films as a source: people are found once, damaged films are named with the reason, the others arrive."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.config import SimulationConfig
+from tensorsim.data.sets.build import build_dataset
+from tensorsim.data.sets.manifest import rows_of
+from tensorsim.data.sets.people import PeopleFinder
+from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig, SplitConfig
+from tensorsim.data.video import VideoReader
+from tensorsim.errors import TensorsimError
+from tensorsim.pipeline import VideoToPose
+from tests.data.sets.recipes import small_recipe
+from tests.film import RectangleDetector, StandingPose, film, walker
+
+FPS = 10.0
+
+
+def write_film(path: Path, frames: np.ndarray) -> None:
+    """A losslessly written film of frames (T, H, W, 3)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    size = (frames.shape[2], frames.shape[1])
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), FPS, size)
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+
+
+def good_film(speed: float) -> np.ndarray:
+    return film(*walker(11, FPS, 4.0, speed, 0.3)).permute(0, 2, 3, 1).numpy()
+
+
+@pytest.fixture
+def films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A good film of each of two classes and ten that are damaged, each in another way."""
+    folder = tmp_path / "films"
+    for label, speed in (("leave", 1.2), ("come", -1.0)):
+        write_film(folder / label / "good.avi", good_film(speed))
+    whole = (folder / "leave" / "good.avi").read_bytes()
+    damaged = {
+        "empty.avi": b"",
+        "cut.avi": whole[:600],
+        "header.avi": whole[:40],
+        "text.mp4": b"no film at all\n",
+        "zeros.mp4": bytes(5000),
+        "noise.mkv": np.random.default_rng(0).bytes(5000),
+        "picture.mp4": cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes(),
+        "html.webm": b"<html>404 Not Found</html>",
+    }
+    for name, content in damaged.items():
+        (folder / "leave" / name).write_bytes(content)
+    write_film(folder / "leave" / "one_frame.avi", good_film(1.0)[:1])
+    write_film(folder / "leave" / "nobody.avi", np.zeros((5, 120, 160, 3), np.uint8))
+    stage = VideoToPose.from_config(SimulationConfig(), RectangleDetector(), StandingPose())
+    monkeypatch.setattr(PeopleFinder, "networks", stage)
+    return folder
+
+
+def films_recipe(folder: Path, **changes: object) -> DatasetRecipe:
+    return small_recipe(
+        sources=(SourceConfig("films", str(folder)),),
+        split=SplitConfig(shares=(1.0, 0.0, 0.0)),
+        **changes,
+    )
+
+
+def test_good_films_arrive_bad_ones_are_named_and_people_are_found_once(
+    films: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    found = PeopleFinder._found
+
+    def counted(self: PeopleFinder, file: Path) -> object:
+        asked.append(file.name)
+        return found(self, file)
+
+    monkeypatch.setattr(PeopleFinder, "_found", counted)
+    cache = tmp_path / "people"
+    assert build_dataset(films_recipe(films), tmp_path / "a", cache=cache, quiet=True) == (2, 10, 12)
+    assert len(asked) == 12
+    rows = list(rows_of(tmp_path / "a"))
+    assert {row["clip"]: row["label"] for row in rows} == {"leave/good.avi": "leave", "come/good.avi": "come"}
+    with (tmp_path / "a" / "failures.csv").open(newline="") as file:
+        failures = list(csv.DictReader(file))
+    bad = {str(path.relative_to(films)) for path in films.rglob("*.*") if path.name != "good.avi"}
+    assert {row["clip"] for row in failures} == bad
+    assert all(row["path"] in row["reason"] for row in failures)
+
+    # Neither the place of the films nor another data set needs the networks again.
+    moved = films.rename(tmp_path / "elsewhere")
+    asked.clear()
+    build_dataset(films_recipe(moved), tmp_path / "b", cache=cache, quiet=True)
+    assert asked == []
+    assert [row["sha256"] for row in rows_of(tmp_path / "b")] == [row["sha256"] for row in rows]
+    assert str(moved) in (tmp_path / "b" / "failures.csv").read_text()
+
+
+def test_strict_stops_at_the_first(films: Path, tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="films/leave/"):
+        build_dataset(films_recipe(films), tmp_path / "set", strict=True, quiet=True)
+    assert not (tmp_path / "set" / "manifest.csv").exists()
+
+
+def test_joints_are_those_of_the_pipeline(films: Path) -> None:
+    path = films / "leave" / "good.avi"
+    motion = PeopleFinder(SourceConfig("films", str(films)), None).motion(str(path), "")
+    video = torch.cat(list(VideoReader(path).chunks(64)))[None]
+    pose = PeopleFinder.networks(video, FPS)  # type: ignore[operator]
+    there = pose.valid[0]
+    assert motion.fps == FPS
+    assert torch.allclose(motion.joints[there], pose.joints[0][there], atol=1e-5)
+    assert bool(torch.isfinite(motion.joints).all())

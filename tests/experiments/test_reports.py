@@ -1,0 +1,194 @@
+"""Reports from results that are known: order, figures, what they say."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.clips import ActivityClip
+from tensorsim.experiments import ablations, networks, paper, real, video
+from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
+from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
+from tensorsim.experiments.trials import Trial
+from tensorsim.experiments.work import Report, Table, Work
+
+QUICK = replace(networks.quick_networks(), networks=("ccln", "diat-radharnet"), seeds=2, snr_db=(50.0, 10.0))
+
+
+def known(trials: list[Trial], ratios: tuple[float, ...], work: Work) -> list[dict[str, Any]]:
+    """CCLN is right in 6 and 8 of 12 clips at 50 dB, in half as many at 10 dB; the other one in 9 at all ratios."""
+    results = []
+    for trial in trials:
+        counts = {}
+        for ratio in ratios:
+            right = (
+                9 if trial.network == "diat-radharnet" else (6 + 2 * trial.seed) // (2 if ratio < 50 else 1)
+            )
+            matrix = torch.diag(torch.tensor([1] * right + [0] * (12 - right)))
+            matrix[11, 0] += 12 - right
+            counts[f"{ratio:g}"] = matrix.tolist()
+        results.append({"validation": 0.5, "training_s": 2.0, "epoch": 1, "confusion": counts})
+    return results
+
+
+@pytest.fixture(autouse=True)
+def trained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(networks, "run_trials", known)
+
+
+def test_networks_stand_in_order_of_accuracy_with_their_spread(tmp_path: Path) -> None:
+    report = networks.networks_report(QUICK, Work(tmp_path))
+    first, second = report.tables[0].rows
+    assert first[:3] == ["DIAT-RadHARNet", pytest.approx(75.0), pytest.approx(0.0)]
+    assert second[:3] == ["CCLN", pytest.approx(100 * 7 / 12), pytest.approx(100 / 12 * 2**0.5)]
+    assert second[3] == pytest.approx(0.247, abs=0.002), "million parameters"
+    assert second[4] > 0
+    assert [second[6], second[7]] == ["5", "reconstruction"]
+    assert len(report.tables[1].rows) == 4
+    assert set(report.figures) == {"accuracy", "confusion-through-wall"}
+    assert "5 clips per class in 32x32 pixels" in report.notes[0]
+
+
+def test_accuracy_against_noise(tmp_path: Path) -> None:
+    report = networks.snr_report(QUICK, Work(tmp_path))
+    assert report.tables[0].columns == ["network", "50 dB", "50 dB, spread", "10 dB", "10 dB, spread"]
+    ccln = report.tables[0].rows[1]
+    assert (ccln[0], ccln[1], ccln[3]) == ("CCLN", pytest.approx(100 * 7 / 12), pytest.approx(100 * 3.5 / 12))
+
+
+def test_accuracy_by_input(tmp_path: Path) -> None:
+    config = replace(networks.quick_inputs(), inputs=("doppler", "merged"))
+    report = networks.inputs_report(config, Work(tmp_path))
+    assert [row[:3] for row in report.tables[0].rows] == [
+        ["doppler", "through-wall", pytest.approx(50.0)],
+        ["merged", "through-wall", pytest.approx(50.0)],
+    ]
+
+
+def test_echo_without_the_wall_is_stronger_and_else_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def one_second(activities: Any, count: int, seed: int) -> dict[str, list[ActivityClip]]:
+        return {"S8 Walking": [ActivityClip("S8 Walking", str(k), 12 * k + 7, 1.0) for k in range(count)]}
+
+    monkeypatch.setattr(ablations, "activity_clips", one_second)
+    work = Work(tmp_path, quiet=True)
+    report = ablations.echo_report(ablations.quick_echo(), work)
+    rows = {row[0]: row for row in report.tables[0].rows}
+    assert list(rows) == [
+        "without wall attenuation",
+        "without multipath",
+        "without both",
+        "empty map",
+        "another clip",
+    ]
+    doppler = 5  # after two columns each of the two range-time maps
+    assert rows["without wall attenuation"][doppler] > 100
+    assert 30 < rows["without multipath"][doppler] < 80
+    assert rows["empty map"][doppler] < 25
+    assert rows["another clip"][doppler] < 30
+    assert rows["without wall attenuation"][-1] > 3, "dB"
+    monkeypatch.setattr(ablations, "compare", None)  # what is kept is not computed again
+    again = ablations.echo_report(ablations.quick_echo(), work)
+    assert [table.csv() for table in again.tables] == [table.csv() for table in report.tables]
+
+
+def test_denoisers_stand_beside_an_empty_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def choice(name: str) -> Any:
+        return None if name == "none" else lambda maps: torch.zeros_like(maps)
+
+    monkeypatch.setattr(ablations, "map_denoiser", choice)
+    config = ablations.DenoiserConfig(("none", "zeros"), ("through-wall",), 1, (10.0,))
+    report = ablations.denoiser_report(config, Work(tmp_path, quiet=True))
+    rows = {(row[1], row[3]): row[4:] for row in report.tables[0].rows}
+    for view in ("processed RTM", "DTM"):
+        assert rows[view, "zeros"][:2] == rows[view, "empty map"][:2]
+        assert rows[view, "none"][0] != rows[view, "another clip"][0]
+    assert rows["DTM", "none"][0] > rows["DTM", "empty map"][0]
+
+
+def test_pictures_become_square_with_the_same_mean() -> None:
+    x = torch.rand(2, 1, 40, 80, generator=torch.Generator().manual_seed(0))
+    found = real.square(x, 32)
+    assert found.shape == (2, 1, 32, 32)
+    assert float(found.mean()) == pytest.approx(float(x.mean()), abs=0.01)
+    line = torch.zeros(1, 1, 16, 60)
+    line[..., 30:] = 1
+    assert bool((real.square(line, 32)[..., 20:] > 0.9).all())
+
+
+def test_real_says_what_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="--data: got nothing, expected a folder"):
+        real.quick_real().sets()
+    with pytest.raises(
+        TensorsimError, match="has none of the measured sets, expected some of glasgow_cfar_masks"
+    ):
+        replace(real.quick_real(), data=str(tmp_path)).sets()
+
+
+@pytest.mark.slow
+def test_real_runs_and_goes_on(tmp_path: Path, shared_data: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    (data / "radhar_points").symlink_to((shared_data / "measured" / "radhar_points").resolve())
+    config = replace(real.quick_real(), data=str(data))
+    work = Work(tmp_path / "work", quiet=True)
+    report = real.real_report(config, work)
+    assert sorted(row[0] for row in report.tables[0].rows) == ["CCLN", "DIAT-RadHARNet"]
+    assert all(0 <= row[1] <= 100 for row in report.tables[0].rows)
+    assert real.real_report(config, work).tables[0].csv() == report.tables[0].csv()
+
+
+@pytest.mark.slow
+def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chain that knows the truth has the best figures; one that finds nobody those of an empty map."""
+
+    class Watcher:
+        missing: dict[str, str] = {"TCN": "no weights"}  # noqa: RUF012
+
+        def __init__(self) -> None:
+            clip = ActivityClip("S8 Walking", "0", 7, 1.0)
+            truth = clip.joints(30.0).float()[None]
+            there = torch.ones(1, truth.shape[1], dtype=torch.bool)
+            nobody = (torch.zeros(0, truth.shape[1], 14, 3), there[:0])
+            self.chains = {"truth": lambda f, h: (truth, there), "nobody": lambda f, h: nobody}
+
+    monkeypatch.setattr(video, "Watcher", Watcher)
+    monkeypatch.setattr(video, "HEIGHT", 36)
+    monkeypatch.setattr(video, "WIDTH", 64)
+    config = replace(video.quick_video(), scenes=("through-wall",))
+    report = video.video_report(config, Work(tmp_path, quiet=True))
+    rows = {row[0]: row for row in report.tables[0].rows}
+    assert rows["truth"][3] > 40
+    assert rows["nobody"][3] == pytest.approx(rows["empty map"][3])
+    assert "**TCN** (no weights)" in report.notes[1]
+    errors = {row[0]: row for row in report.tables[-1].rows}
+    assert errors["truth"][1] == pytest.approx(0.0, abs=1e-6)
+    assert (errors["truth"][4], errors["nobody"][4]) == (1.0, 0.0)
+
+
+def test_the_paper_joins_all_reports(tmp_path: Path) -> None:
+    def run(config: Any, work: Work) -> Report:
+        return Report(["Note.", "More."], [Table("T", ["a"], [[str(config)]])])
+
+    entries = {name: Experiment(name, paper.PaperConfig, run, lambda: "quick") for name in ("one", "real")}
+    report = paper.paper_report(paper.PaperConfig(quick=True), Work(tmp_path), entries)
+    assert [table.title for table in report.tables] == ["one: T"]
+    assert [table.file for table in report.tables] == ["one"]
+    assert any("**real** is left out" in note for note in report.notes)
+    assert "paper" in EXPERIMENTS
+
+
+def test_stored_results_are_of_known_experiments() -> None:
+    assert set(stored_names()) <= set(EXPERIMENTS)
+    for name in stored_names():
+        assert (RESULTS / f"{name}.md").is_file()
+        assert (
+            stored_table(name) if (RESULTS / f"{name}.csv").is_file() else list(RESULTS.glob(f"{name}-*.csv"))
+        )
+    with pytest.raises(TensorsimError, match="got 'nothing', expected one of"):
+        stored_table("nothing")
+    assert sum(path.stat().st_size for path in RESULTS.iterdir()) < 200_000

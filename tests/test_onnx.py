@@ -1,0 +1,64 @@
+"""What is exported to ONNX gives the same in ONNX Runtime, also for other batch sizes."""
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor, nn
+
+import tensorsim as ts
+from tensorsim.recognition import SPGNet
+from tensorsim.recognition.map_image import MapToImage
+
+#: Stages and inputs; the first dimension of the first input may have another size.
+STAGES: dict[str, tuple[nn.Module, Tensor, Tensor]] = {
+    "map to picture": (
+        MapToImage.doppler(ts.RadarConfig.through_wall(), 256, size=32),
+        torch.rand(2, 256, 40),
+        torch.rand(5, 256, 40),
+    ),
+    "recogniser": (SPGNet(3), torch.rand(2, 1, 32, 32), torch.rand(5, 1, 32, 32)),
+}
+
+
+def run(path: Path, x: Tensor) -> np.ndarray:
+    session = onnxruntime.InferenceSession(path)
+    return session.run(None, {session.get_inputs()[0].name: x.numpy()})[0]  # type: ignore[no-any-return]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STAGES)
+def test_onnx_runtime_gives_the_same(name: str, tmp_path: Path) -> None:
+    stage, example, other = STAGES[name]
+    stage.eval()
+    ts.export.to_onnx(stage, tmp_path / "m.onnx", (example,), {0: {0: "batch"}})
+    assert [path.name for path in tmp_path.iterdir()] == ["m.onnx"]
+    for x in (example, other):
+        with torch.no_grad():
+            assert np.abs(run(tmp_path / "m.onnx", x) - stage(x).numpy()).max() < 1e-5
+
+
+@pytest.mark.slow
+def test_what_onnx_cannot_express_is_said_in_one_line(tmp_path: Path) -> None:
+    stage = ts.export.ComplexPairs(ts.radar.DopplerTimeMap(ts.RadarConfig.through_wall())).train()
+    with pytest.raises(
+        ts.TensorsimError, match="to_onnx: got a ComplexPairs that ONNX cannot express"
+    ) as refused:
+        ts.export.to_onnx(stage, tmp_path / "m.onnx", (torch.randn(1, 64, 20, 2),))
+    assert "\n" not in str(refused.value)
+    assert stage.training
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ts.TensorsimError, match="is a folder, expected a file"):
+        ts.export.to_onnx(nn.Linear(1, 1), tmp_path, (torch.zeros(1, 1),))
+
+
+def test_pairs_stand_for_complex_numbers() -> None:
+    x = torch.randn(2, 64, 20, dtype=torch.complex64)
+    mti = ts.radar.MovingTargetIndicator()
+    pairs = ts.export.ComplexPairs(mti)(torch.view_as_real(x))
+    assert torch.view_as_complex(pairs).equal(mti(x))

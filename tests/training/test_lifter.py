@@ -1,0 +1,186 @@
+"""Training of the temporal lifter: motion, views, errors, loss, a run from the command line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tensorsim.body.kinematics import rotation
+from tensorsim.body.skeleton import body_height, body_to_coco, mid_hips
+from tensorsim.cli import main
+from tensorsim.errors import TensorsimError
+from tensorsim.training import lifter_motion
+from tensorsim.training.lifter import LifterRecipe, laplace, lifter_loss, target
+from tensorsim.training.lifter_motion import FRAMES, KINDS, MotionPool, build_pool, captures, with_other_bones
+from tensorsim.training.lifter_scores import camera_of, judge, lifted, nearest, temporal, views
+from tensorsim.training.lifter_views import Draw, before_camera, film, seen_in, windows_of
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
+
+
+@pytest.fixture(scope="module")
+def pool(tmp_path_factory: pytest.TempPathFactory) -> MotionPool:
+    """A few motions of every kind; the capture is a generated walk in a file."""
+    folder = tmp_path_factory.mktemp("motion")
+    walk = build_pool(None, 4, seed=3, quiet=True).joints[0, :200]
+    np.savez(folder / "walks_60hz.npz", one=walk.numpy(), two=walk.numpy(), three=walk.numpy())
+    made = build_pool(folder / "pool.pt", 24, (folder / "walks_60hz.npz",), quiet=True)
+    again = build_pool(folder / "pool.pt", 24, (folder / "walks_60hz.npz",), quiet=True)
+    assert torch.equal(made.joints, again.joints)
+    with pytest.raises(TensorsimError, match="expected"):
+        build_pool(folder / "pool.pt", 25, (folder / "walks_60hz.npz",), quiet=True)
+    kept = captures((folder / "walks_60hz.npz",), held_out=True)
+    assert [name.split()[1] for name in kept] == ["two"]
+    return made
+
+
+def test_motions_are_bodies_on_the_floor(pool: MotionPool) -> None:
+    assert set(pool.kind.tolist()) == set(range(len(KINDS)))
+    assert pool.joints.shape[1:] == (FRAMES, 14, 3)
+    tall = body_height(pool.joints)
+    assert float((tall / tall.mean(dim=1, keepdim=True) - 1).abs().max()) < 0.02  # bones keep their length
+    assert float((tall.mean(dim=1) / pool.height_m - 1).abs().max()) < 0.1
+    assert float(pool.joints[..., 2].amin()) > -0.02
+    assert float(pool.joints[..., 2].amin(dim=-1).median()) < 0.15
+
+
+def test_falls_go_in_all_directions() -> None:
+    generator = torch.Generator().manual_seed(0)
+    people = lifter_motion.draw_people(
+        64, lifter_motion.PeopleConfig(heading_rad=0.0, facing_radar_share=0.0), generator
+    )
+    time = torch.linspace(0.0, 3.0, 2, dtype=torch.float64).expand(64, -1)
+    joints = lifter_motion.perform(lifter_motion.fall_any_way, time, people)
+    along = (joints[:, -1, 1] - mid_hips(joints[:, -1]))[:, :2]
+    quadrant = (along > 0).long() @ torch.tensor([1, 2])
+    assert len(quadrant.unique()) == 4
+    assert float(joints[:, -1, :, 2].amax(dim=-1).median()) < 0.7  # they lie
+
+
+def test_other_bones_have_the_lengths_asked_for(pool: MotionPool) -> None:
+    joints = pool.joints[0].double()
+    factors = torch.tensor([1.1, 1.0, 0.9, 1.2, 1.05, 0.95, 1.0], dtype=torch.float64)
+    moved = with_other_bones(joints, factors)
+    for one, other, factor in ((2, 3, 0.9), (3, 4, 1.2), (8, 9, 1.05), (9, 10, 0.95), (2, 5, 1.1)):
+        ratio = (moved[:, one] - moved[:, other]).norm(dim=-1) / (joints[:, one] - joints[:, other]).norm(
+            dim=-1
+        )
+        torch.testing.assert_close(ratio, torch.full_like(ratio, factor))
+
+
+def test_exact_key_points_are_the_projection(pool: MotionPool) -> None:
+    """Against NumPy: a camera that looks down by 20 degrees."""
+    draw = Draw(3, torch.Generator().manual_seed(1))
+    joints, height, fps = windows_of(pool, 20, draw, 30.0)
+    camera = camera_of(20.0, 2.0, 60.0)
+    view = before_camera(joints, camera, (640, 480), draw)
+    window = seen_in(view, height, fps, draw, errors=False)
+    points = body_to_coco(view.joints).numpy().astype(np.float64)
+    tilt = np.radians(20.0)
+    ahead = points[..., 1] * np.cos(tilt) - points[..., 2] * np.sin(tilt)
+    down = -points[..., 2] * np.cos(tilt) - points[..., 1] * np.sin(tilt)
+    focal = 320 / np.tan(np.radians(30.0))
+    pixels = np.stack([319.5 + focal * points[..., 0] / ahead, 239.5 + focal * down / ahead], axis=-1)
+    inside = window.scores.numpy() > 0.5
+    assert inside.mean() > 0.5
+    np.testing.assert_allclose(window.keypoints.numpy()[inside], pixels[inside], atol=0.01)
+    assert torch.equal(fps, torch.full((3,), 30.0))
+
+
+def test_windows_with_the_same_seed_are_the_same_and_errors_are_bounded(pool: MotionPool) -> None:
+    one, other = (film(pool, 16, 32, torch.Generator().manual_seed(5)) for _ in range(2))
+    for a, b in zip(one, other, strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(one.keypoints, film(pool, 16, 32, torch.Generator().manual_seed(6)).keypoints)
+    shown = one.scores > 0.3
+    assert 0.5 < float(shown.float().mean()) < 1.0
+    assert bool(one.keypoints.isfinite().all())
+    assert float((one.boxes[..., 2] - one.boxes[..., 0]).amin()) >= 0.0
+
+
+def test_target_is_turned_to_the_person(pool: MotionPool) -> None:
+    window = film(pool, 4, 32, torch.Generator().manual_seed(2))
+    sight = window.sight()
+    turned = target(window, sight)
+    angle = torch.atan2(sight.azimuth[..., 1], sight.azimuth[..., 0])
+    expected = window.joints @ rotation(2, angle).mT  # counter-clockwise by the azimuth, which is clockwise
+    torch.testing.assert_close(turned, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_loss_is_least_for_the_truth_and_for_the_right_spread(pool: MotionPool) -> None:
+    window = film(pool, 4, 32, torch.Generator().manual_seed(2))
+    true = target(window, window.sight())
+    spread, weight = torch.full((4, 32, 14, 2), -4.0), torch.ones(4, 32)
+    right = lifter_loss(Located(true, spread, spread[..., 0, 0]), true, weight, window.fps)
+    shifted = true + torch.tensor([0.0, 0.3, 0.0]) * torch.arange(14)[:, None] / 14
+    wrong = lifter_loss(Located(shifted, spread, spread[..., 0, 0]), true, weight, window.fps)
+    assert float(right["place"]) < 1e-6
+    assert float(right["bones"]) < 1e-4
+    assert float(wrong["loss"]) > float(right["loss"])
+    assert float(wrong["depth"]) > 0.05
+    error = torch.tensor(0.2)
+    levels = torch.linspace(-4.0, 1.0, 101)
+    best = levels[laplace(error, levels).argmin()]
+    assert float(best.exp()) == pytest.approx(0.2, rel=0.05)
+
+
+def test_learns(pool: MotionPool) -> None:
+    """Forty steps on a few motions halve the error of depths."""
+    torch.manual_seed(0)
+    net = TemporalNet(32)
+    recipe = LifterRecipe(net, pool, pool, frames=24, learning_rate=4e-3)
+    optimiser = recipe.optimiser()
+    batch = recipe.collate([{"index": k} for k in range(24)])
+    losses = []
+    for _ in range(40):
+        terms = recipe.loss(net, batch)
+        optimiser.zero_grad()
+        terms["loss"].backward()
+        optimiser.step()
+        losses.append(float(terms["depth"].detach()))
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_scores_of_the_truth_are_perfect(pool: MotionPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = next(views(pool, ("joined poses",), errors=False))
+    monkeypatch.setattr(
+        "tensorsim.training.lifter_scores.lifted", lambda make, people: (people.joints, people.valid)
+    )
+    errors = judge(nearest, iter([seen]))
+    assert errors.depth_cm == pytest.approx(0.0, abs=1e-6)
+    assert errors.range_percent == pytest.approx(0.0, abs=1e-6)
+    assert errors.peak == pytest.approx(1.0)
+    assert errors.within == 1.0
+
+
+def test_the_pipeline_takes_a_temporal_lifter(pool: MotionPool) -> None:
+    torch.manual_seed(0)
+    seen = next(views(pool, ("activities",), errors=True))
+    joints, valid = lifted(temporal(TemporalLifter(TemporalNet(16)).eval()), seen)
+    assert joints.shape == seen.joints.shape
+    assert bool(joints.isfinite().all())
+    assert bool(valid.any())
+
+
+def test_train_lifter_from_the_command_line(tmp_path: Path) -> None:
+    """Two steps, then on to three; the weights load."""
+    arguments = [
+        "train",
+        "lifter",
+        "--out",
+        str(tmp_path),
+        "--motions",
+        "100",
+        "--batch",
+        "2",
+        "--frames",
+        "16",
+    ]
+    arguments += ["--channels", "8", "--workers", "0", "--quiet"]
+    main([*arguments, "--steps", "2"])
+    main([*arguments, "--steps", "3"])
+    lifter = TemporalLifter.from_pretrained(tmp_path / "best.safetensors")
+    assert lifter.network.enter.out_features == 8
+    with pytest.raises(SystemExit):
+        main([*arguments[:2], "--out", str(tmp_path / "x"), "--frames", "3"])

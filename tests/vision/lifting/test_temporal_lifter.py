@@ -1,0 +1,207 @@
+"""The temporal lifter: geometry against projection in NumPy, blocks against the whole, what it learns to see."""
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+import tensorsim as ts
+from tensorsim.body.skeleton import body_to_coco, coco_to_body, mid_hips
+from tensorsim.config import CameraConfig, PoseConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.geometry.camera import camera_to_world, project
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.vision.lifting.sight import level_sight, turned_back, windowed_mean
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter, along_axes
+from tensorsim.vision.lifting.temporal_net import TemporalNet
+from tests.stage import StageTester
+
+CAMERA = CameraConfig(position_m=(0.3, -1.0, 1.9), pitch_rad=-0.3, yaw_rad=0.2, horizontal_fov_rad=1.2)
+HEIGHT, WIDTH = 480, 640
+
+
+def network(seed: int = 0, channels: int = 16) -> TemporalNet:
+    """A small network whose answers depend on everything it sees."""
+    torch.manual_seed(seed)
+    net = TemporalNet(channels)
+    nn.init.normal_(net.leave.weight, std=0.05)
+    return net.eval()
+
+
+def filmed(frames: int = 24, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """A generated walk before CAMERA: joints, key points, scores, boxes, valid, each for one person."""
+    joints = ActivityGenerator().generate("walking", 1, seed, frames / 30).joints[0]
+    focal = WIDTH / 2 / math.tan(CAMERA.horizontal_fov_rad / 2)
+    center = ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    pixels, _ = project(body_to_coco(joints), focal, center, camera_to_world(CAMERA))
+    boxes = torch.cat([pixels.amin(dim=-2) - 5, pixels.amax(dim=-2) + 5], dim=-1)
+    scores = torch.full((frames, 17), 0.9, dtype=joints.dtype)
+    return joints, pixels[None], scores[None], boxes[None], torch.ones(1, frames, dtype=torch.bool)
+
+
+class TestTemporalLifter(StageTester):
+    batched_arguments: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
+    gradient_arguments: ClassVar[tuple[int, ...]] = (0,)
+    gradient_atol: ClassVar[float] = 1e-4
+
+    def make(self) -> nn.Module:
+        return TemporalLifter(network(), CAMERA, (1.7, 1.6), frames_per_block=5)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        _, keypoints, scores, boxes, valid = filmed(12)
+        generator = torch.Generator().manual_seed(1)
+        shape = (*batch, 2)
+        noise = 3 * torch.randn(*shape, 12, 17, 2, generator=generator, dtype=torch.float64)
+        scores = scores.expand(*shape, 12, 17).clone()
+        scores[..., 3, 7] = 0.1  # hidden
+        valid = valid.expand(*shape, 12).clone()
+        valid[..., 1, 5:7] = False  # nobody
+        return (
+            (keypoints + noise).to(dtype), scores.to(dtype), boxes.expand(*shape, 12, 4).to(dtype), valid,
+            HEIGHT, WIDTH, 30.0,
+        )  # fmt: skip
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        k, s, b, v, *rest = self.inputs((1,), torch.float32)
+        broken = k.clone()
+        broken[0, 0, 0, 0, 0] = float("nan")
+        return [
+            ((k[..., :16, :], s, b, v, *rest), "17"),
+            ((k, s[..., :3], b, v, *rest), "scores"),
+            ((k, s, b[..., :3], v, *rest), "boxes"),
+            ((k, s, b, v[..., :3], *rest), "valid"),
+            ((k, s, b, v.float(), *rest), "bool"),
+            ((broken, s, b, v, *rest), "keypoints"),
+            ((k, s, b, v, 0, WIDTH, 30.0), "image"),
+            ((k, s, b, v, HEIGHT, WIDTH, 0.0), "fps"),
+            ((k[:, :, :0], s[:, :, :0], b[:, :, :0], v[:, :, :0], *rest), "frame"),
+        ]
+
+
+def test_joints_lie_on_the_lines_of_sight_of_their_key_points() -> None:
+    """An untrained network moves no key point: projected back, its joints are at the pixels that it was given."""
+    torch.manual_seed(0)
+    net = TemporalNet(16)
+    with torch.no_grad():  # depths and sizes at random, no shifts
+        net.leave.weight[28:43].normal_(std=0.1)
+    joints, keypoints, scores, boxes, valid = filmed()
+    lifter = TemporalLifter(net, CAMERA, (1.7,)).double().eval()
+    with torch.no_grad():
+        found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        lifted = lifter.in_picture(found, scores[..., :14], HEIGHT, WIDTH)
+    body, _ = coco_to_body(keypoints, scores)
+    points = (found.joints + found.root[..., None, :])[0].numpy() - np.array(CAMERA.position_m)
+    pose = camera_to_world(CAMERA).numpy()[:, :3]
+    local = points @ pose
+    focal = WIDTH / 2 / math.tan(CAMERA.horizontal_fov_rad / 2)
+    pixels = focal * local[..., :2] / local[..., 2:] + np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+    np.testing.assert_allclose(pixels, body[0].numpy(), atol=1e-6)
+    torch.testing.assert_close(lifted.keypoints, body, atol=1e-6, rtol=0)
+    assert float(mid_hips(found.joints).abs().max()) < 1e-9
+    assert (
+        float((found.joints[0] - (joints - mid_hips(joints)[:, None])).abs().max()) > 0.1
+    )  # depths at random
+
+
+def test_metric_pose_places_what_the_lifter_found() -> None:
+    """Through ``in_picture`` and MetricPose, a body that stands still comes out where the lifter has it."""
+    _, keypoints, scores, boxes, valid = filmed()
+    still = (x[:, :1].expand_as(x) for x in (keypoints, scores, boxes))
+    keypoints, scores, boxes = (x.contiguous() for x in still)
+    lifter = TemporalLifter(network(), CAMERA, (1.7,)).double().eval()
+    with torch.no_grad():
+        found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        lifted = lifter.in_picture(found, scores[..., :14], HEIGHT, WIDTH)
+        place = ts.vision.MetricPose(CAMERA, (1.7,), calibrated=True, range_smoothing_s=0.001)
+        joints, _ = place(lifted.keypoints, scores[..., :14], lifted, valid, HEIGHT, WIDTH, 30.0)
+    torch.testing.assert_close(joints, found.joints + found.root[..., None, :], atol=1e-6, rtol=0)
+
+
+def test_tilt_turn_and_focal_length_are_taken_out() -> None:
+    """The same people seen by another camera at the same place look the same to the network."""
+    joints, *_ = filmed()
+    sights = []
+    for pitch, yaw, fov in ((0.0, 0.0, 1.0), (-0.4, 0.1, 1.3)):
+        camera = CameraConfig(
+            position_m=CAMERA.position_m, pitch_rad=pitch, yaw_rad=yaw, horizontal_fov_rad=fov
+        )
+        focal = WIDTH / 2 / math.tan(fov / 2)
+        center = ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+        pose = camera_to_world(camera)
+        pixels, _ = project(body_to_coco(joints), focal, center, pose)
+        body, _ = coco_to_body(pixels, torch.ones(pixels.shape[:-1], dtype=pixels.dtype))
+        one = torch.ones(1, dtype=torch.float64)
+        frames = len(joints)
+        sights.append(
+            level_sight(
+                pixels[None], one.expand(1, frames, 17), body[None], one.expand(1, frames, 14),
+                torch.zeros(1, frames, 4, dtype=torch.float64), torch.ones(1, frames, dtype=torch.bool), focal * one,
+                torch.tensor([center], dtype=torch.float64), pose[None, :, :3],
+                torch.tensor([[WIDTH, HEIGHT]], dtype=torch.float64), 30 * one,
+            )
+        )  # fmt: skip
+    torch.testing.assert_close(sights[0].joints, sights[1].joints, atol=5e-3, rtol=0)
+    torch.testing.assert_close(sights[0].size, sights[1].size, rtol=5e-3, atol=0)
+    torch.testing.assert_close(sights[0].azimuth, sights[1].azimuth, atol=5e-3, rtol=0)
+
+
+def test_blocks_equal_the_whole() -> None:
+    """A long film in blocks with overlap gives what it gives in one piece."""
+    _, keypoints, scores, boxes, valid = filmed(150)
+    valid[0, 60:75] = False
+    arguments = (keypoints.float(), scores.float(), boxes.float(), valid, HEIGHT, WIDTH, 30.0)
+    with torch.no_grad():
+        whole = TemporalLifter(network(), CAMERA)(*arguments)
+        parts = TemporalLifter(network(), CAMERA, frames_per_block=40)(*arguments)
+    for one, other in zip(whole, parts, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+
+
+def test_frames_out_of_reach_have_no_say() -> None:
+    _, keypoints, scores, boxes, valid = filmed(120)
+    lifter = TemporalLifter(network(), CAMERA).double()
+    other = keypoints.clone()
+    other[0, 0] += 40.0
+    with torch.no_grad():
+        before = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0).joints[0]
+        after = lifter(other, scores, boxes, valid, HEIGHT, WIDTH, 30.0).joints[0]
+    change = (after - before).abs().amax(dim=(1, 2))
+    assert float(change[: lifter.reach // 2].max()) > 1e-4
+    assert float(change[lifter.reach + 1 :].max()) < 1e-9
+
+
+def test_deviations_follow_the_line_of_sight() -> None:
+    across, along = torch.tensor([0.1]), torch.tensor([0.3])
+    for degrees, expected in ((0.0, [0.1, 0.3, 0.1]), (90.0, [0.3, 0.1, 0.1])):
+        angle = math.radians(degrees)
+        azimuth = torch.tensor([[math.cos(angle), math.sin(angle)]])
+        torch.testing.assert_close(along_axes(across, along, azimuth)[0], torch.tensor(expected))
+    ahead = torch.tensor([[[[0.0, 2.0, 0.0]]]])
+    torch.testing.assert_close(
+        turned_back(ahead, torch.tensor([[[0.0, 1.0]]])), torch.tensor([[[[2.0, 0.0, 0.0]]]])
+    )
+
+
+def test_windowed_mean_is_that_of_numpy() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(1, 40, 1, generator=generator, dtype=torch.float64)
+    weight = (torch.rand(1, 40, generator=generator) < 0.7).double()
+    mean = windowed_mean(x, weight)[0, :, 0]
+    for t in (0, 7, 20, 39):
+        inside = slice(max(t - 10, 0), t + 11)
+        expected = np.average(x[0, inside, 0].numpy(), weights=weight[0, inside].numpy())
+        assert float(mean[t]) == pytest.approx(expected)
+
+
+def test_refuses_settings_that_cannot_be() -> None:
+    with pytest.raises(TensorsimError, match="person_height_m"):
+        TemporalLifter(network(), person_height_m=())
+    with pytest.raises(TensorsimError, match="frames_per_block"):
+        TemporalLifter(network(), frames_per_block=0)
+    with pytest.raises(TensorsimError, match="library"):
+        PoseConfig(lifter="temporal", library="pool.safetensors")
+    with pytest.raises(TensorsimError, match="lifter"):
+        PoseConfig(lifter="best")  # type: ignore[arg-type]
