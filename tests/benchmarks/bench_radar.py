@@ -1,4 +1,6 @@
-"""Speed and memory of the radar chain: `python -m tests.benchmarks.bench_radar [--cpu] [--quick | --ten-minutes | --plot PNG]`.
+"""Speed and memory of the radar chain.
+
+`python -m tests.benchmarks.bench_radar [--cpu] [--quick | --ten-minutes | --plot PNG]`
 
 Peers, in the same run: the echo and the chain evaluated directly in NumPy complex128 (tests/radar/reference.py), which
 compute every exponential; the echo's sum written plainly in torch; and NumPy and SciPy with the algorithm of ours, that
@@ -71,7 +73,7 @@ def factored_echo(radar, positions, rcs):
 
 
 def factored_chain(radar, positions, rcs, snr_db=50.0, chunk=1024, bins=16):
-    """Positions to the Doppler-time map (F, K) with noise, in NumPy and SciPy, on as many workers as torch's threads."""
+    """Positions to the Doppler-time map (F, K) with noise, in NumPy and SciPy on as many threads as torch."""
     rng, workers, stage = np.random.default_rng(0), torch.get_num_threads(), DopplerTimeMap(radar)
     window = np.hamming(radar.samples_per_chirp).astype(np.float32)
     echo = np.concatenate(
