@@ -35,6 +35,7 @@ _MEANT_FOR = {
     "keypoint_threshold": ("video", "keypoints"),
     "pose": ("video",),
     "flip_test": ("video",),
+    "engine": ("video",),
     "person_height": ("video", "keypoints"),
     "calibrate": ("video",),
     "camera_fov": ("video", "keypoints"),
@@ -217,6 +218,6 @@ class Simulate(NetworkOptions, RadarOptions):
         reader = VideoReader(
             self.source, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
         )
-        networks = load_networks(detector, pose, config.pose.flip_test)
+        networks = load_networks(detector, pose, config.pose.flip_test, self.engine)
         stage = VideoToPose.from_config(config, *networks).to(device)
         return sources.film_source(reader, stage, device, config.pose.calibrate), config
