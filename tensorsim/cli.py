@@ -31,6 +31,7 @@ from tensorsim.commands.train_acf import TrainAcf
 from tensorsim.commands.train_classifier import TrainClassifier
 from tensorsim.commands.train_denoiser import TrainDenoiser
 from tensorsim.commands.train_detector import TrainDetector
+from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
@@ -84,6 +85,7 @@ COMMANDS: dict[str, Any] = {
             "lifter": TrainLifter,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
+            "everyday": TrainEveryday,
             "acf": TrainAcf,
         },
     ),

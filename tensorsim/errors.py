@@ -159,6 +159,14 @@ def check_complex_map(x: Tensor, name: str, layout: str) -> None:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout} without empty dimensions")
 
 
+def check_scatterers(positions: Tensor, rcs: Tensor) -> None:
+    """Refuse positions or cross sections that are not finite, and negative cross sections."""
+    check_finite(positions, "positions")
+    check_finite(rcs, "rcs")
+    if not is_exporting() and bool((rcs < 0).any()):
+        raise TensorsimError(f"rcs: got a minimum of {float(rcs.min())} m^2, expected no negative value")
+
+
 def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
     """Refuse scatterers of which no echo can be computed.
 
@@ -185,10 +193,7 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
         raise TensorsimError(
             f"rcs: got shape {got}, expected {per_clip} (per clip) or {per_pulse} (per pulse) m^2"
         )
-    check_finite(positions, "positions")
-    check_finite(rcs, "rcs")
-    if not is_exporting() and bool((rcs < 0).any()):
-        raise TensorsimError(f"rcs: got a minimum of {float(rcs.min())} m^2, expected no negative value")
+    check_scatterers(positions, rcs)
     if got == per_clip:
         rcs = rcs.unsqueeze(-2)
     return rcs.expand(per_pulse)

@@ -22,7 +22,7 @@ class Watcher(Protocol):
 _watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
 
 
-class ProgressBar(tqdm):
+class ProgressBar(tqdm):  # type: ignore[misc]  # tqdm has no types
     """A bar whose steps a watcher hears of as well, also where the bar is not shown."""
 
     done = 0

@@ -52,9 +52,9 @@ class ModelEntry:
         """How well a download is verified, in words."""
         if len(self.sha256) == 64:
             return "whole SHA-256"
-        return (
-            f"{len(self.sha256)} digits of SHA-256, which is weak" if self.sha256 else "no SHA-256 published"
-        )
+        if self.sha256:
+            return f"{len(self.sha256)} digits of SHA-256, which is weak"
+        return "no SHA-256 is published: unverified"
 
     @property
     def path(self) -> Path:
@@ -140,7 +140,8 @@ def _videopose(frames: int, kind: str, sha256: str, error_mm: str, joints: str) 
     )
 
 
-#: Published by others. Eight digits of SHA-256 are part of their file names.
+#: Published by others. Eight digits of SHA-256 are part of their file names; a whole digest is that of a copy at hand
+#: that gives the published accuracy.
 PUBLISHED: tuple[ModelEntry, ...] = (
     _coco_rtmdet("tiny", "20220902_112414", "78e30dcc", "41.1"),
     _coco_rtmdet("s", "20220905_161602", "387a891e", "44.6"),
@@ -167,7 +168,7 @@ PUBLISHED: tuple[ModelEntry, ...] = (
         "K. Zhang (KAIR), trained on photographs",
         "blind grey denoising, noise of 0 to 55 grey levels",
         "grey in [0, 1]",
-        "",
+        "e8172769f3cdc6c5298ddd63655b900673a9bd8fb8e6e26e883277ff4baa4cbd",
         "https://github.com/cszn/KAIR/releases/download/v1.0/dncnn_gray_blind.pth",
     ),
 )
@@ -247,14 +248,20 @@ def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
     return fetch(find(str(source), *networks))
 
 
-def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
+def fetch(entry: ModelEntry, quiet: bool = False, unverified: bool = False) -> Path:
     """The file of an entry, downloaded if it is not there. An interrupted download goes on where it stopped.
 
-    The whole SHA-256 of what came is kept beside it, so that later changes show also where only eight digits, or
-    none, are published.
+    The whole SHA-256 of the download is kept beside it, so that later changes are noticed also where only eight digits,
+    or none, are published.
+
+    Args:
+        entry: which file.
+        quiet: no progress bar.
+        unverified: download also what has no published SHA-256.
 
     Raises:
-        TensorsimError: no connection, or a file whose SHA-256 is another (it is removed).
+        TensorsimError: no connection, a file whose SHA-256 is another (it is removed), or no published SHA-256 without
+            ``unverified``.
     """
     path = entry.path
     if entry.url is None:
@@ -262,6 +269,11 @@ def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
     if path.is_file():
         verify(entry)
         return path
+    if not entry.sha256 and not unverified:
+        raise TensorsimError(
+            f"{entry.name}: no SHA-256 of {entry.url} is published, so that a download cannot be verified; take it all "
+            f"the same with tensorsim models fetch --unverified {entry.name}"
+        )
     import gdown
     import requests
 

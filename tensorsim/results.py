@@ -228,7 +228,7 @@ def write_pose(
 ) -> None:
     """Write ``pose.npz`` (and other formats) and a picture of the skeletons in the world."""
     joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
-    arrays = {
+    arrays: dict[str, np.ndarray | float] = {
         "joints_m": joints,
         "keypoints_px": pose.keypoints[0].numpy(),
         "keypoint_scores": pose.keypoint_scores[0].numpy(),

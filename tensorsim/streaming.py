@@ -130,8 +130,9 @@ def _drawn(
     frames: Tensor, boxes: Tensor, keypoints: Tensor, scores: Tensor, valid: Tensor, threshold: float
 ) -> np.ndarray:
     """The last of some frames (n, 3, H, W) with its people."""
-    people = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
-    return plot.draw_people(frames[-1].permute(1, 2, 0).numpy(), *people, threshold)
+    box, points, point_scores, there = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
+    frame = frames[-1].permute(1, 2, 0).numpy()
+    return plot.draw_people(frame, box, points, point_scores, there, threshold)
 
 
 def maps_of_pose(

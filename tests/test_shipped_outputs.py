@@ -11,6 +11,7 @@ from torch.nn import functional as F
 import tensorsim as ts
 from tensorsim import registry
 from tensorsim.recognition import SPGNet
+from tests.networks import keypoints_to_lift
 
 
 def wave(*shape: int) -> Tensor:
@@ -32,6 +33,7 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "PictureNet": lambda network: network(wave(1, network.channels, network.rows, 64)),
     "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
     "RTMDet": detector_logits,  # type: ignore[dict-item]
+    "TemporalLifter": lambda lifter: lifter(*keypoints_to_lift(20)).joints.flatten()[::41],
 }
 
 #: First numbers and root mean square of all, by the first digits of the file's SHA-256.

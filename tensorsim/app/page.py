@@ -104,10 +104,12 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                 inputs | {shown},
                 outputs,
                 concurrency_limit=2,
-                api_name=False,
+                api_visibility="private",
                 show_progress="hidden",
             )
-        cancel.click(runs.cancel, running, None, concurrency_limit=None, api_name=False, queue=False)
+        cancel.click(
+            runs.cancel, running, None, concurrency_limit=None, api_visibility="private", queue=False
+        )
     return page
 
 
@@ -116,19 +118,27 @@ def _activities() -> list[str]:
     return [name.split(" ", 1)[1].lower() for name in ACTIVITIES]
 
 
-def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Textbox) -> None:
+def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Number) -> None:
     """Buttons that set activity, scene and length."""
     gr.Markdown("Examples that need no file:")
     with gr.Row():
         for name, values in _EXAMPLES.items():
             gr.Button(name, size="sm").click(
-                lambda chosen=values: chosen, None, [activity, scene, duration], api_name=False, queue=False
+                lambda chosen=values: chosen,
+                None,
+                [activity, scene, duration],
+                api_visibility="private",
+                queue=False,
             )
 
 
 def _component(control: Control) -> Any:
     """The control as a component of Gradio."""
-    common = {"label": control.label, "info": control.help, "elem_id": control.option.replace("_", "-")}
+    common: dict[str, Any] = {
+        "label": control.label,
+        "info": control.help,
+        "elem_id": control.option.replace("_", "-"),
+    }
     if control.kind == "switch":
         return gr.Checkbox(value=bool(control.default), **common)
     if control.kind == "choice":

@@ -40,7 +40,8 @@ class Run:
 
     def __init__(self, folder: Path) -> None:
         self.token, self.folder = folder.name, folder
-        self.stage, self.done, self.total = "waiting", 0, None
+        self.stage, self.done = "waiting", 0
+        self.total: int | None = None
         self.pictures: dict[str, np.ndarray] = {}
         self.error: str | None = None
         self.finished, self.cancelled = Event(), Event()

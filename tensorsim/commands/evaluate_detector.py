@@ -11,7 +11,7 @@ class EvaluateDetector:
     """Print average precision and recall on held-out pictures, and how long films are followed beside another detector.
 
     Attributes:
-        weights: RTMDet's (.safetensors, .pth, .onnx); the shipped ones if not given.
+        weights: RTMDet's (.safetensors, .pth, .onnx) or ACF's (.safetensors); the shipped ones if not given.
         against: another detector's, measured alike; needed for films.
         data: folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out pictures are looked at.
         coco: folder with one COCO annotation file (*.json) and its pictures in images/.
@@ -28,9 +28,9 @@ class EvaluateDetector:
         """Do it."""
         import torch
 
+        from tensorsim.pipeline.networks import pretrained_detector
         from tensorsim.training.detector_metrics import compare_tracks, measure, tracks_of_film
         from tensorsim.training.shards import Sample, read_coco_folder, read_coco_shards
-        from tensorsim.vision.detection.rtmdet import RTMDet
 
         groups: dict[str, list[Sample]] = {}
         if self.data is not None:
@@ -46,9 +46,7 @@ class EvaluateDetector:
             raise TensorsimError("--films: got no --against, the detector to compare with")
 
         files = [self.weights] if self.against is None else [self.weights, self.against]
-        detectors = [
-            ("shipped" if file is None else str(file), RTMDet.from_pretrained(file)) for file in files
-        ]
+        detectors = [("shipped" if file is None else str(file), pretrained_detector(file)) for file in files]
         with torch.inference_mode():
             for name, samples in groups.items():
                 for source, detector in detectors:

@@ -283,8 +283,15 @@ def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "Sim
     return config
 
 
+#: Speeds that the radars of the classifiers' training resolve (the through-wall preset: 0.6 m/s), with a margin.
+COARSEST_M_S = 0.8
+
+
 def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
-    """The classifier of the maps of this radar; None if no label is wanted.
+    """The classifier of the maps of this radar; None if no label is wanted or the radar is unlike those of training.
+
+    The pictures of the shipped networks show speeds up to 3.8 m/s, resolved to 0.6 m/s or better. A radar for which
+    faster motion folds, or which resolves speeds less, gets no label but a warning.
 
     Raises:
         TensorsimError: weights that are not there, of another network, or without names of their classes.
@@ -297,14 +304,20 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
         recognizer = ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier)
     except TensorsimError as error:
         raise TensorsimError(f"--classifier: {error}") from None
-    # Faster motion would fold into the picture that the network sees.
-    if config.scene.radar.unambiguous_speed_m_s < 0.9 * recognizer.speed_m_s:
-        warnings.warn(
-            f"no label: the radar sees speeds up to {config.scene.radar.unambiguous_speed_m_s:.2g} m/s, the classifier "
-            f"was trained on speeds up to {recognizer.speed_m_s:.2g} m/s",
-            TensorsimWarning,
-            stacklevel=2,
+    radar, unlike = config.scene.radar, None
+    resolution_m_s = radar.doppler_wavelength_m / 2 / config.processing.window_s
+    if radar.unambiguous_speed_m_s < 0.9 * recognizer.speed_m_s:
+        unlike = (
+            f"sees speeds up to {radar.unambiguous_speed_m_s:.2g} m/s, the classifier was trained on speeds up to "
+            f"{recognizer.speed_m_s:.2g} m/s"
         )
+    elif resolution_m_s > COARSEST_M_S:
+        unlike = (
+            f"resolves speeds {resolution_m_s:.2g} m/s apart, the classifier was trained on radars that resolve "
+            f"{COARSEST_M_S:.2g} m/s or less"
+        )
+    if unlike is not None:
+        warnings.warn(f"no label: the radar {unlike}", TensorsimWarning, stacklevel=2)
         return None
     return recognizer
 

@@ -18,6 +18,8 @@ class CameraConfig:
         position_m: the camera in the world.
         pitch_rad: upward tilt of the optical axis.
         yaw_rad: turn of the optical axis from +y towards +x.
+        roll_rad: turn about the optical axis, positive = clockwise as the camera sees it, so that upright bodies lean
+            to the left in its picture.
 
     Raises:
         TensorsimError: a focal length or field of view that is not physical, a position, principal point or angle
@@ -30,6 +32,7 @@ class CameraConfig:
     position_m: Vector = (0.0, 0.0, 1.5)
     pitch_rad: float = 0.0
     yaw_rad: float = 0.0
+    roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if self.focal_px is not None:
@@ -48,7 +51,7 @@ class CameraConfig:
             raise TensorsimError(
                 f"CameraConfig.center_px: got {center!r}, expected two finite numbers (u, v) or None"
             )
-        for name in ("pitch_rad", "yaw_rad"):
+        for name in ("pitch_rad", "yaw_rad", "roll_rad"):
             if not is_finite(getattr(self, name)):
                 raise TensorsimError(
                     f"CameraConfig.{name}: got {getattr(self, name)}, expected finite radians"

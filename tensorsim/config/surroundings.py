@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from tensorsim.config.checks import Vector, as_positions, is_finite, require_dielectric, require_vector
 from tensorsim.errors import TensorsimError
+from tensorsim.limits import check_range
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class WallConfig:
             raise TensorsimError(
                 f"WallConfig.size_m: got {self.size_m}, expected positive width and height and thickness >= 0"
             )
+        for name, quantity in (("center_m", "position"), ("size_m", "length")):
+            for value in getattr(self, name):
+                check_range(value, quantity, f"WallConfig.{name}")
         require_dielectric("WallConfig", self.relative_permittivity, self.loss_tangent)
 
     @property

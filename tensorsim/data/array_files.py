@@ -40,7 +40,8 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray | float], formats: Sequ
         TensorsimError: h5py is not installed.
     """
     if "npz" in formats:
-        np.savez_compressed(path.with_suffix(".npz"), **{name: np.asarray(x) for name, x in arrays.items()})
+        named: dict[str, Any] = {name: np.asarray(x) for name, x in arrays.items()}
+        np.savez_compressed(path.with_suffix(".npz"), **named)
     if "mat" in formats:
         from scipy.io import savemat
 

@@ -29,8 +29,11 @@ def camera_to_world(camera: CameraConfig) -> Tensor:
     cos_pitch, sin_pitch = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
     right = torch.tensor([cos_yaw, -sin_yaw, 0.0], dtype=torch.float64)
     forward = torch.tensor([sin_yaw * cos_pitch, cos_yaw * cos_pitch, sin_pitch], dtype=torch.float64)
+    down = torch.linalg.cross(forward, right)
+    cos_roll, sin_roll = math.cos(camera.roll_rad), math.sin(camera.roll_rad)
+    right, down = cos_roll * right + sin_roll * down, cos_roll * down - sin_roll * right
     position = torch.tensor(camera.position_m, dtype=torch.float64)
-    return torch.stack([right, torch.linalg.cross(forward, right), forward, position], dim=1)
+    return torch.stack([right, down, forward, position], dim=1)
 
 
 def project(points: Tensor, focal: float, center: tuple[float, float], pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -49,7 +52,7 @@ def project(points: Tensor, focal: float, center: tuple[float, float], pose: Ten
     # Equal to kornia.geometry.project_points after transform_points, which take more than twice as long.
     local = torch.matmul(points - pose[:, 3], pose[:, :3])
     depth = local[..., 2]
-    scale = focal / depth.clamp(min=NEAR_M)
+    scale = focal / depth.clamp(min=0.1)  # NEAR_M: TorchScript reads no constants of modules
     return local[..., :2] * scale[..., None] + torch.tensor(center).to(local), depth
 
 

@@ -150,7 +150,8 @@ class LiveRadar:
         end_s = self.pulse / self.prf_hz
         if scene is None:
             bins = self.simulator.range_profile.range_m.shape[0]
-            return NewColumns(torch.zeros(self.simulator.doppler.bins, 0), *[torch.zeros(bins, 0)] * 2, end_s)
+            empty = torch.zeros(bins, 0)
+            return NewColumns(torch.zeros(self.simulator.doppler.bins, 0), empty, empty, end_s)
         piece = self.simulator.advance(*scene, first, self.pending)
         self.pending = piece.pending
         still = self._display(0, piece.profiles[0].T.abs())

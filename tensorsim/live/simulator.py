@@ -1,7 +1,7 @@
 """The whole live chain: a frame in, people, new columns of the maps and a label out."""
 
 import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -45,8 +45,8 @@ class LiveFrame(NamedTuple):
     """What a frame adds.
 
     Attributes:
-        index: of the frame, from 0; frames that were missed count.
-        time_s: of the frame, ``index / fps``.
+        number: of the frame, from 0; frames that were missed count.
+        time_s: of the frame, ``number / fps``.
         people: in the frame.
         doppler_time: (F, k) new columns of the Doppler-time map.
         doppler_time_s: (k,) their centres.
@@ -55,7 +55,7 @@ class LiveFrame(NamedTuple):
         delay_s: from the end of the last Doppler window to this frame, in seconds of the film.
     """
 
-    index: int
+    number: int
     time_s: float
     people: list[LivePerson]
     doppler_time: Tensor
@@ -255,7 +255,7 @@ class LiveSimulator:
         ).eval()
 
 
-def _each_frame_alone(lifter: nn.Module) -> nn.Module:
+def _each_frame_alone(lifter: nn.Module | None) -> nn.Module:
     """The same lifter without a look at other frames, quick for single ones.
 
     Raises:
@@ -271,7 +271,7 @@ def _each_frame_alone(lifter: nn.Module) -> nn.Module:
     return alone
 
 
-def _tracking(config: SimulationConfig) -> dict[str, float]:
+def _tracking(config: SimulationConfig) -> dict[str, Any]:
     """Arguments of the tracker."""
     tracking = config.tracking
     names = (

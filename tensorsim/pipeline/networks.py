@@ -1,4 +1,4 @@
-"""Pose networks as the pipeline takes them."""
+"""Networks of files and names as the pipeline takes them."""
 
 import os
 from pathlib import Path
@@ -7,6 +7,8 @@ from torch import nn
 
 from tensorsim.config import PoseConfig
 from tensorsim.protocols import check_part, is_pose_estimator
+from tensorsim.vision.detection.acf import AcfDetector
+from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -21,6 +23,24 @@ def top_down(pose: nn.Module, flip_test: bool = True) -> nn.Module:
     if is_pose_estimator(pose):
         return check_part(pose, "pose")
     return TopDownPose(check_part(pose, "network"), flip_test=flip_test)
+
+
+def pretrained_detector(source: str | os.PathLike[str] | None = None) -> RTMDet | AcfDetector:
+    """The detector of a file or name, in evaluation mode: ACF where the header of the file says so, else RTMDet.
+
+    Args:
+        source: a path, a name of ``tensorsim models list``, or None for the shipped RTMDet.
+
+    Raises:
+        TensorsimError: no such file or name, or weights of another network.
+    """
+    from tensorsim.registry import locate
+    from tensorsim.weights import read_metadata
+
+    path = locate(source, "RTMDet", "AcfDetector")
+    if read_metadata(path).get("network") == "AcfDetector":
+        return AcfDetector.from_pretrained(path)
+    return RTMDet.from_pretrained(path)
 
 
 def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: bool = True) -> TopDownPose:
@@ -54,5 +74,9 @@ def pretrained_lifter(people: PoseConfig) -> NearestPoseLifter | TemporalLifter:
         )
     library = None if people.library is None else load_pose_library(people.library)
     return NearestPoseLifter(
-        library, neighbours=people.neighbours, temporal=people.temporal, pitch_rad=people.camera.pitch_rad
+        library,
+        neighbours=people.neighbours,
+        temporal=people.temporal,
+        pitch_rad=people.camera.pitch_rad,
+        roll_rad=people.camera.roll_rad,
     ).eval()

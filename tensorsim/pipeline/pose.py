@@ -8,10 +8,9 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
-from tensorsim.pipeline.networks import pretrained_lifter, pretrained_pose, top_down
+from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
-from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -20,6 +19,7 @@ from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
+from tensorsim.vision.smoothing.sides import SteadySides
 from tensorsim.vision.tracking.tracker import GNNTracker
 
 
@@ -96,12 +96,15 @@ class VideoToPose(nn.Module):
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
         self.metric_pose = metric_pose
+        self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
         self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
+        #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
+        self.noise_share = 0.03
         #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
         self.top_speed_m_s = 12.0
         #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
@@ -123,7 +126,7 @@ class VideoToPose(nn.Module):
         """
         tracking, people, smoothing = config.tracking, config.pose, config.smoothing
         if detector is None:
-            detector = RTMDet.from_pretrained(tracking.detector)
+            detector = pretrained_detector(tracking.detector)
         if pose is None:
             pose = pretrained_pose(people.network, people.flip_test)
         return cls(
@@ -174,7 +177,7 @@ class VideoToPose(nn.Module):
         if isinstance(lifter, TemporalLifter):
             other.temporal = lifter.seen_by(camera)
         else:
-            other.lifter = lifter.tilted(camera.pitch_rad)
+            other.lifter = lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
         return other.eval()
 
@@ -305,6 +308,7 @@ class VideoToPose(nn.Module):
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
         """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
+        keypoints, scores = self.sides(keypoints, scores, tracks.valid, fps)
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         # Joints below the threshold have no weight in the match: the network guesses what it cannot see.
         reliable = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
@@ -315,9 +319,10 @@ class VideoToPose(nn.Module):
         usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
-            lifted = self.temporal.in_picture(found, body_scores, height, width)
-            body, noise = lifted.keypoints, found.deviation
+            lifted = self.temporal.in_picture(found, body, body_scores, height, width)
+            body, noise = lifted.keypoints, self.noise_share * found.deviation
         else:
+            assert self.lifter is not None
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)

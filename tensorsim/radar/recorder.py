@@ -1,5 +1,7 @@
 """What a radar records of a scene: range profiles with the noise and the effects of its receiver."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -56,11 +58,12 @@ class Recorder(nn.Module):
         total, clutter = scene.noise_reference == "total", None
         if scene.clutter is not None:
             clutter = RoomClutter(scene.clutter.reflectors, jitter_m=scene.clutter.jitter_m, seed=seed)
-        self.engine: nn.Module = TimeEngine(echo, profile, total, clutter)
+        # With a front end it is a TimeEngine: see SceneConfig.check_engine.
+        self.engine: Any = TimeEngine(echo, profile, total, clutter)
         if processing.engine == "range-bins":
             bins = RangeBinSynthesizer(echo, profile, processing.near_bins, processing.energy_stride)
             self.engine = RangeBinEngine(bins, total, clutter)
-        self.front_end: nn.Module | None = None
+        self.front_end: FrontEnd | None = None
         if scene.sampled_effects:
             self.front_end = FrontEnd(scene, self.noise, seed)
         self.echo = echo

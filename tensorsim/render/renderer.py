@@ -140,7 +140,7 @@ class PersonRenderer:
         boxes = _boxes(mask)
         camera = CameraConfig(
             view.scale, self.camera.horizontal_fov_rad, view.center, self.camera.position_m,
-            self.camera.pitch_rad, self.camera.yaw_rad,
+            self.camera.pitch_rad, self.camera.yaw_rad, self.camera.roll_rad,
         )  # fmt: skip
         return RenderedVideo(
             torch.stack(frames),

@@ -52,7 +52,7 @@ class AcfSettings:
     positives: int = 3000
     negatives: int = 3000
     learning_rate: float = 0.5
-    false_per_picture: float = 0.3
+    false_per_picture: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:

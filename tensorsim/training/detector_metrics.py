@@ -14,6 +14,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.geometry.boxes import box_iou
 from tensorsim.training.shards import Sample
 from tensorsim.types import Detections, Tracks
+from tensorsim.vision.detection.acf import AcfDetector
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.tracking.tracker import GNNTracker
 
@@ -21,7 +22,9 @@ from tensorsim.vision.tracking.tracker import GNNTracker
 HALF_PRECISION = 0.01
 
 
-def measure(detector: RTMDet, samples: Sequence[Sample], score: float = 0.5) -> dict[str, float]:
+def measure(
+    detector: RTMDet | AcfDetector, samples: Sequence[Sample], score: float = 0.5
+) -> dict[str, float]:
     """Figures of a detector on pictures in which everybody is labelled.
 
     Returns:
@@ -114,11 +117,11 @@ def average_precision(truths: Sequence[Tensor], found: Sequence[Tensor]) -> tupl
     return float(evaluation.stats[0]), float(evaluation.stats[1])
 
 
-def people_in(detector: RTMDet, sample: Sample) -> tuple[Tensor, Tensor]:
+def people_in(detector: RTMDet | AcfDetector, sample: Sample) -> tuple[Tensor, Tensor]:
     """Boxes (n, 4) and scores (n,) of the people that a detector finds in a picture, on the CPU."""
     image = torch.from_numpy(sample.image()).permute(2, 0, 1)[None]
     with torch.no_grad():
-        seen: Detections = detector(image.to(detector.mean.device))
+        seen: Detections = detector(image.to(next(detector.buffers()).device))
     persons = seen.valid[0] & (seen.labels[0] == 0)
     return seen.boxes[0][persons].cpu(), seen.scores[0][persons].cpu()
 
@@ -176,12 +179,12 @@ class Followed(NamedTuple):
     shared: int
 
 
-def tracks_of_film(detector: RTMDet, path: str | os.PathLike[str], interval: int = 2) -> Tracks:
+def tracks_of_film(detector: RTMDet | AcfDetector, path: str | os.PathLike[str], interval: int = 2) -> Tracks:
     """People of a film (one clip) by the default tracker, detected in every ``interval``-th frame and in the last."""
     reader = VideoReader(path)
     found: list[Detections] = []
     observed: list[bool] = []
-    last, device = torch.empty(0), detector.mean.device
+    last, device = torch.empty(0), next(detector.buffers()).device
     with torch.no_grad():
         for frames in reader.chunks(interval):
             found.append(detector(frames[:1].to(device)))

@@ -186,7 +186,8 @@ def _captured(
     sequences: list[tuple[Tensor, float]], count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Pieces of captured motion at 0.75 to 1.3 of its speed, of bodies with other proportions and sizes."""
-    pieces, heights = [], []
+    pieces: list[Tensor] = []
+    heights: list[float] = []
     while len(pieces) < count:
         lengths = torch.tensor([len(joints) / fps for joints, fps in sequences]).clamp(max=12.0)
         joints, fps = sequences[int(torch.multinomial(lengths, 1, generator=generator))]
@@ -250,8 +251,8 @@ def build_pool(
     Raises:
         TensorsimError: a damaged file, or one of other motions.
     """
-    settings = {"count": count, "seed": seed, "held_out": held_out}
-    settings |= {"motions": [file.name for file in motions]}
+    names = [file.name for file in motions]
+    settings = {"count": count, "seed": seed, "held_out": held_out, "motions": names}
     if path is not None and path.is_file():
         try:
             stored = torch.load(path, map_location="cpu", weights_only=True)

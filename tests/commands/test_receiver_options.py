@@ -76,6 +76,21 @@ def test_the_paper_has_an_ideal_receiver(tmp_path: Path) -> None:
         RadarOptions(adc_bits=40).configuration()
 
 
+def test_simulate_with_an_array(tmp_path: Path) -> None:
+    """Four channels, one set of maps."""
+    (tmp_path / "array.yaml").write_text(
+        "carrier_hz: 2e9\nbandwidth_hz: 1e9\nprf_hz: 128\n"
+        "tx_m: [[-0.1, 0, 1.5], [0.05, 0, 1.5]]\nrx_m: [[0.1, 0, 1.5], [0.17, 0, 1.5]]\n"
+    )
+    body = np.array([0, 4, 1]) + np.random.default_rng(0).normal(0, 0.3, (14, 3))
+    np.savez(tmp_path / "stand.npz", joints=np.repeat(body[None], 30, 0), fps=30.0)
+    run = ["simulate", str(tmp_path / "stand.npz"), "--quiet", "--classifier", "none", "--sound"]
+    cli.main([*run, "--radar", str(tmp_path / "array.yaml"), "--out", str(tmp_path / "out")])
+    with np.load(tmp_path / "out" / "maps.npz") as maps:
+        assert maps["range_time"].shape == (200, 128)
+    assert (tmp_path / "out" / "doppler.wav").is_file()
+
+
 def test_simulate_with_a_typical_receiver(tmp_path: Path) -> None:
     steps = np.linspace(0, 1, 45)[:, None, None]
     body = np.array([0, 4, 1]) + np.random.default_rng(0).normal(0, 0.3, (14, 3))

@@ -64,6 +64,15 @@ def test_names() -> None:
         (lambda: ts.WallConfig(size_m=(5, -0.1, 2.5)), "size_m"),
         (lambda: ts.WallConfig(relative_permittivity=0.5), "relative_permittivity: got 0.5"),
         (lambda: ts.WallConfig(loss_tangent=-1), "loss_tangent"),
+        (
+            lambda: ts.WallConfig(loss_tangent=1e300),
+            r"loss_tangent: got 1e\+300, expected loss tangent from 0 to 100",
+        ),
+        (
+            lambda: ts.WallConfig(size_m=(4.0, 1e6, 3.0)),
+            r"size_m: got 1e\+06, expected length from 0 to 1000 m",
+        ),
+        (lambda: ts.WallConfig(center_m=(0.0, 1e6, 3.0)), r"center_m: got 1e\+06, expected position"),
         (lambda: ts.WallConfig(center_m=(0, math.inf, 0)), "center_m"),
         (lambda: ts.CameraConfig(focal_px=-5), "focal_px"),
         (lambda: ts.CameraConfig(horizontal_fov_rad=60.0), "horizontal_fov_rad: got 60.0"),

@@ -287,7 +287,9 @@ def test_uneven_times_are_said(tmp_path: Path) -> None:
     durations = [40] * 20
     durations[8] = 2000
     pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=durations)
-    with pytest.warns(TensorsimWarning, match=r"a\.gif: .* up to [12]\.\d+ s away .* \(mostly there are 25\)"):
+    with pytest.warns(
+        TensorsimWarning, match=r"a\.gif: .* up to [12]\.\d+ s away .* \(mostly there are 25\)"
+    ):
         read(tmp_path / "a.gif")
     # Before the pause all is even, and a rate that is given is taken.
     assert len(read(tmp_path / "a.gif", fps=25.0)) == 20

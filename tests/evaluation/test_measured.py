@@ -28,7 +28,6 @@ def write_folder(folder: Path, clips: int, seed: int) -> Path:
     masks[:, 126:130] = True
     np.savez(
         folder / "glasgow_cfar_masks" / "masks.npz", dt_packed=np.packbits(masks, axis=-1), label=labels,
-        dr_packed=np.packbits(masks[:, ::-1], axis=-1),
         classes=np.array(glasgow.CLASSES),
     )  # fmt: skip
     labels = np.arange(5).repeat(clips).astype(np.int8)
@@ -194,7 +193,7 @@ def test_lda_separates_what_is_linear():
     generator = torch.Generator().manual_seed(0)
     shown, labels = torch.rand(60, 1, 8, 8, generator=generator), torch.arange(60) % 3
     shown = shown + 0.3 * labels.view(-1, 1, 1, 1)
-    logits = lda_logits([shown[:40]], labels[:40], [shown[40:]], 4)
+    logits = lda_logits(shown[:40], labels[:40], shown[40:], 4)
     assert logits.shape == (20, 4)
     assert report.accuracy(logits, labels[40:]) > 0.9
     assert bool((logits[:, 3] == -100).all())

@@ -92,7 +92,8 @@ def test_echo_without_the_wall_is_stronger_and_else_the_same(
     assert rows["another clip"][doppler] < 30
     assert rows["without wall attenuation"][-1] > 3, "dB"
     monkeypatch.setattr(ablations, "compare", None)  # what is kept is not computed again
-    assert ablations.echo_report(ablations.quick_echo(), work).tables == report.tables
+    again = ablations.echo_report(ablations.quick_echo(), work)
+    assert [table.csv() for table in again.tables] == [table.csv() for table in report.tables]
 
 
 def test_denoisers_stand_beside_an_empty_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,9 +139,10 @@ def test_real_runs_and_goes_on(tmp_path: Path, shared_data: Path) -> None:
     report = real.real_report(config, work)
     assert sorted(row[0] for row in report.tables[0].rows) == ["CCLN", "DIAT-RadHARNet"]
     assert all(0 <= row[1] <= 100 for row in report.tables[0].rows)
-    assert real.real_report(config, work).tables == report.tables
+    assert real.real_report(config, work).tables[0].csv() == report.tables[0].csv()
 
 
+@pytest.mark.slow
 def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A chain that knows the truth has the best figures; one that finds nobody those of an empty map."""
 

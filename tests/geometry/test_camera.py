@@ -16,7 +16,7 @@ from tensorsim.geometry.camera import (
     project,
 )
 
-CAMERA = CameraConfig(position_m=(0.3, -1.0, 1.2), pitch_rad=-0.2, yaw_rad=0.4)
+CAMERA = CameraConfig(position_m=(0.3, -1.0, 1.2), pitch_rad=-0.2, yaw_rad=0.4, roll_rad=0.1)
 HEIGHT, WIDTH = 360, 640
 
 
@@ -41,6 +41,15 @@ def test_projection_equals_kornia() -> None:
     pixels, depth = project(points, focal, center, pose)
     torch.testing.assert_close(pixels, expected, rtol=0, atol=1e-9)
     torch.testing.assert_close(depth, local[..., 2])
+
+
+def test_a_camera_rolled_clockwise_sees_upright_bodies_lean_to_the_left() -> None:
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.0), roll_rad=0.2)
+    body = torch.tensor([[0.0, 5.0, 0.0], [0.0, 5.0, 2.0]], dtype=torch.float64)
+    (feet, head), _ = project(body, 500.0, (320.0, 180.0), camera_to_world(camera))
+    # 100 px below and above the middle, turned by 0.2 rad.
+    assert head.tolist() == pytest.approx([320 - 100 * math.sin(0.2), 180 - 100 * math.cos(0.2)])
+    assert feet.tolist() == pytest.approx([320 + 100 * math.sin(0.2), 180 + 100 * math.cos(0.2)])
 
 
 def test_back_projection_is_the_inverse() -> None:

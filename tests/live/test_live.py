@@ -235,7 +235,7 @@ def test_missed_frames_are_bridged_and_counted(walk: Tensor) -> None:
     for index, frame in enumerate(walk):
         new = live.miss() if index % 3 == 2 else live.push(frame)
     assert live.missed == FRAMES // 3
-    assert new.index == FRAMES - 1
+    assert new.number == FRAMES - 1
     assert new.people[0].present
     assert float(new.people[0].joints[8, 1]) == pytest.approx(3.0 + 0.6 * 5.9, abs=0.4)
 

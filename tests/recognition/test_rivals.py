@@ -37,9 +37,18 @@ class TestMRWCN(StageTester):
         shape = (*batch, 2, self.height, self.width)
         return (torch.rand(shape, generator=generator, dtype=torch.float64).to(dtype),)
 
+    # Nine networks of the same few layers: what takes seconds each is for the slow suite.
     @pytest.mark.slow
     def test_exports(self) -> None:
         super().test_exports()
+
+    @pytest.mark.slow
+    def test_scripted_equals_eager(self) -> None:
+        super().test_scripted_equals_eager()
+
+    @pytest.mark.slow
+    def test_gradients_against_finite_differences(self) -> None:
+        super().test_gradients_against_finite_differences()
 
     def test_channels_last(self) -> None:
         """The layout that the training loop gives networks changes nothing."""

@@ -143,7 +143,7 @@ def test_learns(pool: MotionPool) -> None:
 
 
 def test_scores_of_the_truth_are_perfect(pool: MotionPool, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = next(views(pool, ("activities",), errors=False))
+    seen = next(views(pool, ("joined poses",), errors=False))
     monkeypatch.setattr(
         "tensorsim.training.lifter_scores.lifted", lambda make, people: (people.joints, people.valid)
     )

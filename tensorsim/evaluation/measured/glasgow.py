@@ -191,18 +191,6 @@ def read(folder: Path) -> tuple[Tensor, Tensor]:
     return masks[:, ROWS], labels
 
 
-def read_ranges(folder: Path) -> Tensor:
-    """Pictures (N, 1, 40, 64) over Doppler (+-156 Hz) and range of the same clips as :func:`read` gives."""
-    with np.load(folder / "masks.npz") as file:
-        masks = torch.from_numpy(np.unpackbits(file["dr_packed"], axis=-1).astype(bool))
-    return F.avg_pool2d(masks[:, 88:168].float().unsqueeze(1), (2, 4))
-
-
-def augment_ranges(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Pictures over Doppler and range, moved in range, with cells missing."""
-    return drop_cells(shift(shown, 6, -1, generator), 0.05, generator)
-
-
 def pictures(masks: Tensor) -> Tensor:
     """Masks (N, 128, 256) to pictures (N, 1, 40, 64) of +-156 Hz, without the filter's start in the first columns."""
     shown = masks[:, 24:104].float()

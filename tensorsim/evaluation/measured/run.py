@@ -28,23 +28,17 @@ def few(labels: Tensor, shots: int) -> Tensor:
     return torch.cat(chosen)
 
 
-def lda_logits(train: list[Tensor], labels: Tensor, test: list[Tensor], classes: int) -> Tensor:
-    """Log-probabilities (N, classes) of scikit-learn's LDA with shrinkage on pictures of half the height and width.
-
-    The pictures of all maps of a clip together are its features.
-    """
+def lda_logits(train: Tensor, labels: Tensor, test: Tensor, classes: int) -> Tensor:
+    """Log-probabilities (N, classes) of scikit-learn's LDA with shrinkage on pictures of half the height and width."""
     try:
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     except ImportError as error:
         raise TensorsimError(
             f"LDA: scikit-learn does not import ({error}); install tensorsim[train]"
         ) from error
-    halved = [
-        [torch.nn.functional.avg_pool2d(x, 2).flatten(1) for x in pictures] for pictures in (train, test)
-    ]
-    features = [torch.cat(parts, 1).double().numpy() for parts in halved]
+    features = [torch.nn.functional.avg_pool2d(x, 2).flatten(1).double().numpy() for x in (train, test)]
     model = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features[0], labels.numpy())
-    logits = torch.full((len(test[0]), classes), -100.0)
+    logits = torch.full((len(test), classes), -100.0)
     logits[:, torch.as_tensor(model.classes_)] = torch.from_numpy(
         model.predict_log_proba(features[1]).clip(min=-100.0)
     ).float()
@@ -79,7 +73,6 @@ class Experiment:
         self.clips, self.steps, self.seed, self.quiet = clips, steps, seed, quiet
         self.train, self.train_labels = measured.load(train)
         self.test, self.test_labels = measured.load(test)
-        self.train_beside, self.test_beside = measured.load_beside(train), measured.load_beside(test)
 
     def quick(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips by the shipped weights."""
@@ -97,11 +90,10 @@ class Experiment:
         chosen = few(self.train_labels, SHOTS)
         everything = torch.arange(len(self.train_labels))
         logits = {"simulation_only": predict(net, self.test)}
-        logits["ten_shot"] = self._measured_logits(net, chosen, self.steps // 2)
-        logits["ten_shot_alone"] = self._measured_logits(None, chosen, self.steps // 2)
-        logits["all"] = self._measured_logits(net, everything, 3 * self.steps // 2)
-        maps = [[x for x in pair if x is not None] for pair in self._maps()]
-        logits["lda"] = lda_logits(maps[0], self.train_labels, maps[1], len(self.measured.classes))
+        logits["ten_shot"] = self._measured_logits(net, chosen, self.steps // 2, 1e-3)
+        logits["ten_shot_alone"] = self._measured_logits(self._new(), chosen, self.steps // 2, 3e-3)
+        logits["all"] = self._measured_logits(net, everything, self.steps, 2e-3)
+        logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
         return logits
 
     def ablation(self) -> dict[str, Tensor]:
@@ -120,29 +112,11 @@ class Experiment:
         fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=self.seed)
         return net
 
-    def _maps(self) -> tuple[tuple[Tensor, Tensor | None], tuple[Tensor, Tensor | None]]:
-        """Pictures of both maps, of train and of test."""
-        return (self.train, self.train_beside), (self.test, self.test_beside)
-
-    def _measured_logits(self, net: PictureNet | None, chosen: Tensor, steps: int) -> Tensor:
-        """Log-probabilities (N, classes) of the test clips by networks that learned from chosen clips of train.
-
-        A copy of ``net`` goes on at a third of the learning rate; None begins anew. Where the clips have another map,
-        a second network learns that alone, and the log-probabilities of both are added.
-        """
-        labels = self.train_labels[chosen]
-        learner = self._new() if net is None else copy.deepcopy(net)
+    def _measured_logits(self, net: PictureNet, chosen: Tensor, steps: int, learning_rate: float) -> Tensor:
+        """Logits (N, classes) of the test clips by a copy of ``net`` that goes on with chosen clips of train alone."""
+        learner = copy.deepcopy(net)
         fit_pictures(
-            learner, self.train[chosen], labels, steps=steps, augment=self.measured.augment_measured,
-            learning_rate=3e-3 if net is None else 1e-3, seed=self.seed,
+            learner, self.train[chosen], self.train_labels[chosen], steps=steps,
+            augment=self.measured.augment_measured, learning_rate=learning_rate, seed=self.seed,
         )  # fmt: skip
-        logits = predict(learner, self.test).log_softmax(-1)
-        beside = self.measured.beside
-        if beside is not None and self.train_beside is not None and self.test_beside is not None:
-            torch.manual_seed(self.seed)
-            second = PictureNet(len(self.measured.classes), self.train_beside.shape[-2])
-            fit_pictures(
-                second, self.train_beside[chosen], labels, steps=steps, augment=beside.augment, seed=self.seed
-            )
-            logits = logits + predict(second, self.test_beside).log_softmax(-1)
-        return logits
+        return predict(learner, self.test)

@@ -19,19 +19,6 @@ _CHUNK = 10
 
 
 @dataclass(frozen=True)
-class Beside:
-    """Another map of measured clips.
-
-    Attributes:
-        read: folder -> pictures (N, 1, rows, columns), clips in the order of ``MeasuredSet.read``.
-        augment: changes of pictures in training.
-    """
-
-    read: Callable[[Path], Tensor]
-    augment: Augment
-
-
-@dataclass(frozen=True)
 class MeasuredSet:
     """A measured set and its simulation.
 
@@ -47,7 +34,6 @@ class MeasuredSet:
         augment: changes of pictures in training.
         weights: name of the shipped weights.
         augment_measured: changes of measured pictures in training.
-        beside: another map of the measured clips, which the simulation does not make; None where there is none.
     """
 
     name: str
@@ -61,7 +47,6 @@ class MeasuredSet:
     augment: Augment
     weights: str
     augment_measured: Augment
-    beside: "Beside | None" = None
 
     def load(self, folder: Path) -> tuple[Tensor, Tensor]:
         """Pictures (N, 1, H, W) and labels (N,) of this set in a folder of measured sets.
@@ -69,29 +54,18 @@ class MeasuredSet:
         Raises:
             TensorsimError: the file is not there, is damaged, or holds no clips.
         """
-        maps, labels = self._read(folder, self.read)
-        if len(labels) == 0:
-            raise TensorsimError(f"{folder / self.name / self.file}: got no clips, expected at least one")
-        return self.pictures(maps), labels
-
-    def load_beside(self, folder: Path) -> Tensor | None:
-        """Pictures (N, 1, rows, columns) of the other map of the same clips; None where there is none.
-
-        Raises:
-            TensorsimError: as :meth:`load`.
-        """
-        return None if self.beside is None else self._read(folder, self.beside.read)
-
-    def _read(self, folder: Path, read: Callable[[Path], Any]) -> Any:
         path = folder / self.name / self.file
         if not path.is_file():
             raise TensorsimError(f"{path}: no such file, expected the measured clips of {self.name}")
         try:
-            return read(path.parent)
+            maps, labels = self.read(path.parent)
         except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
             raise TensorsimError(
                 f"{path}: not the measured clips of {self.name} ({type(error).__name__}: {error})"
             ) from error
+        if len(labels) == 0:
+            raise TensorsimError(f"{path}: got no clips, expected at least one")
+        return self.pictures(maps), labels
 
     @property
     def effect_names(self) -> tuple[str, ...]:
@@ -138,7 +112,6 @@ SETS: tuple[MeasuredSet, ...] = (
         glasgow.augment,
         "measured-glasgow",
         glasgow.augment_measured,
-        Beside(glasgow.read_ranges, glasgow.augment_ranges),
     ),
     MeasuredSet(
         "kmkim_cw24_iq",

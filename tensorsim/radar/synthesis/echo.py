@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
-from tensorsim.errors import TensorsimError, check_scene
+from tensorsim.errors import TensorsimError, check_scatterers, check_scene
 from tensorsim.ops import flatten_batch, unflatten_batch
 from tensorsim.radar.synthesis.dechirp import beat_sum, dispersed_sum
 from tensorsim.radar.synthesis.paths import Paths, PropagationPaths, Resonance, chosen_paths
@@ -123,11 +123,12 @@ class EchoSynthesizer(nn.Module):
 
     @torch.jit.export
     def target_echo(self, positions: Tensor, rcs: Tensor, step: Tensor | None = None) -> Tensor:
-        """Echo of the targets alone, without input checks and without pulse chunks.
+        """Echo of the targets alone, without pulse chunks.
 
         (..., S, 3) m and (..., S) m^2 -> (..., N); several antennas (..., M, S, 3) -> (..., V, M, N). ``step``:
         see :meth:`PropagationPaths.forward <tensorsim.radar.synthesis.paths.PropagationPaths.forward>`.
         """
+        check_scatterers(positions, rcs)
         paths = self.paths(positions.double(), rcs.double(), step)
         if self.paths.airy:
             resonance = self.paths.resonance(positions.double(), step)

@@ -46,7 +46,7 @@ class CameraEstimate(NamedTuple):
 
 
 def camera_config(found: CameraEstimate) -> CameraConfig:
-    """The camera of one clip above the origin, looking along +y; CameraConfig has no roll.
+    """The camera of one clip above the origin, looking along +y.
 
     Args:
         found: of one clip, fields of one element.
@@ -55,6 +55,7 @@ def camera_config(found: CameraEstimate) -> CameraConfig:
         horizontal_fov_rad=float(found.horizontal_fov_rad),
         position_m=(0.0, 0.0, float(found.height_m)),
         pitch_rad=float(found.pitch_rad),
+        roll_rad=float(found.roll_rad),
     )
 
 
@@ -63,8 +64,10 @@ class CameraCalibrator(nn.Module):
 
     People are upright bodies of known or typical height on a level floor (see
     :mod:`tensorsim.vision.calibration.camera_fit`). Where they tell little, the estimate stays near what is assumed
-    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 +- 0.7 m, field of view 60 +- 15 degrees); somebody who
-    walks through the scene tells everything. The height of the camera goes with that of the people.
+    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 20
+    degrees); somebody who walks through the scene tells everything. The height of the camera goes with that of the
+    people. However long somebody stays at one place, that is one observation: errors of key points there do not average
+    out.
 
     Args:
         person_height_m: standing heights by order of person; the last one serves all further people.
@@ -110,15 +113,18 @@ class CameraCalibrator(nn.Module):
         self.lean, self.pace, self.pace_spread = LEAN, PACE, PACE_SPREAD
         self.correlation_s = 0.4  # after which the errors of a body are no longer those of before
         self.smoothing_s = 0.15
-        mean = [0.0, 0.0, 1.5, 60 * degree]
-        deviation = [20 * degree, 3 * degree, 0.7, 20 * degree]
+        self.path = 0.5  # body heights in the image after which somebody is seen anew
+        mean = [0.0, 0.0, math.log(1.5), 60 * degree]
+        deviation = [20 * degree, 3 * degree, 0.45, 20 * degree]
         self.register_buffer("standing", torch.tensor(STANDING, dtype=torch.float64), persistent=False)
         self.register_buffer("walking", torch.tensor(WALKING, dtype=torch.float64), persistent=False)
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float64), persistent=False)
         self.register_buffer("deviation", torch.tensor(deviation, dtype=torch.float64), persistent=False)
         self.register_buffer("stature", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
         starts = [
-            [pitch * degree, 0.0, 1.5, fov * degree] for pitch in (0, -12, -25, -40) for fov in (45, 60, 80)
+            [pitch * degree, 0.0, math.log(1.5), fov * degree]
+            for pitch in (0, -12, -25, -40)
+            for fov in (45, 60, 80)
         ]
         self.register_buffer("starts", torch.tensor(starts, dtype=torch.float64), persistent=False)
 
@@ -164,7 +170,7 @@ class CameraCalibrator(nn.Module):
                     )
                 )
         if clips == 0:
-            table = torch.cat([self.mean, self.deviation, self.mean.new_zeros(1)])
+            table = self._row(self.mean, self.deviation, self.mean.new_zeros(1))
             table = table.expand(list(shape) + [9])  # noqa: RUF005  # TorchScript has no stars
         else:
             table = torch.stack(found).reshape(list(shape) + [9])  # noqa: RUF005
@@ -211,10 +217,30 @@ class CameraCalibrator(nn.Module):
         mean = torch.cat([self.mean, nothing, pace])
         deviation = torch.cat([self.deviation, self.height_sd_m / stature, nothing + self.pace_spread])
         rest = torch.cat([nothing, pace]).expand(self.starts.shape[0], -1)
-        independent = min(every / (self.correlation_s * fps), 1.0)
+        independent = self._independent(ends, upright, every / fps)
         at, covariance, cost = fit_camera(
             torch.cat([self.starts, rest], dim=-1), mean, deviation, bodies, fps / every, independent
         )
         best = int(cost.argmin())
-        sd = torch.diagonal(covariance[best])[:4].sqrt()
-        return torch.cat([at[best, :4], sd, count])
+        return self._row(at[best, :4], torch.diagonal(covariance[best])[:4].sqrt(), count)
+
+    def _row(self, at: Tensor, sd: Tensor, count: Tensor) -> Tensor:
+        """Pitch, roll, height in m, field of view, their deviations, and the number of frames (9,)."""
+        height = at[2:3].exp()
+        return torch.cat([at[:2], height, at[3:], sd[:2], height * sd[2:3], sd[3:], count])
+
+    def _independent(self, ends: Tensor, upright: Tensor, dt: float) -> Tensor:
+        """Independent observations per frame (P, 1, 1): one at the start, one for each :attr:`path` on the way.
+
+        Args:
+            ends: (P, T, 2, 2) pixels.
+            upright: (P, T) bool.
+            dt: seconds between frames.
+        """
+        step = max(int(self.correlation_s / dt + 0.5), 1)
+        at, there = ends[:, ::step], upright[:, ::step]
+        size = torch.linalg.vector_norm(at[..., 0, :] - at[..., 1, :], dim=-1).clamp(min=1.0)
+        way = torch.linalg.vector_norm(at[:, 1:] - at[:, :-1], dim=-1).amax(dim=-1) / size[:, 1:]
+        path = (way * (there[:, 1:] & there[:, :-1]).to(way.dtype)).sum(dim=-1)
+        share = (1.0 + path / self.path) / upright.sum(dim=-1).clamp(min=1)
+        return share.clamp(max=min(dt / self.correlation_s, 1.0))[:, None, None]

@@ -6,6 +6,7 @@ on the floor that places them best in the image is linear least squares; what is
 several places the horizon, the lean of bodies beside the middle the nadir, both together the focal length.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -86,8 +87,8 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     """Residuals of upright bodies and of their walking speeds, in standard deviations.
 
     Args:
-        parameters: (..., 4 + 2 P): pitch, roll, height of the camera, horizontal field of view, then for each person
-            the logarithms of the factor on the body height and of the walking speed.
+        parameters: (..., 4 + 2 P): pitch, roll, logarithm of the height of the camera in m, horizontal field of view,
+            then for each person the logarithms of the factor on the body height and of the walking speed.
         bodies: what is seen.
         fps: frames per second.
 
@@ -97,11 +98,12 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     people, frames = bodies.upright.shape[0], bodies.upright.shape[1]
     axes = camera_axes(parameters[..., 0], parameters[..., 1])
     focal = 1.0 / torch.tan(parameters[..., 3] / 2)
+    height = parameters[..., 2].exp()
     factor = parameters[..., 4 : 4 + people].exp()
     pace = parameters[..., 4 + people :].exp()
     above_floor = bodies.above_floor * factor[..., None, None]
     nowhere = torch.zeros_like(bodies.image)
-    spot, _ = place_upright(axes, parameters[..., 2], focal, bodies.image, above_floor, nowhere)
+    spot, _ = place_upright(axes, height, focal, bodies.image, above_floor, nowhere)
 
     # Where people go, over one second: the first and last half second go as the frames beside them.
     span = max(min(int(fps + 0.5), frames - 1), 1)
@@ -114,7 +116,7 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     moves = bodies.walking * known.to(spot.dtype)
     ahead = way / distance.clamp(min=0.3)[..., None] * (moves * bodies.lean_m[:, None])[..., None]
     beside = torch.stack([torch.zeros_like(ahead), ahead], dim=-2)
-    _, seen = place_upright(axes, parameters[..., 2], focal, bodies.image, above_floor, beside)
+    _, seen = place_upright(axes, height, focal, bodies.image, above_floor, beside)
 
     away = (seen - bodies.image) / bodies.noise[..., None, None]
     away = torch.where(bodies.upright[..., None, None], away, 0.0).flatten(-2)
@@ -165,7 +167,7 @@ def fit_camera(
     deviation: Tensor,
     bodies: Bodies,
     fps: float,
-    share: float,
+    share: Tensor,
     rounds: int = 25,
     outlier: float = 2.5,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -175,7 +177,7 @@ def fit_camera(
         start: (S, 4 + 2 P) parameters, see :func:`misfit`.
         mean, deviation: (4 + 2 P,) of the priors.
         bodies, fps: see :func:`misfit`.
-        share: how much each frame counts; successive frames are not independent.
+        share: (P, 1, 1) how much each frame of a person counts; successive frames are not independent.
         rounds: steps.
         outlier: residual in standard deviations beyond which a body or a speed is doubted.
 
@@ -209,17 +211,17 @@ def fit_camera(
 
 
 def _cost(
-    at: Tensor, residual: Tensor, mean: Tensor, deviation: Tensor, share: float, outlier: float
+    at: Tensor, residual: Tensor, mean: Tensor, deviation: Tensor, share: Tensor, outlier: float
 ) -> Tensor:
     """Negative logarithm of the posterior (S,) but for a constant."""
-    loss = share * robust(residual, outlier)[0].flatten(1).sum(dim=-1)
+    loss = (share * robust(residual, outlier)[0]).flatten(1).sum(dim=-1)
     return loss + 0.5 * ((at - mean) / deviation).square().sum(dim=-1)
 
 
 def _feasible(parameters: Tensor) -> Tensor:
-    """Cameras between 0.1 and 10 m above the floor with fields of view of 15 to 150 degrees, tilted below 80."""
-    low = [-1.4, -0.8, 0.1, 0.26]
-    high = [1.4, 0.8, 10.0, 2.6]
+    """Cameras between 0.3 and 10 m above the floor with fields of view of 15 to 150 degrees, tilted below 80."""
+    low = [-1.4, -0.8, math.log(0.3), 0.26]
+    high = [1.4, 0.8, math.log(10.0), 2.6]
     columns = [parameters[..., i : i + 1].clamp(low[i], high[i]) for i in range(4)]
     columns.append(parameters[..., 4:])
     return torch.cat(columns, dim=-1)

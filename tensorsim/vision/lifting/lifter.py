@@ -40,6 +40,15 @@ def fit_poses(keypoints: Tensor, weights: Tensor, poses: Tensor) -> tuple[Tensor
     return scale, placed, distance
 
 
+def rolled(keypoints: Tensor, angle: float) -> Tensor:
+    """Pixels (..., 2) turned clockwise (u right, v down) by ``angle`` in radians about the origin of the picture."""
+    if angle == 0.0:
+        return keypoints
+    cos, sin = math.cos(angle), math.sin(angle)
+    u, v = keypoints[..., 0], keypoints[..., 1]
+    return torch.stack([cos * u - sin * v, sin * u + cos * v], dim=-1)
+
+
 def smooth_assignment(emission: Tensor, transition: Tensor) -> Tensor:
     """Posterior of a hidden Markov chain over candidates (forward-backward in logarithms).
 
@@ -83,6 +92,7 @@ class NearestPoseLifter(nn.Module):
             body heights and by 1 % of the size; 0 treats frames alone.
         chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair.
         pitch_rad: upward tilt of the camera; depths are along its optical axis.
+        roll_rad: turn of the camera about it, see :class:`tensorsim.CameraConfig`.
 
     Shape:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
@@ -104,6 +114,7 @@ class NearestPoseLifter(nn.Module):
         temporal: float = 1.0,
         chunk: int = 2**22,
         pitch_rad: float = 0.0,
+        roll_rad: float = 0.0,
     ) -> None:
         super().__init__()
         poses = load_pose_library() if library is None else standardise_poses(library)
@@ -124,13 +135,14 @@ class NearestPoseLifter(nn.Module):
         # walks at 1.2 m/s, in relative size. Sizes that change faster than bodies can move are wrong matches.
         self.change, self.size_change = 0.03, 0.01
         self.search = PoseSearch(poses, yaws, neighbours, chunk, pitch_rad)
+        self.roll_rad = float(roll_rad)
 
-    def tilted(self, pitch_rad: float) -> "NearestPoseLifter":
-        """The same for a camera of another tilt."""
+    def tilted(self, pitch_rad: float, roll_rad: float = 0.0) -> "NearestPoseLifter":
+        """The same for a camera of another tilt and roll."""
         search = self.search
         return NearestPoseLifter(
             search.library, search.yaws, self.neighbours, self.search_joints, self.tolerance, self.temporal,
-            search.chunk, pitch_rad,
+            search.chunk, pitch_rad, roll_rad,
         ).to(search.library.device)  # fmt: skip
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
@@ -150,6 +162,7 @@ class NearestPoseLifter(nn.Module):
         shape, frames = keypoints.shape, keypoints.shape[-3]
         tracks = keypoints[..., 0, 0, 0].numel()
         keypoints, weights = keypoints.reshape(tracks, frames, 14, 2), weights.reshape(tracks, frames, 14)
+        keypoints = rolled(keypoints, self.roll_rad)  # as a level camera would see them
         seen = (weights > 0).sum(dim=-1)
         placeable = seen >= 2
         source = nearest_valid(placeable)
@@ -169,7 +182,7 @@ class NearestPoseLifter(nn.Module):
         return Lifted(
             depth=(share[..., None] * poses[..., 1]).sum(dim=2).reshape(shape[:-1]),
             scale=(share * scale).sum(dim=2).reshape(shape[:-2]),
-            keypoints=(share[..., None, None] * placed).sum(dim=2).reshape(shape),
+            keypoints=rolled((share[..., None, None] * placed).sum(dim=2), -self.roll_rad).reshape(shape),
             nearest=index[..., 0].reshape(shape[:-2]),
             distance=distance[..., 0].reshape(shape[:-2]),
         )

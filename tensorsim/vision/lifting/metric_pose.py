@@ -11,13 +11,20 @@ from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive
 from tensorsim.geometry.camera import back_project, camera_to_world
 from tensorsim.types import Lifted
+from tensorsim.vision.lifting.floor import (
+    floor_under,
+    fused_range,
+    looks_bent,
+    lowered,
+    lowest_ankle,
+    range_on_floor,
+    upright_share,
+)
 from tensorsim.vision.smoothing.along_time import (
     fill_gaps,
-    local_linear,
     masked_median,
     nearest_valid,
     robust_smooth,
-    running_quantile,
 )
 
 #: Initial distances of the original's panel by person; the paper's mode cannot do without.
@@ -58,16 +65,6 @@ def accumulated_displacement(u: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
     return F.pad(steps.cumsum(dim=-1), [1, 0])
 
 
-def lowest_ankle(joints: Tensor) -> Tensor:
-    """Height of the lower ankle (joints 10 and 13): (..., 14, 3) -> (...)."""
-    return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])
-
-
-def lowered(joints: Tensor, drop: Tensor) -> Tensor:
-    """Joints (..., 14, 3) moved down by ``drop`` (...)."""
-    return torch.cat([joints[..., :2], joints[..., 2:] - drop[..., None, None]], dim=-1)
-
-
 def paper_pose(image: Tensor, lifted: Lifted, valid: Tensor, height: Tensor, distance: Tensor) -> Tensor:
     """Joints (..., P, T, 14, 2) of the image to the world as in the paper; see :class:`MetricPose`."""
     v = image[..., 1]
@@ -86,12 +83,14 @@ class MetricPose(nn.Module):
 
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
-    joints relative to the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm. Each joint lies on
+    joints relative to the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm. The less upright a
+    body is, the more its range is that at which its lowest joint rests on the floor where the person stood
+    (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on
     its line of sight at its own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not
     know (people who lie), do not give a reliable size: they take that of the others, and one of few joints that would
     make a body of less than 0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The
-    floor is a low running quantile of the height of the lower ankle, so that it stays through a jump and an outlier
-    does not move it.
+    floor is a low running quantile of the height of the lower ankle where they stand, so that it stays through a jump
+    and an outlier does not move it.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
     joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
@@ -216,7 +215,15 @@ class MetricPose(nn.Module):
             whole = valid & many & (lifted.distance < self.poor_fit)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid & many)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
+            center = self._center_px(keypoints, image_height, image_width)
             hips_range = camera_range(focal, height, scale) - height * offset
+            image = torch.where(seen[..., None], keypoints, lifted.keypoints)
+            depth = height[..., None] * lifted.depth
+            # What is found at the lower edge of the picture is cut off by it, and no foot on the floor.
+            inside = seen & (keypoints[..., 1] < 0.97 * image_height)
+            hips_range, whole, stands = self._on_floor(
+                hips_range, image, depth, focal, center, pose, height, inside, whole, fps
+            )
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
             body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
@@ -226,12 +233,10 @@ class MetricPose(nn.Module):
             middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)
             placed = middle + (body_px / scale)[..., None, None] * (lifted.keypoints - middle)
             image = torch.where(seen[..., None], keypoints, placed)
-            depth = hips_range[..., None] + height[..., None] * lifted.depth
-            joints = back_project(
-                image, depth, focal, self._center_px(image, image_height, image_width), pose
-            )
+            joints = back_project(image, hips_range[..., None] + depth, focal, center, pose)
             if not self.calibrated:
-                joints = lowered(joints, self._floor(joints, valid, fps))
+                stands = torch.where(stands.any(dim=-1, keepdim=True), stands & valid, valid)
+                joints = lowered(joints, floor_under(joints, stands, fps, self.floor_window_s))
         joints = joints.gather(-3, nearest_valid(valid)[..., None, None].expand_as(joints))
         return joints * valid.any(dim=-1)[..., None, None, None], seen
 
@@ -268,12 +273,48 @@ class MetricPose(nn.Module):
         early = valid & (since <= max(int(0.5 * fps), 1))
         return masked_median(scale * (distance / height + offset), early).clamp(min=1.0).expand_as(scale)
 
-    def _floor(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
-        """Height of the floor under each person, (..., P, T)."""
-        low = fill_gaps(lowest_ankle(joints), valid)
-        window = int(self.floor_window_s * fps)
-        low = running_quantile(low, window, 0.15)
-        return local_linear(low, torch.ones_like(low), max(0.2 * window, 0.5))
+    def _on_floor(
+        self,
+        by_size: Tensor,
+        image: Tensor,
+        depth: Tensor,
+        focal: Tensor,
+        center: Tensor,
+        pose: Tensor,
+        height: Tensor,
+        seen: Tensor,
+        whole: Tensor,
+        fps: float,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Range of the hips (..., P, T) from the size of the body or, where it is not upright, from the floor.
+
+        Also which frames tell it, and in which of them the person stands.
+        """
+        bent = looks_bent(image, seen)
+        straight = whole & ~bent
+        straight = torch.where(straight.any(dim=-1, keepdim=True), straight, whole)
+        smooth = robust_smooth(by_size, straight, self.range_smoothing_s * fps)
+        smooth = torch.where(straight, smooth, by_size)
+        joints = back_project(image, smooth[..., None] + depth, focal, center, pose)
+        upright = upright_share(joints, height.expand_as(by_size)) * (~bent).to(joints.dtype)
+        # Without feet the lowest joint that is seen may be anything.
+        feet = seen[..., 10] | seen[..., 13]
+        # The floor is where this person stood last, or will stand next.
+        stands = whole & feet & (upright >= 0.9)
+        ankle = robust_smooth(lowest_ankle(joints), stands, self.floor_window_s * fps)
+        floor = fill_gaps(ankle, stands)
+        ahead = torch.cat(
+            [(image - center) / focal[..., None, None], torch.ones_like(image[..., :1])], dim=-1
+        )
+        rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
+        by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
+        # Nobody falls further than by two fifths of the range.
+        stood = fill_gaps(smooth, stands)
+        near = stands.any(dim=-1, keepdim=True) & ((by_floor - stood).abs() < 0.4 * stood)
+        by_floor = torch.where(near, by_floor, torch.full_like(by_floor, float("inf")))
+        error_m = torch.full_like(floor, 0.06)
+        fused, share = fused_range(by_size, upright, by_floor, gain, error_m)
+        return fused, whole | (seen.any(dim=-1) & (share > 0.5)), stands
 
 
 def _check(

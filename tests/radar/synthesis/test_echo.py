@@ -222,3 +222,17 @@ def test_bad_arguments():
         EchoSynthesizer(FREE, pulse_chunk=0)
     with pytest.raises(TensorsimError, match="wall_paths"):
         EchoSynthesizer(FREE, wall_paths="all")
+
+
+@pytest.mark.parametrize(
+    ("scale", "rcs", "message"),
+    [
+        (1.0, -1.0, "rcs: got a minimum of -1.0"),
+        (math.nan, 1.0, "positions: got NaN"),
+        (1.0, math.inf, "rcs: got NaN or infinite"),
+    ],
+)
+def test_echo_of_the_targets_refuses_what_has_no_echo(scale, rcs, message):
+    positions = scale * torch.tensor([[0.0, 3.0, 1.0], [0.0, 4.0, 1.0]])
+    with pytest.raises(TensorsimError, match=message):
+        EchoSynthesizer(FREE).target_echo(positions, torch.tensor([1.0, rcs]))

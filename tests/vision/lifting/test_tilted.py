@@ -14,7 +14,7 @@ from tensorsim.geometry.camera import camera_to_world, focal_length, principal_p
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.pipeline import VideoToPose
 from tensorsim.types import Tracks
-from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.lifter import NearestPoseLifter, rolled
 from tensorsim.vision.lifting.pose_library import load_pose_library, seen_from
 
 HEIGHT, WIDTH, FPS = 480, 640, 30.0
@@ -70,3 +70,21 @@ def test_other_parts_know_no_camera() -> None:
     stage = VideoToPose(nn.Identity(), nn.Identity(), lifter=nn.Identity())
     with pytest.raises(TensorsimError, match="got Identity and MetricPose"):
         stage.seen_by(CameraConfig())
+
+
+def test_a_rolled_camera_lifts_as_a_level_one_does() -> None:
+    """Key points turned about the middle of the picture, as by a camera that is turned the other way."""
+    generator = torch.Generator().manual_seed(0)
+    library = torch.randn(40, 14, 3, generator=generator)
+    level = NearestPoseLifter(library, yaws=4, neighbours=4)
+    image = 100.0 * torch.randn(6, 14, 2, generator=generator) + 300.0
+    angle = 0.3
+    turned = rolled(image, -angle)
+    cos, sin = math.cos(angle), math.sin(angle)
+    rotation = torch.tensor([[cos, -sin], [sin, cos]])  # u right, v down: counter-clockwise by angle
+    torch.testing.assert_close(turned, image @ rotation)
+    weights = torch.ones(6, 14)
+    expected, found = level(image, weights), level.tilted(0.0, angle)(turned, weights)
+    torch.testing.assert_close(found.depth, expected.depth, atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(found.scale, expected.scale, atol=1e-2, rtol=1e-4)
+    torch.testing.assert_close(rolled(found.keypoints, angle), expected.keypoints, atol=1e-2, rtol=1e-4)

@@ -1,0 +1,77 @@
+"""``tensorsim train everyday``: train an activity classifier on everyday motion, as films show it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tensorsim.commands.options import check_seed
+from tensorsim.commands.training import TrainOptions
+from tensorsim.errors import TensorsimError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainEveryday(TrainOptions):
+    """Train SPNet or SPGNet on pictures of everyday motion in both presets, and calibrate it on held-out ones.
+
+    Run again with the same arguments, it goes on where it stopped. Writes OUT/classifier.safetensors.
+    """
+
+    maps: Path
+    """Folder of pictures; groups that are missing are made first (about 10 s each on one core)."""
+    groups: int = 50
+    """Groups of up to 99 clips and some of an empty scene; every fifth is held out."""
+    maps_seed: int = 0
+    """Of people, motion, cameras and errors of the pictures."""
+    network: Literal["spnet", "spgnet"] = "spgnet"
+    """SPGNet (s2p6) on 32x32 pictures, or SPNet."""
+    size: int | None = None
+    """Height and width of the pictures, a divisor of 64; 32 for SPGNet and 64 for SPNet if not given."""
+    learning_rate: float = 1e-3
+    """The highest."""
+    epochs: int = 10
+    """Passes over the training pictures."""
+    batch: int = 64
+    """Pictures per step."""
+
+    share: float = 1.0
+    """Of the way from --init to the trained weights that the result has, from 0 to 1: less keeps more of --init."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.training.everyday_classifier import EverydayRecipe, load_between, save_calibrated
+        from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
+
+        check_seed(self.maps_seed, "--maps-seed")
+        if self.groups < 5:
+            raise TensorsimError(
+                f"--groups: got {self.groups}, expected at least 5, of which one is held out"
+            )
+        if not 0 <= self.share <= 1:
+            raise TensorsimError(f"--share: got {self.share}, expected a number from 0 to 1")
+        if self.share < 1 and self.init is None:
+            raise TensorsimError("--share: got no --init, expected the weights to stay near")
+        self.loop(steps=1, batch=self.batch)  # refuses what cannot work before maps are made
+        build_everyday(self.maps, self.groups, EverydaySettings(seed=self.maps_seed), quiet=self.quiet)
+        recipe = EverydayRecipe(
+            self.network,
+            EverydayStore(self.maps, range(self.groups)),
+            self.size,
+            self.seed,
+            self.init,
+            self.learning_rate,
+        )
+        epoch = max(1, len(recipe.training) // self.batch)
+        loop = self.loop(
+            steps=self.epochs * epoch,
+            batch=self.batch,
+            checkpoint_every=min(50, epoch),
+            validate_every=epoch,
+            ema_decay=0.99,
+        )
+        best = self.train(recipe, loop)
+        load_between(recipe.net, best if self.init is None else self.init, best, self.share)
+        path = self.out / "classifier.safetensors"
+        temperature, error = save_calibrated(recipe, path)
+        print(f"{path}: temperature {temperature:.3f}, calibration error of held-out films {error:.3f}")
+        for name, value in recipe.validate(recipe.net).items():
+            print(f"  {name} {value:.3f}")

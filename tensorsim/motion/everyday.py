@@ -1,0 +1,173 @@
+"""Movements of everyday people that count as one of the twelve activities: falls any way, fists swung, balls kicked.
+
+Scripts as in :mod:`.scripts`. Each happens from time 0 on; before it the person stands, or walks up.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, with_gait
+from tensorsim.motion.people import People
+from tensorsim.motion.scripts import toppling
+from tensorsim.motion.timing import bell, minimum_jerk, segment, travel
+
+
+def _share_of(who: People, factor: float) -> Tensor:
+    """A number (B, 1) in [0, 1) of each person's own."""
+    return torch.remainder(who.gait_phase * factor, 1.0)[:, None]
+
+
+def fall_any_way(time: Tensor, who: People) -> Act:
+    """Gives way and topples like a rod about the feet in any direction; stays down.
+
+    Some sink first, with the knees far bent, and some fall stiff; some catch themselves with their arms.
+    """
+    v = Vary(who)
+    tempo = who.tempo[:, None]
+    down = toppling(tempo * time, who.height_m) / 88
+    way = 2 * math.pi * _share_of(who, 7.0)
+    sinking = _share_of(who, 13.0)
+    give = bell(time, 0.0 * v(1.0), v(1.3) / tempo)
+    arms = v(100.0) * _share_of(who, 29.0)
+    bent = 100 * sinking * give + v(30.0) * down
+    hip = REST_HIP * (1 - down) + 0.55 * bent
+    pose = make_pose(
+        time,
+        who,
+        lean=88 * torch.cos(way) * down,
+        pitch=v(25.0) * sinking * give,
+        nod=-20 * torch.cos(way) * down,
+        hip=(hip, v(0.9) * hip),
+        knee=(REST_KNEE * (1 - down) + bent, REST_KNEE * (1 - down) + v(0.9) * bent),
+        flexion=(2 + arms * down, 2 + v(0.8) * arms * down),
+        abduction=(8 + v(30.0) * down, 8 + v(25.0) * down),
+        elbow=(12 + v(40.0) * down, 12 + v(40.0) * down),
+    )
+    pose = pose._replace(roll=pose.roll + math.radians(88.0) * torch.sin(way) * down)
+    upright = 1 - segment(time, 0.0 * v(1.0) + 0.3, 0.9 / tempo)
+    act = on_the_spot(time, pose)
+    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+
+
+def fall_on_knees(time: Tensor, who: People) -> Act:
+    """Drops onto the knees, then forward onto the hands or the chest; stays down."""
+    v = Vary(who)
+    tempo = who.tempo[:, None]
+    drop, wait, over = v(0.55) / tempo, v(0.25), v(0.7) / tempo
+    kneel = ((time / drop).clamp(0.0, 1.0)) ** 2
+    prone = minimum_jerk(((time - drop - wait) / over).clamp(0.0, 1.0))
+    far = 0.55 + 0.45 * (_share_of(who, 13.0) > 0.3)
+    arms = 2 + v(25.0) * kneel + v(110.0) * prone
+    pose = make_pose(
+        time,
+        who,
+        lean=88 * far * prone,
+        pitch=v(20.0) * kneel * (1 - prone),
+        nod=-30 * prone,
+        hip=(REST_HIP + v(10.0) * kneel * (1 - prone), REST_HIP + v(14.0) * kneel * (1 - prone)),
+        knee=(
+            REST_KNEE + (v(100.0) - REST_KNEE) * kneel * (1 - 0.8 * prone),
+            REST_KNEE + (v(100.0) - REST_KNEE) * kneel * (1 - 0.8 * prone),
+        ),
+        flexion=(arms, arms),
+        elbow=(12 + v(30.0) * kneel, 12 + v(30.0) * kneel),
+    )
+    act = on_the_spot(time, pose)
+    upright = 1 - segment(time, 0.0 * drop, drop)
+    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+
+
+def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
+    """Walks up, loses hold at time 0 and falls forward or to a side; stays down."""
+    v = Vary(who)
+    tempo = who.tempo[:, None]
+    down = toppling(tempo * time, who.height_m) / 88
+    way = math.pi * (_share_of(who, 7.0) - 0.5)
+    give = bell(time, 0.0 * v(1.0), v(1.2) / tempo)
+    bent = v(60.0) * _share_of(who, 13.0) * give
+    rest = 1 - 0.4 * down
+    arms = 2 + v(110.0) * minimum_jerk(down)
+    base = make_pose(
+        time,
+        who,
+        lean=88 * torch.cos(way) * down,
+        nod=-30 * down,
+        hip=(rest * REST_HIP + 0.6 * bent, rest * REST_HIP + 0.5 * bent),
+        knee=(rest * REST_KNEE + bent, rest * REST_KNEE + 0.9 * bent),
+        flexion=(arms, arms),
+    )
+    base = base._replace(roll=base.roll + math.radians(88.0) * torch.sin(way) * down)
+    pace = 1 - segment(time, -0.45 + 0.0 * tempo, 0.25 + 0.0 * tempo)
+    path = who.speed_m_s[:, None] * (time - travel(time, -0.45 + 0.0 * tempo, 0.25 + 0.0 * tempo))
+    act = with_gait(time, who, base, pace, path)
+    upright = 1 - segment(time, 0.4 / tempo, 0.9 / tempo)
+    return act._replace(hold=act.hold * upright[..., None], lift=act.lift * upright[..., None], level=upright)
+
+
+def swing_fist(time: Tensor, who: People) -> Act:
+    """Swings one fist out sideways (a backfist) or round to the front (a hook), the trunk turning along, and back.
+
+    Some do it with one arm all the time and some with both in turn.
+    """
+    v = Vary(who)
+    every = v(1.5) / who.tempo[:, None]
+    both = _share_of(who, 13.0) < 0.5
+    hook = _share_of(who, 29.0) < 0.4
+
+    def fist(start: Tensor) -> Tensor:
+        since = time - start
+        since = torch.where(since < 0, since, torch.remainder(since, torch.where(both, 2 * every, every)))
+        out, back = 0.16 * every, 0.26 * every
+        return segment(since, 0 * out, out) - segment(since, out + 0.1 * every, out + 0.1 * every + back)
+
+    right = fist(0 * every)
+    left = torch.where(both, fist(every), 0 * right)
+    twist = v(35.0) * (left - right) * torch.where(hook, -1.0, 1.0)
+    guard, fold = v(45.0), v(120.0)
+    bent = v(20.0)
+    aside, ahead = torch.where(hook, v(35.0), v(80.0)), torch.where(hook, v(75.0), v(20.0))
+    straight = torch.where(hook, v(75.0), v(15.0))
+    pose = make_pose(
+        time,
+        who,
+        pitch=v(6.0),
+        twist=twist,
+        look=-twist,
+        hip=(bent / 2, bent / 2),
+        knee=(bent, bent),
+        flexion=(guard + (ahead - guard) * right, guard + (ahead - guard) * left),
+        abduction=(14 + (aside - 14) * right, 14 + (aside - 14) * left),
+        inward=(25 * (1 - right), 25 * (1 - left)),
+        elbow=(fold + (straight - fold) * right, fold + (straight - fold) * left),
+    )
+    return on_the_spot(time, pose)
+
+
+def kick_ball(time: Tensor, who: People) -> Act:
+    """Walks or runs up to a ball, kicks it at time 0 with a straight swing of the leg, and comes to rest."""
+    v = Vary(who)
+    tempo = who.tempo[:, None]
+    back, through, down = v(0.30) / tempo, v(0.22) / tempo, v(0.5) / tempo
+    drawn = segment(time, -back - 0.1, 0 * back - 0.1) - segment(time, 0 * back - 0.1, through - 0.1)
+    shot = segment(time, 0 * back - 0.1, through) - segment(time, through, through + down)
+    poised = bell(time, -back - 0.1, through + down)
+    swing = v(20.0) * (shot - drawn)
+    base = make_pose(
+        time,
+        who,
+        pitch=v(12.0) * poised - v(15.0) * shot,
+        twist=v(15.0) * (drawn - shot),
+        hip=(REST_HIP - v(28.0) * drawn + v(55.0) * shot, REST_HIP + 5 * poised),
+        knee=(REST_KNEE + v(75.0) * drawn, REST_KNEE + v(12.0) * poised),
+        flexion=(2 - swing, 2 + swing),
+        abduction=(8 + v(15.0) * poised, 8 + v(25.0) * poised),
+        elbow=(12 + 20 * poised, 12 + 20 * poised),
+    )
+    stop, still = -back - 0.2, 0.1 + 0.0 * back
+    pace = 1 - segment(time, stop, still)
+    act = with_gait(time, who, base, pace, who.speed_m_s[:, None] * (time - travel(time, stop, still)))
+    aloft = segment(time, -back - 0.15, -back) - segment(time, through + 0.6 * down, through + down)
+    free = torch.stack([1 - aloft, torch.ones_like(aloft)], dim=-1)
+    return act._replace(hold=act.hold * free, lift=act.lift * free)

@@ -1,0 +1,156 @@
+"""The twelve activities as everyday people do them: any heading, place, moment and speed, from a list of variants."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.config import ACTIVITIES
+from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.measured.motions import (
+    KNOT_HZ,
+    Draw,
+    Unrest,
+    act_out,
+    add_unrest,
+    at_instants,
+    to_and_fro,
+)
+from tensorsim.motion import everyday, exercises, scripts
+from tensorsim.motion.act import Act
+from tensorsim.motion.people import People, PeopleConfig, draw_people
+
+#: Bodies and manners: untrained people, in every heading.
+PEOPLE = PeopleConfig(
+    height_m=(1.5, 1.95), speed_m_s=(0.6, 1.5), heading_rad=math.pi, variation=0.18, tempo=(0.55, 1.05)
+)
+#: Where the middle of a path is: x to either side, and nearest and farthest y, in metres.
+SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
+
+
+class Variant(NamedTuple):
+    """A way to do an activity.
+
+    Attributes:
+        script: what is done.
+        first_s: time of the script at which the movement begins.
+        lasts_s: how long it takes; None for what goes on for as long as it is watched.
+        share: of the clips of its activity.
+        rate: lowest and highest speed of the script's clock.
+    """
+
+    script: Callable[[Tensor, People], Act]
+    first_s: float
+    lasts_s: float | None
+    share: float
+    rate: tuple[float, float] = (0.75, 1.2)
+
+
+#: Variants by index of the activity; nobody is there in the first.
+VARIANTS: tuple[tuple[Variant, ...], ...] = (
+    (),
+    (
+        Variant(scripts.punch, 0.4, None, 0.4),
+        Variant(exercises.box, 0.0, None, 0.25),
+        Variant(everyday.swing_fist, 0.0, None, 0.35),
+    ),
+    (Variant(scripts.kick, 0.4, None, 0.6), Variant(everyday.kick_ball, -0.5, 1.2, 0.4, (0.65, 1.0))),
+    (Variant(scripts.grab, 0.3, None, 0.45), Variant(exercises.pick_up, 0.0, 2.5, 0.55, (0.8, 1.6))),
+    (Variant(scripts.sit_down, 0.8, 1.9, 1.0, (0.8, 1.7)),),
+    (Variant(scripts.stand_up, 0.7, 2.0, 1.0, (0.8, 1.7)),),
+    (Variant(scripts.rotate, 0.0, None, 1.0, (0.7, 1.3)),),
+    (Variant(scripts.walk, 0.0, None, 1.0),),
+    (Variant(scripts.sit_to_walk, 0.4, 2.4, 1.0, (0.75, 1.15)),),
+    (Variant(scripts.walk_to_sit, 0.8, 2.8, 1.0, (0.8, 1.15)),),
+    (Variant(scripts.fall_to_walk, 0.25, 2.6, 1.0, (0.7, 1.2)),),
+    (
+        Variant(scripts.walk_to_fall, 1.3, 1.8, 0.2, (0.9, 1.1)),
+        Variant(everyday.walk_and_fall_any_way, -0.2, 1.8, 0.25, (0.9, 1.1)),
+        Variant(everyday.fall_any_way, 0.0, 1.8, 0.35, (0.9, 1.1)),
+        Variant(everyday.fall_on_knees, 0.0, 1.8, 0.2, (0.8, 1.2)),
+    ),
+)
+
+
+def _began(variant: Variant, duration_s: Tensor, rate: Tensor, draw: Draw) -> Tensor:
+    """Seconds (N, 1) after which a movement begins, such that nearly all of it lies in the clip."""
+    if variant.lasts_s is None:
+        return draw(-1.5, 0.6)
+    spare = (duration_s - 0.9 * variant.lasts_s / rate).clamp(min=0.1)
+    return draw(0.0, 1.0) * spare + draw(-0.1, 0.0)
+
+
+def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, draw: Draw) -> Tensor:
+    """Joints (N, K, 14, 3) at ``KNOT_HZ`` about the origin, turned to the people's headings."""
+    if variant.script is scripts.walk:
+        # Half go straight on, half turn round within some metres.
+        long = torch.where(draw(0.0, 1.0) < 0.5, 20.0, draw(1.5, 4.5))
+        first = torch.where(long > 10, 0.0 * long, draw(0.0, 1.0) * long)
+        return to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
+    rate = draw(*variant.rate)
+    clock = (time - _began(variant, duration_s, rate, draw)) * rate + variant.first_s
+    return act_out(variant.script, clock, people)
+
+
+def everyday_motion(
+    activity: int, count: int, duration_s: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """People who do an activity in ways, headings, places and at moments of their own.
+
+    Args:
+        activity: index of ``tensorsim.ACTIVITIES``, of one in which somebody is there.
+        count: N people.
+        duration_s: (N,) length of each clip.
+        generator: of everything random.
+
+    Returns:
+        Joints (N, K, 14, 3) m at ``KNOT_HZ`` for the longest clip, z up from the floor, and heights (N,) m.
+
+    Raises:
+        TensorsimError: the empty scene, or no such activity.
+    """
+    if not 0 < activity < len(ACTIVITIES):
+        raise TensorsimError(f"activity: got {activity}, expected 1 to {len(ACTIVITIES) - 1}")
+    draw = Draw(count, generator)
+    people = draw_people(count, PEOPLE, generator)
+    variants = VARIANTS[activity]
+    shares = torch.tensor([variant.share for variant in variants])
+    kind = torch.multinomial(shares, count, replacement=True, generator=generator)
+    knots = round(float(duration_s.max()) * KNOT_HZ) + 8
+    time = torch.arange(knots, dtype=torch.float64) / KNOT_HZ
+    joints = torch.empty(count, knots, 14, 3, dtype=torch.float64)
+    for k in kind.unique().tolist():
+        chosen = torch.nonzero(kind == k)[:, 0]
+        some = Draw(len(chosen), generator)
+        lengths = duration_s[chosen, None].double()
+        joints[chosen] = _acted(variants[k], time.expand(len(chosen), -1), lengths, people.take(chosen), some)
+    hips = joints[:, :, (8, 11), :2].mean(2)
+    middle = (hips.amin(1) + hips.amax(1)) / 2
+    spot = torch.cat([draw(-SIDE_M, SIDE_M), draw(*RANGE_M)], 1)
+    # Nobody comes nearer than 1.2 m.
+    nearest = (hips[..., 1] - middle[:, None, 1] + spot[:, None, 1]).amin(1)
+    spot[:, 1] += (1.2 - nearest).clamp(min=0.0)
+    shift = torch.nn.functional.pad(spot - middle, (0, 1))
+    joints = add_unrest(joints + shift[:, None, None], draw, Unrest((0.0, 0.01), (0.0, 0.03)))
+    return joints, people.height_m
+
+
+def at_rate(joints: Tensor, frames: int, rate_hz: float) -> Tensor:
+    """Motion (K, 14, 3) at ``KNOT_HZ`` to (frames, 14, 3) at another rate."""
+    return at_instants(joints[None], torch.arange(frames, dtype=torch.float64) / rate_hz)[0]
+
+
+def bystander(duration_s: float, generator: torch.Generator) -> Tensor:
+    """Somebody who stands or sits at the side and hardly moves: joints (K, 14, 3) m at ``KNOT_HZ``."""
+    draw = Draw(1, generator)
+    people = draw_people(1, PEOPLE, generator)
+    knots = round(duration_s * KNOT_HZ) + 8
+    seated = bool(draw(0.0, 1.0) < 0.5)
+    clock = torch.full((1, knots), 10.0 if seated else 0.0, dtype=torch.float64)
+    joints = act_out(scripts.sit_down if seated else scripts.stand, clock, people)
+    hips = joints[:, :1, (8, 11), :2].mean(2)
+    spot = torch.cat([draw(-2.5, 2.5), draw(3.5, 7.0)], 1)[:, None]
+    joints = joints + torch.nn.functional.pad(spot - hips, (0, 1))[:, :, None]
+    return add_unrest(joints, draw, Unrest((0.003, 0.02), (0.0, 0.06)))[0]

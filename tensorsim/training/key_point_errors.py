@@ -1,0 +1,203 @@
+"""Key points as networks find them in films from any camera, and what the pipeline makes of them.
+
+Networks do not err at random: a hidden arm stays in the wrong place for as long as it is hidden, left and right are
+mixed up for a while, people who lie down are lost. Sizes of errors are shares of the body's height in the picture.
+"""
+
+import copy
+import math
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.skeleton import body_to_coco
+from tensorsim.config import CameraConfig
+from tensorsim.evaluation.measured.motions import Draw, smooth_noise
+from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
+from tensorsim.geometry.framing import keypoint_boxes
+from tensorsim.pipeline import VideoToPose
+from tensorsim.types import Tracks
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.pose2d.topdown import MIRRORED
+
+#: Errors of each COCO key point relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
+RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2
+#: Key points that are mixed up with those of the other side: arms, legs, all.
+MIXED_UP = ((5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16), tuple(range(5, 17)))
+#: What is believed of the tilt is a multiple of this: the lifter prepares its poses for each tilt, which takes long.
+PITCH_STEP_DEG = 3.0
+#: Pictures: height, width.
+SIZES = ((360, 640), (480, 640), (640, 360))
+
+
+class Seen(NamedTuple):
+    """Somebody in a film.
+
+    Attributes:
+        keypoints: (T, 17, 2) pixels.
+        scores: (T, 17).
+        valid: (T,) bool, whether followed.
+    """
+
+    keypoints: Tensor
+    scores: Tensor
+    valid: Tensor
+
+
+class Filming(NamedTuple):
+    """A camera, what is believed of it, and the size of its pictures."""
+
+    camera: CameraConfig
+    believed: CameraConfig
+    height: int
+    width: int
+
+
+def draw_camera(hips: Tensor, draw: Draw) -> Filming:
+    """A camera above the radar that has people with hips (T, 3) in view, and its calibration with errors."""
+    height, width = SIZES[int(torch.multinomial(torch.tensor([0.5, 0.4, 0.1]), 1, generator=draw.generator))]
+    fov = math.radians(float(draw(42.0, 75.0)))
+    above = float(draw(0.6, 2.6))
+    middle = hips.mean(0) - hips.new_tensor([0.0, 0.0, above])
+    towards = math.atan2(float(middle[2]), float(middle[:2].norm()))
+    half = math.atan(math.tan(fov / 2) * height / width)
+    step = math.radians(PITCH_STEP_DEG)
+    thought = step * round((towards + float(draw(-0.45, 0.45)) * half) / step)
+    pitch = thought + math.radians(4.0) * float(draw.normal(1))
+    stretch = math.exp(0.12 * float(draw.normal(1)))
+    lifted = max(0.3, above * stretch + 0.1 * float(draw.normal(1)))
+    camera = CameraConfig(horizontal_fov_rad=fov, position_m=(0.0, 0.0, above), pitch_rad=pitch)
+    believed = CameraConfig(
+        horizontal_fov_rad=min(1.6, 2 * math.atan(math.tan(fov / 2) / stretch)),
+        position_m=(0.0, 0.0, lifted),
+        pitch_rad=thought,
+    )
+    return Filming(camera, believed, height, width)
+
+
+def _spell(frames: int, rate: float, shortest: float, longest: float, draw: Draw) -> Tensor:
+    """(N, T) bool: with probability ``rate`` one spell, of a share of the frames, anywhere."""
+    length = draw(shortest, longest) * frames
+    start = draw(-0.2, 1.0) * frames
+    time = torch.arange(frames)
+    return (draw(0.0, 1.0) < rate) & (time >= start) & (time < start + length)
+
+
+def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filming, draw: Draw) -> Seen:
+    """What networks find of a person with joints (T, 14, 3) m and this height; ``draw`` is for one."""
+    frames = len(joints)
+    body = body_to_coco(joints)
+    focal = focal_length(filming.camera, filming.width)
+    center = principal_point(filming.camera, filming.height, filming.width)
+    true, depth = project(body, focal, center, camera_to_world(filming.camera))
+    unit = (focal * height_m / depth[:, 11:13].mean(1).clamp(min=0.5))[:, None, None]
+
+    level = torch.exp(0.5 * draw.normal(1))[..., 0] * torch.tensor(RELATIVE, dtype=torch.float64)[:, None]
+    quick, slow = (
+        smooth_noise(draw, frames, fps, torch.full((1, 1), band, dtype=torch.float64), 34)[0].unflatten(
+            -1, (17, 2)
+        )
+        for band in (4.0, 0.6)
+    )
+    error = level * (0.006 * quick + 0.009 * slow)
+    # Somebody whose trunk is not upright is found badly.
+    trunk = (joints[:, 1] - (joints[:, 8] + joints[:, 11]) / 2)[:, 2] / (0.3 * height_m)
+    tilted = (1.0 - trunk).clamp(0.0, 1.0)
+    error = error * (1 + 2.0 * tilted)[:, None, None]
+    each = Draw(17, draw.generator)
+    # A point that is lost is taken for something else nearby, and its score is low for a part of that time.
+    wild = _spell(frames, 0.12, 0.03, 0.3, each).T
+    away = smooth_noise(draw, frames, fps, torch.full((1, 1), 1.0, dtype=torch.float64), 34)[0]
+    error = error + 0.1 * wild[..., None] * away.unflatten(-1, (17, 2))
+    found = true + unit * error
+
+    other = found[:, list(MIRRORED)]
+    # The far arm or leg of somebody seen from the side is taken for the near one.
+    near = (true - true[:, list(MIRRORED)]).norm(dim=-1, keepdim=True) < 0.1 * unit
+    far = (depth > depth[:, list(MIRRORED)] + 0.06)[..., None] & (torch.arange(17) > 6)[:, None]
+    merged = near & far & _spell(frames, 0.4, 0.2, 1.0, each).T[..., None]
+    found = torch.where(merged, other, found)
+    for group in MIXED_UP:
+        mixed = torch.zeros(17, dtype=torch.bool)
+        mixed[list(group)] = True
+        spell = _spell(frames, 0.12, 0.02, 0.25, draw)[0]
+        found = torch.where((spell[:, None] & mixed)[..., None], found[:, list(MIRRORED)], found)
+
+    inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
+    scores = (0.85 - 3.0 * error.norm(dim=-1) + 0.06 * each.normal(frames).T).clamp(0.35, 0.95)
+    scores = torch.where(merged[..., 0], scores - 0.2, scores)
+    hidden = _spell(frames, 0.12, 0.1, 1.0, each).T
+    scores = torch.where(hidden, 0.2, scores) * (inside & (depth > NEAR_M))
+    return Seen(found, scores, _followed(found, scores, tilted, fps, draw))
+
+
+def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: Draw) -> Tensor:
+    """In which frames (T,) somebody is followed: most who lie down are lost, some come late or leave early."""
+    frames = len(found)
+    time = torch.arange(frames)
+    seen = (scores >= 0.3).sum(-1) >= 4
+    followed = seen & ~_spell(frames, 0.12, 0.03, 0.2, draw)[0]
+    if float(draw(0.0, 1.0)) < 0.12:
+        followed &= time >= float(draw(0.0, 0.4)) * frames
+    if float(draw(0.0, 1.0)) < 0.12:
+        followed &= time < float(draw(0.6, 1.0)) * frames
+    lying = tilted > 0.7
+    if bool(lying.any()):
+        chance = float(draw(0.0, 1.0))
+        if chance < 0.5:  # lost for good some time after
+            lost = int(torch.nonzero(lying)[0]) + float(draw(0.0, 1.2)) * fps
+            if bool(lying[-1]):
+                followed &= time < lost
+            else:  # found again when up
+                followed &= (time < lost) | (time > int(torch.nonzero(lying)[-1]))
+        elif chance < 0.65:
+            followed &= ~lying
+    return followed
+
+
+class FilmedMotion:
+    """Motion as the pipeline finds it in films: key points with errors, lifted, placed and smoothed.
+
+    Args:
+        every: only every n-th pose of the shipped library is searched, for speed.
+    """
+
+    def __init__(self, every: int = 24) -> None:
+        nothing = nn.Identity()
+        lifter = NearestPoseLifter(load_pose_library()[::every], neighbours=16)
+        self.stage = VideoToPose(nothing, nothing, lifter=lifter).eval()
+        self._tilted: dict[float, nn.Module | None] = {}
+
+    def _seen_by(self, camera: CameraConfig) -> VideoToPose:
+        """The stage for a camera, with a lifter that is made once for each tilt."""
+        stage = self.stage
+        if camera.pitch_rad not in self._tilted:
+            self._tilted[camera.pitch_rad] = stage.seen_by(camera).lifter
+        other = copy.copy(stage)
+        other._modules = dict(stage._modules)
+        other.lifter = self._tilted[camera.pitch_rad]
+        other.metric_pose = cast(MetricPose, stage.metric_pose).seen_by(camera)
+        return other
+
+    @torch.no_grad()
+    def __call__(
+        self, people: list[tuple[Tensor, float]], fps: float, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """People, each joints (T, 14, 3) m and height in m, to joints (P, T, 14, 3) and presence (P, T)."""
+        draw = Draw(1, generator)
+        hips = torch.stack([(joints[:, 8] + joints[:, 11]) / 2 for joints, _ in people])
+        filming = draw_camera(hips.mean(0), draw)
+        seen = [find_key_points(joints, height, fps, filming, draw) for joints, height in people]
+        keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
+        boxes = keypoint_boxes(keypoints, scores, margin=0.08)
+        if not bool(valid.any()):
+            return torch.ones((*valid.shape, 14, 3)), valid
+        stage = self._seen_by(filming.believed)
+        tracks = Tracks(boxes.float()[None], valid[None], valid[None])
+        pose = stage.lift(
+            tracks, keypoints.float()[None], scores.float()[None], filming.height, filming.width, fps
+        )
+        return pose.joints[0].double(), pose.valid[0]

@@ -1,0 +1,129 @@
+"""The floor under people: whoever stands, kneels or lies on it is as far away as the floor is there.
+
+The size of a body in the image tells its distance while it is upright. Of somebody who crouches, falls or lies it
+tells little, as many poses look alike. There the floor helps: the lowest joint of a body rests on it, and it is as high
+as it was under the feet of the same person before. Heights of the floor are those of a standing ankle; any other joint
+that rests on the floor has about as much flesh around it.
+"""
+
+import torch
+from torch import Tensor
+
+from tensorsim.body.skeleton import mid_hips
+from tensorsim.vision.smoothing.along_time import fill_gaps, local_linear, running_quantile
+
+
+def lowest_ankle(joints: Tensor) -> Tensor:
+    """Height of the lower ankle (joints 10 and 13): (..., 14, 3) -> (...)."""
+    return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])
+
+
+def lowered(joints: Tensor, drop: Tensor) -> Tensor:
+    """Joints (..., 14, 3) moved down by ``drop`` (...)."""
+    return torch.cat([joints[..., :2], joints[..., 2:] - drop[..., None, None]], dim=-1)
+
+
+def upright_share(joints: Tensor, height: Tensor) -> Tensor:
+    """How upright bodies are: 1 from a vertical extent of 0.78 standing heights (0.88 in a stand), 0 below 0.6.
+
+    Args:
+        joints: (..., 14, 3) m.
+        height: (...) standing heights, m.
+    """
+    extent = (joints[..., 2].amax(dim=-1) - joints[..., 2].amin(dim=-1)) / height
+    return ((extent - 0.6) / 0.18).clamp(0.0, 1.0)
+
+
+def looks_bent(image: Tensor, seen: Tensor) -> Tensor:
+    """Whether legs and trunk, all seen, do not look like those of a body that stands.
+
+    In a stand the trunk is 0.6 times as long as the legs, 0.4 to 0.9 with cameras that look down, steps and leaning; it
+    is in line with them within 40 degrees, and the legs are straight: thigh and shank are not more than 1.25 times as
+    long as from hip to ankle. A lifter may take a crouch for a stand of somebody further away; this does not ask it.
+
+    Args:
+        image: (..., 14, 2) joints in pixels of a camera without roll.
+        seen: (..., 14) bool.
+
+    Returns:
+        (...) bool, false where a joint of trunk or legs is hidden.
+    """
+    ankles = 0.5 * (image[..., 10, :] + image[..., 13, :])
+    hips = mid_hips(image)
+    trunk, legs = hips - image[..., 1, :], ankles - hips
+    trunk_px, legs_px = torch.linalg.vector_norm(trunk, dim=-1), torch.linalg.vector_norm(legs, dim=-1)
+    bones = torch.zeros_like(trunk_px)
+    for first in (8, 11):
+        thigh = torch.linalg.vector_norm(image[..., first + 1, :] - image[..., first, :], dim=-1)
+        shank = torch.linalg.vector_norm(image[..., first + 2, :] - image[..., first + 1, :], dim=-1)
+        stretched = torch.linalg.vector_norm(image[..., first + 2, :] - image[..., first, :], dim=-1)
+        # A straight leg is enough: the other one may be lifted.
+        ratio = (thigh + shank) / stretched.clamp(min=1e-3)
+        bones = ratio if first == 8 else torch.minimum(bones, ratio)
+    aligned = (trunk * legs).sum(dim=-1) > 0.766 * trunk_px * legs_px
+    ratio = trunk_px / legs_px.clamp(min=1e-3)
+    stands = aligned & (ratio > 0.4) & (ratio < 0.9) & (bones < 1.25) & (legs[..., 1] > 0.0)
+    return ~stands & seen[..., 1] & seen[..., 8:].all(dim=-1)
+
+
+def range_on_floor(rise: Tensor, depth: Tensor, floor: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth of the hips at which the lowest joint of a body rests on the floor.
+
+    With the hips at depth y joint j is at ``rise_j (y + depth_j)`` above the camera; the largest y at which no joint is
+    below the floor makes one rest on it.
+
+    Args:
+        rise: (..., 14) by how much the line of sight of a joint rises per metre along the optical axis.
+        depth: (..., 14) of the joints about the hips, m.
+        floor: (...) height above the camera (so negative), m.
+        seen: (..., 14) bool, the joints that count.
+
+    Returns:
+        (...) metres, and by how much it changes with the height of the floor, (...) positive; infinite where no line
+        of sight leads down to the floor.
+    """
+    down = seen & (rise < -0.03) & (floor < 0.0)[..., None]
+    slope = torch.where(down, rise, torch.full_like(rise, -1.0))
+    y = torch.where(down, floor[..., None] / slope - depth, torch.full_like(rise, float("inf")))
+    nearest, index = y.min(dim=-1)
+    gain = -1.0 / slope.gather(-1, index[..., None])[..., 0]
+    return nearest, torch.where(nearest < float("inf"), gain, nearest)
+
+
+def fused_range(
+    by_size: Tensor, upright: Tensor, by_floor: Tensor, gain: Tensor, floor_error_m: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Mean of the ranges that the size of a body and the floor tell, each with its precision.
+
+    The size of an upright body is good to 3 %, and taken alone; of any other to 15 %.
+
+    Args:
+        by_size: (...) metres.
+        upright: (...) of :func:`upright_share`.
+        by_floor, gain: (...) of :func:`range_on_floor`.
+        floor_error_m: (...) standard deviation of the height of the floor.
+
+    Returns:
+        (...) metres and the share of the floor in it.
+    """
+    usable = (by_floor > 0.3) & (by_floor < 100.0)
+    size_variance = (by_size * (0.15 - 0.12 * upright)).square().clamp(min=1e-4)
+    floor_variance = (floor_error_m * torch.where(usable, gain, torch.ones_like(gain))).square()
+    share = (1.0 - upright) * size_variance / (size_variance + floor_variance)
+    share = torch.where(usable, share, torch.zeros_like(share))
+    return by_size + share * torch.where(usable, by_floor - by_size, torch.zeros_like(by_size)), share
+
+
+def floor_under(joints: Tensor, valid: Tensor, fps: float, window_s: float) -> Tensor:
+    """Height of the floor under people (..., T): a low running quantile of the lower ankle, smoothed.
+
+    Args:
+        joints: (..., T, 14, 3) m.
+        valid: (..., T) bool, the frames that tell the floor; the others take that of the nearest one.
+        fps: frames per second.
+        window_s: of the quantile; longer than a jump.
+    """
+    low = fill_gaps(lowest_ankle(joints), valid)
+    window = int(window_s * fps)
+    low = running_quantile(low, window, 0.15)
+    return local_linear(low, torch.ones_like(low), max(0.2 * window, 0.5))

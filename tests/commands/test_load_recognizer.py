@@ -1,0 +1,35 @@
+"""Which radars get a label: those like the ones that the classifier was trained on."""
+
+import warnings
+from dataclasses import replace
+
+import pytest
+
+from tensorsim.commands.options import load_recognizer
+from tensorsim.config import SceneConfig, SimulationConfig
+from tensorsim.errors import TensorsimWarning
+from tensorsim.radar.presets import PRESETS
+
+
+@pytest.mark.parametrize("scene", ["free-space", "through-wall", "ti-iwr6843"])
+def test_radars_like_those_of_training_get_a_label(scene):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_recognizer(SimulationConfig(scene=PRESETS[scene])) is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"prf_hz": 90.0}, r"no label: the radar sees speeds up to 2\.7 m/s"),
+        ({"carrier_hz": 0.5e9}, r"no label: the radar resolves speeds 1\.5 m/s apart"),
+    ],
+)
+def test_others_get_none_and_a_reason(change, message):
+    radar = replace(PRESETS["through-wall"].radar, **change)
+    with pytest.warns(TensorsimWarning, match=message):
+        assert load_recognizer(SimulationConfig(scene=SceneConfig(radar))) is None
+
+
+def test_none_is_wanted():
+    assert load_recognizer(SimulationConfig(classifier="none")) is None

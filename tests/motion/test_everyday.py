@@ -1,0 +1,85 @@
+"""Everyday variants: bones keep their length, nobody is too fast, who falls lies, who kicks has walked up."""
+
+import pytest
+import torch
+
+from tensorsim.config import JOINTS
+from tensorsim.motion import everyday
+from tensorsim.motion.activities import perform
+from tensorsim.motion.people import PeopleConfig, draw_people
+
+RATE = 120.0
+FALLS = ("fall_any_way", "fall_on_knees", "walk_and_fall_any_way")
+BONES = [("right_hip", "right_knee"), ("left_knee", "left_ankle"), ("neck", "right_shoulder"),
+         ("left_elbow", "left_wrist")]  # fmt: skip
+
+
+def joint(joints, name):
+    return joints[..., JOINTS.index(name), :]
+
+
+@pytest.fixture(scope="module", params=[*FALLS, "swing_fist", "kick_ball"])
+def moved(request):
+    """Sixteen people from 1.5 s before the movement begins to 4 s after."""
+    people = draw_people(16, PeopleConfig(tempo=(0.6, 0.9)), torch.Generator().manual_seed(5))
+    time = torch.arange(round(5.5 * RATE), dtype=torch.float64) / RATE - 1.5
+    return request.param, people, perform(getattr(everyday, request.param), time.expand(16, -1), people)
+
+
+def test_bones_keep_their_length_and_nobody_is_too_fast(moved):
+    _, _, joints = moved
+    for a, b in BONES:
+        length = (joint(joints, a) - joint(joints, b)).norm(dim=-1)
+        assert float((length.amax(1) - length.amin(1)).max()) < 1e-9
+    speed = joints.diff(dim=1).norm(dim=-1) * RATE
+    # The foot of a ball player reaches 15 m/s.
+    assert 1.5 < float(speed.max()) < 15
+    assert float(joints[..., 2].min()) > 0.0
+
+
+def test_who_falls_ends_on_the_floor_and_stays(moved):
+    name, people, joints = moved
+    if name not in FALLS:
+        pytest.skip("no fall")
+    head, hips = joint(joints, "head")[..., 2], joint(joints, "right_hip")[..., 2]
+    standing = round(1.4 * RATE)
+    assert bool((head[:, standing] > 0.8 * people.height_m).all())
+    # On the knees and hands, at the highest.
+    assert bool((head[:, -1] < 0.62 * people.height_m).all())
+    assert bool((hips[:, -1] < 0.45 * people.height_m).all())
+    late = joints[:, -round(0.3 * RATE) :]
+    assert float((late.diff(dim=1).norm(dim=-1) * RATE).max()) < 0.1
+
+
+def test_people_fall_to_all_sides():
+    people = draw_people(40, PeopleConfig(), torch.Generator().manual_seed(0))
+    time = torch.tensor([0.0, 4.0], dtype=torch.float64).expand(40, -1)
+    joints = perform(everyday.fall_any_way, time, people)
+    over = (joint(joints, "head") - joint(joints, "right_ankle"))[:, 1, :2]
+    angle = torch.atan2(over[:, 1], over[:, 0])
+    assert {int(q) for q in torch.floor((angle + torch.pi) / (torch.pi / 2)).clamp(max=3)} == {0, 1, 2, 3}
+
+
+def test_a_ball_is_kicked_after_walking_up():
+    people = draw_people(8, PeopleConfig(), torch.Generator().manual_seed(1))
+    time = torch.arange(round(3.5 * RATE), dtype=torch.float64) / RATE - 2.0
+    joints = perform(everyday.kick_ball, time.expand(8, -1), people)
+    way = joint(joints, "neck")[..., 1]
+    assert bool((way[:, round(1.4 * RATE)] - way[:, 0] > 0.4).all())
+    foot = joint(joints, "right_ankle").diff(dim=1).norm(dim=-1) * RATE
+    kick = foot[:, round(1.8 * RATE) : round(2.4 * RATE)].amax(1)
+    assert bool((kick > 3.0).all())
+    resting = joint(joints, "neck").diff(dim=1).norm(dim=-1)[:, -12:] * RATE
+    assert float(resting.max()) < 0.3
+
+
+def test_a_fist_is_swung_out_and_back():
+    people = draw_people(8, PeopleConfig(), torch.Generator().manual_seed(2))
+    time = torch.arange(round(3 * RATE), dtype=torch.float64) / RATE - 0.5
+    joints = perform(everyday.swing_fist, time.expand(8, -1), people)
+    reach = torch.stack(
+        [(joint(joints, f"{side}_wrist") - joint(joints, "neck")).norm(dim=-1) for side in ("right", "left")]
+    ).amax(0)
+    assert bool((reach.amax(1) > reach[:, 0] + 0.1).all())
+    still = joint(joints, "right_ankle").diff(dim=1).norm(dim=-1)
+    assert float(still.max()) < 1e-6

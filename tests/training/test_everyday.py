@@ -1,0 +1,113 @@
+"""Everyday motion as films show it: in every heading, with errors of networks, and what the pipeline makes of it."""
+
+import math
+
+import pytest
+import torch
+
+from tensorsim.config import ACTIVITIES, CameraConfig
+from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.measured.motions import KNOT_HZ, Draw
+from tensorsim.training import everyday
+from tensorsim.training.everyday import at_rate, bystander, everyday_motion
+from tensorsim.training.key_point_errors import FilmedMotion, Filming, draw_camera, find_key_points
+
+
+def motion(activity: int, count: int = 6, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return everyday_motion(activity, count, torch.full((count,), 4.0), generator)
+
+
+def test_every_activity_but_the_empty_one_has_variants():
+    assert len(everyday.VARIANTS) == len(ACTIVITIES)
+    assert everyday.VARIANTS[0] == ()
+    for variants in everyday.VARIANTS[1:]:
+        assert sum(variant.share for variant in variants) == pytest.approx(1.0)
+
+
+def test_walks_have_all_headings_and_half_of_them_turn():
+    joints, _ = motion(7, 60)
+    hips = joints[:, :, (8, 11), :2].mean(2)
+    step = hips[:, 60] - hips[:, 0]
+    angle = torch.atan2(step[:, 1], step[:, 0]) + math.pi
+    assert {int(q) for q in torch.floor(angle / (math.pi / 2)).clamp(max=3)} == {0, 1, 2, 3}
+    way = hips.diff(dim=1).norm(dim=-1).sum(1)
+    straight = (hips[:, -1] - hips[:, 0]).norm(dim=-1)
+    turned = straight < 0.8 * way
+    assert 0.2 < float(turned.double().mean()) < 0.8
+    assert float(hips[..., 1].min()) > 1.0
+
+
+@pytest.mark.parametrize(("activity", "change"), [(4, -0.3), (5, 0.3), (11, -0.8)])
+def test_heads_go_down_and_up_as_the_activity_says(activity, change):
+    joints, height = motion(activity, 24)
+    moved = (joints[:, -1, 0, 2] - joints[:, 0, 0, 2]) / height
+    assert float(moved.median()) * math.copysign(1, change) > 0.5 * abs(change)
+
+
+def test_one_seed_gives_one_motion():
+    torch.testing.assert_close(motion(3, 2)[0], motion(3, 2)[0], rtol=0, atol=0)
+    assert not torch.equal(motion(3, 2)[0], motion(3, 2, seed=1)[0])
+
+
+def test_bystanders_stay_where_they_are():
+    joints = bystander(4.0, torch.Generator().manual_seed(0))
+    assert float((joints.amax(0) - joints.amin(0)).max()) < 0.4
+
+
+def test_refuses_the_empty_scene():
+    with pytest.raises(TensorsimError, match="activity: got 0, expected 1 to 11"):
+        motion(0)
+
+
+@pytest.fixture(scope="module")
+def standing() -> torch.Tensor:
+    """Joints (80, 14, 3) of somebody who rotates, at 20 frames a second."""
+    return at_rate(motion(6, 1)[0][0], 80, 20.0)
+
+
+def test_key_points_are_near_the_true_ones(standing):
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.5))
+    filming = Filming(camera, camera, 360, 640)
+    errors = []
+    for seed in range(12):
+        draw = Draw(1, torch.Generator().manual_seed(seed))
+        seen = find_key_points(standing, 1.75, 20.0, filming, draw)
+        other = find_key_points(
+            standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed + 100))
+        )
+        errors.append((seen.keypoints - other.keypoints).norm(dim=-1).median())
+        assert seen.scores.min() >= 0
+        assert seen.scores.max() <= 1
+    span = 640 / 2 / math.tan(math.pi / 6) * 1.75 / float(standing[:, 8, 1].mean())
+    # Two finds differ by some hundredths of the body's height.
+    assert 0.008 < float(torch.stack(errors).median()) / span < 0.06
+
+
+def test_cameras_have_people_in_view_and_are_known_to_some_degrees(standing):
+    hips = (standing[:, 8] + standing[:, 11]) / 2
+    wrong = []
+    for seed in range(40):
+        filming = draw_camera(hips, Draw(1, torch.Generator().manual_seed(seed)))
+        seen = find_key_points(standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
+        assert float((seen.scores[:, 11:13] > 0).double().mean()) > 0.6
+        wrong.append(filming.camera.pitch_rad - filming.believed.pitch_rad)
+    assert 2.0 < math.degrees(float(torch.tensor(wrong).std())) < 6.5
+
+
+def test_the_pipeline_finds_the_person_again(standing):
+    found, valid = FilmedMotion()(
+        [(standing, 1.75), (standing + 0.5, 1.75)], 20.0, torch.Generator().manual_seed(3)
+    )
+    assert found.shape == (2, 80, 14, 3)
+    assert valid.shape == (2, 80)
+    assert float(valid.double().mean()) > 0.5
+    assert bool(torch.isfinite(found).all())
+    hips = found[0, valid[0]][:, 8]
+    assert float((hips - standing[valid[0]][:, 8]).norm(dim=-1).median()) < 1.2
+    assert float((found[0].diff(dim=0).norm(dim=-1) * 20).max()) < 12.5
+
+
+def test_motion_at_a_rate_goes_through_the_knots(standing):
+    joints, _ = motion(6, 1)
+    torch.testing.assert_close(at_rate(joints[0], 40, KNOT_HZ / 4), joints[0, :160:4])

@@ -1,0 +1,101 @@
+"""Ranges from the floor, against bodies whose place is known."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.body.skeleton import mid_hips
+from tensorsim.config import CameraConfig
+from tensorsim.types import Lifted
+from tensorsim.vision.lifting.floor import fused_range, lowest_ankle, range_on_floor, upright_share
+from tensorsim.vision.lifting.metric_pose import MetricPose
+from tests.vision.lifting.test_metric_pose import TALL, film, place
+
+CAMERA = CameraConfig(position_m=(0.0, 0.0, 1.8), pitch_rad=-math.radians(10))
+
+
+def squat(frames: int = 90) -> Tensor:
+    """World joints (T, 14, 3) of somebody who stands for a second, then goes into a squat, feet in place."""
+    e = ((torch.arange(frames, dtype=torch.float64) - 30) / 30).clamp(0, 1)
+    pose = BodyPose.standing((frames,))._replace(
+        hip=torch.stack([e[:, None].expand(-1, 2) * 1.9, torch.zeros(frames, 2).double()], dim=-1),
+        knee=e[:, None].expand(-1, 2) * 2.3,
+        trunk=torch.stack([e * 0.7, 0 * e, 0 * e], dim=-1),
+    )
+    joints = forward_kinematics(pose, TALL)
+    ankles = joints[:, (10, 13)].mean(dim=1)
+    way = torch.tensor([0.3, 4.0, 0.0], dtype=torch.float64) - ankles
+    way[:, 2] = -lowest_ankle(joints)
+    return joints + way[:, None]
+
+
+def test_lowest_joint_rests_on_the_floor() -> None:
+    """A camera 1.5 m above the floor; lines of sight that fall by 0.3 and by 0.5 per metre meet it at 5 and 3 m."""
+    rise = torch.full((14,), -0.3, dtype=torch.float64)
+    rise[0] = 0.1  # above the horizon
+    depth, seen = torch.zeros(14, dtype=torch.float64), torch.ones(14, dtype=torch.bool)
+    floor = torch.tensor(-1.5, dtype=torch.float64)
+    y, gain = range_on_floor(rise, depth, floor, seen)
+    assert float(y) == pytest.approx(5.0)
+    assert float(gain) == pytest.approx(1 / 0.3)
+    rise[4] = -0.5
+    assert float(range_on_floor(rise, depth, floor, seen)[0]) == pytest.approx(3.0)
+    depth[4] = -0.5  # nearer than the hips
+    assert float(range_on_floor(rise, depth, floor, seen)[0]) == pytest.approx(3.5)
+    seen[4] = False
+    assert float(range_on_floor(rise, depth, floor, seen)[0]) == pytest.approx(5.0)
+    for nothing in (
+        range_on_floor(rise, depth, -floor, seen),
+        range_on_floor(rise, depth, floor, seen & False),
+    ):
+        assert nothing[0].isinf()
+        assert nothing[1].isinf()
+
+
+def test_size_counts_while_upright_and_the_floor_otherwise() -> None:
+    size, floor = torch.tensor([4.0, 4.0, 4.0]), torch.tensor([3.0, 3.0, math.inf])
+    upright, gain = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 2.0, math.inf])
+    y, share = fused_range(size, upright, floor, gain, torch.full((3,), 0.06))
+    # Variances 0.6^2 and 0.12^2.
+    assert share.tolist() == pytest.approx([0.0, 0.36 / (0.36 + 0.0144), 0.0])
+    assert y.tolist() == pytest.approx([4.0, 4.0 - 0.36 / 0.3744, 4.0])
+
+
+def test_upright_share_of_a_squat() -> None:
+    share = upright_share(squat(), torch.tensor(TALL, dtype=torch.float64))
+    assert share[:30].eq(1).all()
+    assert share[-10:].eq(0).all()
+
+
+@pytest.mark.parametrize("error", [0.7, 1.3])
+def test_a_wrong_size_of_somebody_who_squats_does_not_move_them(error: float) -> None:
+    world = squat()
+    image, lifted = film(world, CAMERA)
+    share = upright_share(world, torch.tensor(TALL, dtype=torch.float64))
+    wrong = Lifted(lifted.depth, lifted.scale * torch.where(share < 0.5, error, 1.0), *lifted[2:])
+    placed = place(MetricPose(CAMERA, (TALL,)), image, wrong)
+    # The size alone would be wrong by 4 m / 0.7 - 4 m or 4 m - 4 m / 1.3, 0.9 m and more.
+    assert float((mid_hips(placed) - mid_hips(world))[:, 1].abs().max()) < 0.2
+    assert float(lowest_ankle(placed).abs().max()) < 0.1
+
+
+def test_somebody_who_lies_is_on_the_floor() -> None:
+    """Standing for a second, then lying across the picture, found at 0.6 of the true size."""
+    joints = forward_kinematics(BodyPose.standing((60,)), TALL)
+    turn = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
+    lying = (joints - mid_hips(joints)[:, None]) @ turn.T
+    world = torch.where(torch.arange(60)[:, None, None] < 30, joints, lying)
+    world = (
+        world
+        - torch.stack([0 * world[:, 0, 0], 0 * world[:, 0, 0], world[..., 2].amin(dim=1)], dim=-1)[:, None]
+    )
+    world = world + torch.tensor([0.0, 4.0, 0.0], dtype=torch.float64)
+    image, lifted = film(world, CAMERA)
+    size = torch.where(torch.arange(60) < 30, 1.0, 0.6)
+    placed = place(MetricPose(CAMERA, (TALL,)), image, lifted._replace(scale=lifted.scale * size))
+    assert float((mid_hips(placed) - mid_hips(world))[:, 1].abs().max()) < 0.15
+    assert float(placed[..., 2].min()) > -0.1
+    assert float(placed[35:, :, 2].max()) < 0.7
