@@ -1,9 +1,12 @@
 """Networks to test with, without training one."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
+
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.body.skeleton import body_to_coco
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -21,3 +24,23 @@ def settled(network: Network) -> Network:
             ):
                 nn.init.uniform_(values, low, high, generator=generator)
     return network.eval()
+
+
+def keypoints_to_lift(frames: int) -> tuple[Any, ...]:
+    """Arguments of a temporal lifter: somebody 4 m in front of a level camera who raises the arms."""
+    pose = BodyPose.standing((frames,), torch.float32)
+    raised = torch.linspace(0.0, 2.0, frames)[:, None, None] * torch.tensor([1.0, 0.0, 0.0])
+    joints = forward_kinematics(pose._replace(shoulder=raised.expand(-1, 2, -1)), 1.75)
+    points = body_to_coco(joints)
+    pixels = 500 * torch.stack([points[..., 0], -points[..., 2]], dim=-1) / (4.0 + points[..., 1:2])
+    pixels = (pixels + torch.tensor([320.0, 180.0]))[None]
+    boxes = torch.cat([pixels.amin(dim=-2) - 8, pixels.amax(dim=-2) + 8], dim=-1)
+    return (
+        pixels,
+        torch.full((1, frames, 17), 0.9),
+        boxes,
+        torch.ones(1, frames, dtype=torch.bool),
+        360,
+        640,
+        30.0,
+    )

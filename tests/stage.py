@@ -57,6 +57,19 @@ class StageTester:
     cuda_atol: ClassVar[float] = 1e-4
     gradient_atol: ClassVar[float] = 1e-5
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Leave out the tests of what a stage does not do by design, and those of CUDA where there is none."""
+        super().__init_subclass__(**options)
+        for name, applies in (
+            ("test_scripted_equals_eager", cls.scripts),
+            ("test_float32_near_float64", cls.float64),
+            ("test_gradients_against_finite_differences", len(cls.gradient_arguments) > 0),
+            ("test_exports", cls.exports),
+            ("test_cpu_equals_cuda", torch.cuda.is_available()),
+        ):
+            if not applies and name not in cls.__dict__:
+                setattr(cls, name, None)
+
     def make(self) -> nn.Module:
         """The stage with small, quick settings."""
         raise NotImplementedError
@@ -100,8 +113,6 @@ class StageTester:
                 assert_same([p[0] for p in part], [w[index] for w in whole], atol=self.batch_atol)
 
     def test_scripted_equals_eager(self) -> None:
-        if not self.scripts:
-            pytest.skip("this stage does not script: see its docstring")
         module = self.make()
         scripted = torch.jit.script(module)
         file = io.BytesIO()
@@ -116,8 +127,6 @@ class StageTester:
                 assert_same(loaded(*args), expected, atol=self.script_atol)
 
     def test_float32_near_float64(self) -> None:
-        if not self.float64:
-            pytest.skip("this stage computes in one precision: see its docstring")
         args64 = self.inputs(self.batch_shapes[0], torch.float64)
         args32 = pytree.tree_map(
             lambda x: x.float() if isinstance(x, Tensor) and x.dtype == torch.float64 else x, args64
@@ -126,8 +135,6 @@ class StageTester:
             assert_same(self.make()(*args32), self.make().double()(*args64), atol=self.float32_atol)
 
     def test_gradients_against_finite_differences(self) -> None:
-        if not self.gradient_arguments:
-            pytest.skip("this stage is not differentiable: see its docstring")
         module = self.make().double()
         args = list(self.inputs((1,), torch.float64))
         for position in self.gradient_arguments:
@@ -142,8 +149,6 @@ class StageTester:
         )
 
     def test_exports(self) -> None:
-        if not self.exports:
-            pytest.skip("this stage does not go through torch.export: see its docstring")
         module = self.make()
         args = self.inputs(self.batch_shapes[0], torch.float32)
         with torch.no_grad(), warnings.catch_warnings():
@@ -151,7 +156,6 @@ class StageTester:
             program = torch.export.export(module, args)
             assert_same(program.module()(*args), module(*args), atol=self.script_atol)
 
-    @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
     def test_cpu_equals_cuda(self) -> None:
         module, args = self.make(), self.inputs(self.batch_shapes[0], torch.float32)
         on_gpu = pytree.tree_map(lambda x: x.cuda() if isinstance(x, Tensor) else x, args)

@@ -12,6 +12,7 @@ import tensorsim as ts
 from tensorsim import registry
 from tensorsim.recognition import SPGNet
 from tensorsim.vision.detection.acf_features import aggregate_channels
+from tests.networks import keypoints_to_lift
 
 
 def wave(*shape: int) -> Tensor:
@@ -41,6 +42,7 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
     "RTMDet": detector_logits,  # type: ignore[dict-item]
     "AcfDetector": tree_sums,  # type: ignore[dict-item]
+    "TemporalLifter": lambda lifter: lifter(*keypoints_to_lift(20)).joints.flatten()[::41],
 }
 
 #: First numbers and root mean square of all, by the first digits of the file's SHA-256.

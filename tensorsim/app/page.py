@@ -107,7 +107,9 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                 api_visibility="private",
                 show_progress="hidden",
             )
-        cancel.click(runs.cancel, running, None, concurrency_limit=None, api_visibility="private", queue=False)
+        cancel.click(
+            runs.cancel, running, None, concurrency_limit=None, api_visibility="private", queue=False
+        )
     return page
 
 
@@ -122,13 +124,21 @@ def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Number) -> No
     with gr.Row():
         for name, values in _EXAMPLES.items():
             gr.Button(name, size="sm").click(
-                lambda chosen=values: chosen, None, [activity, scene, duration], api_visibility="private", queue=False
+                lambda chosen=values: chosen,
+                None,
+                [activity, scene, duration],
+                api_visibility="private",
+                queue=False,
             )
 
 
 def _component(control: Control) -> Any:
     """The control as a component of Gradio."""
-    common: dict[str, Any] = {"label": control.label, "info": control.help, "elem_id": control.option.replace("_", "-")}
+    common: dict[str, Any] = {
+        "label": control.label,
+        "info": control.help,
+        "elem_id": control.option.replace("_", "-"),
+    }
     if control.kind == "switch":
         return gr.Checkbox(value=bool(control.default), **common)
     if control.kind == "choice":

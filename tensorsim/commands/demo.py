@@ -68,7 +68,7 @@ class Demo(NetworkOptions, RadarOptions):
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
             recognizer = load_recognizer(config)
-            networks = load_networks(detector, pose_network, config.pose.flip_test)
+            networks = load_networks(detector, pose_network, config.pose.flip_test, self.engine)
             maps_stage = PoseToDoppler.from_config(config).to(device)
             # The true motion is known at many moments: it needs no smoothing.
             true_stage = PoseToDoppler.from_config(config.replace(smoothing=SmoothingConfig())).to(device)

@@ -75,7 +75,7 @@ class Live(NetworkOptions, RadarOptions):
             live = LiveSimulator(
                 config,
                 camera.fps,
-                *load_networks(*networks, config.pose.flip_test),
+                *load_networks(*networks, config.pose.flip_test, self.engine),
                 recognizer,
                 self.least_probability,
             )

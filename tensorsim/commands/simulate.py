@@ -35,6 +35,7 @@ _MEANT_FOR = {
     "keypoint_threshold": ("video", "keypoints"),
     "pose": ("video",),
     "flip_test": ("video",),
+    "engine": ("video",),
     "person_height": ("video", "keypoints"),
     "calibrate": ("video",),
     "camera_fov": ("video", "keypoints"),
@@ -67,8 +68,9 @@ class Simulate(NetworkOptions, RadarOptions):
     radar)."""
     camera_fov: float | None = None
     """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: 60."""
-    calibrate: bool = False
-    """Estimate tilt, height and field of view of the camera from the people of the film."""
+    calibrate: bool = True
+    """Estimate tilt, roll, height and field of view of the camera from the people of the film, unless --camera-fov or
+    --initial-distance tells it. A --config says itself whether to."""
     position: Literal["camera", "paper"] | None = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
     lifter: Literal["temporal", "nearest"] | None = None
@@ -156,7 +158,10 @@ class Simulate(NetworkOptions, RadarOptions):
         ):
             if value is not None:
                 config = config.replace(**{field: value})
-        if self.calibrate:
+        known = self.camera_fov is not None or self.initial_distance is not None or self.config is not None
+        if not self.calibrate:
+            config = config.replace(pose__calibrate=False)
+        elif not known and config.pose.position == "camera":
             config = config.replace(pose__calibrate=True)
         return config if self.flip_test else config.replace(pose__flip_test=False)
 
@@ -179,10 +184,6 @@ class Simulate(NetworkOptions, RadarOptions):
                 raise TensorsimError(f"{option}: got no numbers, expected at least one")
             for value in given if isinstance(given, tuple) else [given] * (given is not None):
                 check_range(value, quantity, option)
-        if self.calibrate and (self.camera_fov is not None or self.initial_distance is not None):
-            raise TensorsimError(
-                "--calibrate: got --camera-fov or --initial-distance beside it, expected one way to the camera"
-            )
         if self.position == "paper" and self.initial_distance is None and self.config is None:
             raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
 
@@ -217,6 +218,6 @@ class Simulate(NetworkOptions, RadarOptions):
         reader = VideoReader(
             self.source, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
         )
-        networks = load_networks(detector, pose, config.pose.flip_test)
+        networks = load_networks(detector, pose, config.pose.flip_test, self.engine)
         stage = VideoToPose.from_config(config, *networks).to(device)
         return sources.film_source(reader, stage, device, config.pose.calibrate), config

@@ -13,7 +13,7 @@ from tensorsim.errors import TensorsimError
 class TrainEveryday(TrainOptions):
     """Train SPNet or SPGNet on pictures of everyday motion in both presets, and calibrate it on held-out ones.
 
-    Run again with the same arguments, it goes on where it stopped.
+    Run again with the same arguments, it goes on where it stopped. Writes OUT/classifier.safetensors.
     """
 
     maps: Path
@@ -33,9 +33,12 @@ class TrainEveryday(TrainOptions):
     batch: int = 64
     """Pictures per step."""
 
+    share: float = 1.0
+    """Of the way from --init to the trained weights that the result has, from 0 to 1: less keeps more of --init."""
+
     def run(self) -> None:
         """Do it."""
-        from tensorsim.training.everyday_classifier import EverydayRecipe, calibrate
+        from tensorsim.training.everyday_classifier import EverydayRecipe, load_between, save_calibrated
         from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
 
         check_seed(self.maps_seed, "--maps-seed")
@@ -43,6 +46,10 @@ class TrainEveryday(TrainOptions):
             raise TensorsimError(
                 f"--groups: got {self.groups}, expected at least 5, of which one is held out"
             )
+        if not 0 <= self.share <= 1:
+            raise TensorsimError(f"--share: got {self.share}, expected a number from 0 to 1")
+        if self.share < 1 and self.init is None:
+            raise TensorsimError("--share: got no --init, expected the weights to stay near")
         self.loop(steps=1, batch=self.batch)  # refuses what cannot work before maps are made
         build_everyday(self.maps, self.groups, EverydaySettings(seed=self.maps_seed), quiet=self.quiet)
         recipe = EverydayRecipe(
@@ -61,5 +68,10 @@ class TrainEveryday(TrainOptions):
             validate_every=epoch,
             ema_decay=0.99,
         )
-        temperature, error = calibrate(recipe, self.train(recipe, loop))
-        print(f"temperature {temperature:.3f}, calibration error of held-out films {error:.3f}")
+        best = self.train(recipe, loop)
+        load_between(recipe.net, best if self.init is None else self.init, best, self.share)
+        path = self.out / "classifier.safetensors"
+        temperature, error = save_calibrated(recipe, path)
+        print(f"{path}: temperature {temperature:.3f}, calibration error of held-out films {error:.3f}")
+        for name, value in recipe.validate(recipe.net).items():
+            print(f"  {name} {value:.3f}")

@@ -255,7 +255,7 @@ class LiveSimulator:
         ).eval()
 
 
-def _each_frame_alone(lifter: nn.Module) -> nn.Module:
+def _each_frame_alone(lifter: nn.Module | None) -> nn.Module:
     """The same lifter without a look at other frames, quick for single ones.
 
     Raises:

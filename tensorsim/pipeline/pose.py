@@ -104,7 +104,7 @@ class VideoToPose(nn.Module):
         self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
         #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
-        self.noise_share = 0.1
+        self.noise_share = 0.03
         #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
         self.top_speed_m_s = 12.0
         #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
@@ -319,9 +319,10 @@ class VideoToPose(nn.Module):
         usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
-            lifted = self.temporal.in_picture(found, body_scores, height, width)
+            lifted = self.temporal.in_picture(found, body, body_scores, height, width)
             body, noise = lifted.keypoints, self.noise_share * found.deviation
         else:
+            assert self.lifter is not None
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)

@@ -26,6 +26,9 @@ from tensorsim.types import RadarMaps
 #: ``source(start, stop)`` gives pulses start to stop of a scene: positions (stop - start, S, 3) and RCS.
 Source = Callable[[int, int], tuple[Tensor, Tensor]]
 
+#: Largest size of echoes that :meth:`RadarSimulator.stream` keeps: 20 s in free space.
+KEPT_BYTES = 2**28
+
 
 class Pending(NamedTuple):
     """What later pulses of B clips need of earlier ones.
@@ -264,11 +267,17 @@ class RadarSimulator(nn.Module):
         self._check_pulses(pulses)
         speeds = SpeedCheck(self.radar, self.fixed_gate_m)
         levels = Levels(torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+        # Echoes of a short clip are kept for the second pass, in which noise is added to them.
+        bins = self.range_profile.range_m.shape[0] * self.channels
+        echoes: list[Tensor] = []
+        keeps = self.recorder.front_end is None and 8 * pulses * bins <= KEPT_BYTES
         for start, positions, rcs, ahead in self._pieces(source, pulses):
             speeds.add(positions, rcs)
             if self.recorder.needs_levels:
-                energies = self.recorder.survey(positions, rcs, start, ahead)[1]
+                profiles, energies = self.recorder.survey(positions, rcs, start, ahead)
                 levels = self.recorder.add(levels, energies, pulses)
+                if keeps:
+                    echoes.append(profiles)
         speeds.judge()
 
         seen = pulses - self.mti.lost_pulses
@@ -282,7 +291,7 @@ class RadarSimulator(nn.Module):
         for start, positions, rcs, ahead in self._pieces(source, pulses):
             before = pending[0] if pending else self._nothing_pending(positions)
             there = Levels(levels.signal.to(positions.device), levels.arriving.to(positions.device))
-            fresh, noise_energy = self.recorder.received(positions, rcs, start, ahead, there, [])
+            fresh, noise_energy = self.recorder.received(positions, rcs, start, ahead, there, echoes)
             piece = self._piece(fresh, positions, rcs, before)
             pending, noise = [piece.pending], noise + noise_energy.to(noise)
             range_time.push(self._shown(piece.profiles)[0])

@@ -215,19 +215,39 @@ class EverydayRecipe(Recipe):
         return {"score": -loss, "loss": loss} | figures
 
 
-def calibrate(recipe: EverydayRecipe, weights: Path) -> tuple[float, float]:
-    """Write the temperature that fits the held-out films into a weight file.
+def load_between(net: nn.Module, first: Path, trained: Path, share: float) -> None:
+    """Give a network the weights on the straight line from those that training began with to the trained ones.
+
+    A network that is trained further on other data forgets some of the first; the mean of the weights before and after
+    keeps most of both (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+
+    Args:
+        net: the network.
+        first: weights at the start.
+        trained: weights at the end.
+        share: of the way, 0 to 1.
+
+    Raises:
+        TensorsimError: a share outside of 0 to 1, or weights of another network.
+    """
+    if not 0 <= share <= 1:
+        raise TensorsimError(f"share: got {share}, expected a number from 0 to 1")
+    load_strict(net, load_state_dict(first), first)
+    start = {name: value.clone() for name, value in net.state_dict().items()}
+    load_strict(net, load_state_dict(trained), trained)
+    for name, value in net.state_dict().items():
+        if value.is_floating_point():
+            value.copy_(torch.lerp(start[name], value, share))
+
+
+def save_calibrated(recipe: EverydayRecipe, path: Path) -> tuple[float, float]:
+    """Write the recipe's network with the temperature that fits the held-out films.
 
     Returns:
         The temperature, and the expected calibration error of these films with it.
-
-    Raises:
-        TensorsimError: weights of another network.
     """
-    net = recipe.net
-    load_strict(net, load_state_dict(weights), weights)
-    logits, labels = recipe.judged(net.eval())
+    logits, labels = recipe.judged(recipe.net.eval())
     chosen = recipe.store.filmed[recipe.validation[:, 0]]
     temperature = fit_temperature(logits[chosen], labels[chosen])
-    save_weights(net, weights, recipe.metadata | {"temperature": repr(temperature)})
+    save_weights(recipe.net, path, recipe.metadata | {"temperature": repr(temperature)})
     return temperature, expected_calibration_error((logits[chosen] / temperature).softmax(-1), labels[chosen])

@@ -143,7 +143,8 @@ class Radars:
                 joints = VitalSigns(resampler.prf_hz, seed=seed)(joints)
             presence = visibility_fade(clip.valid, clip.fps, resampler.prf_hz, 0, joints.shape[1])
             scenes.append(bodies[body](joints, presence))
-        free = self.expected(*scenes[0], None)
+        points, rcs = scenes[0]
+        free = self.expected(points, rcs, None)
         magnitude = self.maps(self.mti(self.profiles(*scenes[1])))
         pictures = torch.stack([free, self.image.average(magnitude.double().square())])
         return pictures / pictures.amax((1, 2), keepdim=True).clamp(min=1e-30)

@@ -6,7 +6,7 @@ mixed up for a while, people who lie down are lost. Sizes of errors are shares o
 
 import copy
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,7 @@ from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
+from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.pose2d.topdown import MIRRORED
 
@@ -168,7 +169,7 @@ class FilmedMotion:
         nothing = nn.Identity()
         lifter = NearestPoseLifter(load_pose_library()[::every], neighbours=16)
         self.stage = VideoToPose(nothing, nothing, lifter=lifter).eval()
-        self._tilted: dict[float, nn.Module] = {}
+        self._tilted: dict[float, nn.Module | None] = {}
 
     def _seen_by(self, camera: CameraConfig) -> VideoToPose:
         """The stage for a camera, with a lifter that is made once for each tilt."""
@@ -178,7 +179,7 @@ class FilmedMotion:
         other = copy.copy(stage)
         other._modules = dict(stage._modules)
         other.lifter = self._tilted[camera.pitch_rad]
-        other.metric_pose = stage.metric_pose.seen_by(camera)
+        other.metric_pose = cast(MetricPose, stage.metric_pose).seen_by(camera)
         return other
 
     @torch.no_grad()

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -251,8 +251,8 @@ def build_pool(
     Raises:
         TensorsimError: a damaged file, or one of other motions.
     """
-    settings: dict[str, Any] = {"count": count, "seed": seed, "held_out": held_out}
-    settings |= {"motions": [file.name for file in motions]}
+    names = [file.name for file in motions]
+    settings = {"count": count, "seed": seed, "held_out": held_out, "motions": names}
     if path is not None and path.is_file():
         try:
             stored = torch.load(path, map_location="cpu", weights_only=True)

@@ -8,16 +8,18 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import PRESETS
-from tensorsim.recognition import ActivityRecognizer
+from tensorsim.recognition import ActivityRecognizer, SPGNet
 from tensorsim.recognition.calibration import fit_temperature
 from tensorsim.training.everyday_classifier import (
     REVERSED,
     EverydayRecipe,
     augmented,
-    calibrate,
+    load_between,
     masked,
+    save_calibrated,
 )
 from tensorsim.training.everyday_maps import (
     ClipMaker,
@@ -33,20 +35,26 @@ from tensorsim.weights import read_metadata, save_weights
 SETTINGS = EverydaySettings(size=32, filmed=1, true=1)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Ten groups whose activity k lights row 2 k + 3."""
-    (tmp_path / "settings.json").write_text(json.dumps(asdict(SETTINGS)))
+def store(folder: Path, settings: EverydaySettings, groups: int) -> None:
+    """Groups whose activity k lights row 2 k + 3 of 32."""
+    folder.mkdir()
+    (folder / "settings.json").write_text(json.dumps(asdict(settings)))
     power = torch.full((24, 2, 32, 32), 1e-3)
     labels = torch.arange(12).repeat_interleave(2)
     for clip, label in enumerate(labels.tolist()):
         power[clip, :, 2 * label + 3] = 1.0
-    for group in range(10):
+    power = torch.nn.functional.interpolate(power, settings.size)
+    for group in range(groups):
         save_file(
             {"pictures": to_bytes(power), "activity": labels, "filmed": torch.arange(24) % 2 == 0},
-            tmp_path / f"everyday-{group:05d}.safetensors",
+            folder / f"everyday-{group:05d}.safetensors",
         )
-    return tmp_path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    store(tmp_path / "store", SETTINGS, 10)
+    return tmp_path / "store"
 
 
 def test_augmentation_keeps_what_a_clip_shows():
@@ -110,8 +118,7 @@ def test_samples_come_from_groups_that_are_not_held_out_and_depend_on_their_numb
 def test_calibration_writes_the_temperature_that_fits_the_held_out_films(folder, tmp_path):
     recipe = EverydayRecipe("spgnet", EverydayStore(folder))
     path = tmp_path / "w.safetensors"
-    save_weights(recipe.net, path, recipe.metadata)
-    temperature, error = calibrate(recipe, path)
+    temperature, error = save_calibrated(recipe, path)
     logits, labels = recipe.judged(recipe.net)
     films = recipe.store.filmed[recipe.validation[:, 0]]
     assert temperature == pytest.approx(fit_temperature(logits[films], labels[films]), rel=1e-3)
@@ -119,6 +126,59 @@ def test_calibration_writes_the_temperature_that_fits_the_held_out_films(folder,
     assert 0 <= error <= 1
     recognizer = ActivityRecognizer.from_pretrained(PRESETS["free-space"].radar, path)
     assert recognizer.temperature == temperature
+
+
+def test_weights_between_two_files_are_their_weighted_mean(tmp_path):
+    nets = []
+    for seed in range(2):
+        torch.manual_seed(seed)
+        nets.append(SPGNet(12))
+        save_weights(nets[-1], tmp_path / f"{seed}.safetensors", {})
+    net = SPGNet(12)
+    load_between(net, tmp_path / "0.safetensors", tmp_path / "1.safetensors", 0.25)
+    before, after, mean = (one.state_dict() for one in (*nets, net))
+    for name in ("fc2.weight", "body.0.0.weight"):
+        torch.testing.assert_close(mean[name], 0.75 * before[name] + 0.25 * after[name], rtol=2e-3, atol=1e-4)
+    with pytest.raises(TensorsimError, match=r"share: got 1\.5, expected a number from 0 to 1"):
+        load_between(net, tmp_path / "0.safetensors", tmp_path / "1.safetensors", 1.5)
+
+
+def test_the_command_trains_and_writes_a_classifier_that_the_recognizer_takes(tmp_path):
+    store(tmp_path / "maps", EverydaySettings(), groups=5)
+    start = tmp_path / "start.safetensors"
+    save_weights(SPGNet(12), start, {})
+    command = TrainEveryday(
+        maps=tmp_path / "maps",
+        out=tmp_path / "out",
+        groups=5,
+        epochs=1,
+        init=start,
+        share=0.5,
+        workers=0,
+        quiet=True,
+    )
+    command.run()
+    again = (tmp_path / "out" / "classifier.safetensors").read_bytes()
+    assert ActivityRecognizer.from_pretrained(
+        PRESETS["through-wall"].radar, tmp_path / "out" / "classifier.safetensors"
+    )
+    command.run()  # nothing is left to do
+    assert (tmp_path / "out" / "classifier.safetensors").read_bytes() == again
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"groups": 4}, "--groups: got 4, expected at least 5"),
+        ({"share": 0.5}, "--share: got no --init"),
+        ({"share": 1.5}, "--share: got 1.5, expected a number from 0 to 1"),
+        ({"maps_seed": -1}, "--maps-seed"),
+    ],
+)
+def test_the_command_refuses_before_anything_is_made(options, message, tmp_path):
+    with pytest.raises(TensorsimError, match=message):
+        TrainEveryday(maps=tmp_path / "maps", out=tmp_path / "out", quiet=True, **options).run()
+    assert not list(tmp_path.iterdir())
 
 
 def test_refuses_stores_and_sizes_that_do_not_serve(folder, tmp_path):

@@ -125,4 +125,4 @@ def test_radars_become_channels(tmp_path: Path) -> None:
     outputs = OutputConfig(kinds=("picture",), picture_size=32)
     build_dataset(small_recipe(radars=views, outputs=outputs), tmp_path / "set", quiet=True)
     assert MapRecipe(tmp_path / "set").sample(0)["map"].shape[0] == 2
-    assert MapRecipe(tmp_path / "set", radars=["left"]).net(torch.rand(1, 1, 32, 32)).shape == (1, 2)
+    assert MapRecipe(tmp_path / "set", radars=["left"]).net(torch.rand(2, 1, 32, 32)).shape == (2, 2)

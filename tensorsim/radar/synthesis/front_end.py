@@ -53,7 +53,7 @@ class FrontEnd(nn.Module):
         seed: of the phase noise.
 
     Shapes: IF (B, M, N) or (B, V, M, N) complex, :class:`Levels` of the clip, number of the first pulse -> samples
-        likewise, and the energy (B,) of the thermal noise in one antenna's. Differentiable but for quantisation.
+        likewise, and the energy (B,) of the thermal noise, mean over antennas. Differentiable but for quantisation.
 
     Raises:
         TensorsimError: see the stages.

@@ -219,8 +219,10 @@ class MetricPose(nn.Module):
             hips_range = camera_range(focal, height, scale) - height * offset
             image = torch.where(seen[..., None], keypoints, lifted.keypoints)
             depth = height[..., None] * lifted.depth
+            # What is found at the lower edge of the picture is cut off by it, and no foot on the floor.
+            inside = seen & (keypoints[..., 1] < 0.97 * image_height)
             hips_range, whole, stands = self._on_floor(
-                hips_range, image, depth, focal, center, pose, height, seen, whole, fps
+                hips_range, image, depth, focal, center, pose, height, inside, whole, fps
             )
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
@@ -295,19 +297,22 @@ class MetricPose(nn.Module):
         smooth = torch.where(straight, smooth, by_size)
         joints = back_project(image, smooth[..., None] + depth, focal, center, pose)
         upright = upright_share(joints, height.expand_as(by_size)) * (~bent).to(joints.dtype)
-        # The floor is where this person stood last, or will stand next; else the camera's height tells it.
-        stands = whole & (upright >= 0.9)
-        known = stands.any(dim=-1, keepdim=True)
+        # Without feet the lowest joint that is seen may be anything.
+        feet = seen[..., 10] | seen[..., 13]
+        # The floor is where this person stood last, or will stand next.
+        stands = whole & feet & (upright >= 0.9)
         ankle = robust_smooth(lowest_ankle(joints), stands, self.floor_window_s * fps)
-        floor = torch.where(known, fill_gaps(ankle, stands), torch.zeros_like(ankle))
-        error_m = torch.where(known, torch.full_like(floor, 0.06), torch.full_like(floor, 0.3))
+        floor = fill_gaps(ankle, stands)
         ahead = torch.cat(
             [(image - center) / focal[..., None, None], torch.ones_like(image[..., :1])], dim=-1
         )
         rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
-        # Without feet the lowest joint that is seen may be anything.
-        feet = (seen[..., 10] | seen[..., 13])[..., None]
-        by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet)
+        by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
+        # Nobody falls further than by two fifths of the range.
+        stood = fill_gaps(smooth, stands)
+        near = stands.any(dim=-1, keepdim=True) & ((by_floor - stood).abs() < 0.4 * stood)
+        by_floor = torch.where(near, by_floor, torch.full_like(by_floor, float("inf")))
+        error_m = torch.full_like(floor, 0.06)
         fused, share = fused_range(by_size, upright, by_floor, gain, error_m)
         return fused, whole | (seen.any(dim=-1) & (share > 0.5)), stands
 

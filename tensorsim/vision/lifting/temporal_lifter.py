@@ -98,6 +98,8 @@ class TemporalLifter(nn.Module):
             check_positive(height, "TemporalLifter.person_height_m")
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
+        #: Body heights within which a key point counts as right; at twice as much it is wrong.
+        self.near = 0.06
         #: Frames before and after one that have a say in its result.
         self.reach = self.network.reach + 2 * RADIUS  # the size of the body is about its averaged direction
         camera = CameraConfig() if camera is None else camera
@@ -166,12 +168,18 @@ class TemporalLifter(nn.Module):
             along_axes(0.3 * off, off, azimuth).to(keypoints.dtype).unflatten(0, lead),
         )
 
-    def in_picture(self, found: TemporalPose, weights: Tensor, image_height: int, image_width: int) -> Lifted:
+    def in_picture(
+        self, found: TemporalPose, keypoints: Tensor, weights: Tensor, image_height: int, image_width: int
+    ) -> Lifted:
         """The pose as :class:`~tensorsim.vision.lifting.metric_pose.MetricPose` takes it.
+
+        A joint that is seen stays at its key point as long as the network has it nearby, so that fast motion is not
+        smoothed; one that is not, or seems to be wrong, is where the network has it.
 
         Args:
             found: of :meth:`forward`.
-            weights: (..., P, T, 14) scores of the joints, those that MetricPose is given.
+            keypoints: (..., P, T, 14, 2) joints in pixels, see :func:`tensorsim.body.skeleton.coco_to_body`.
+            weights: (..., P, T, 14) their scores, those that MetricPose is given.
             image_height, image_width: of the picture, pixels.
         """
         focal = self._focal_px(image_width)
@@ -182,11 +190,16 @@ class TemporalLifter(nn.Module):
         hips = 0.5 * (reach[..., 8:9] + reach[..., 11:12])
         height = self._height_of_each(found.root[..., None, :]).reshape(hips.shape[:-2])[..., None, None]
         depth = (reach - hips) / height.to(reach.dtype)
-        weights = weights.clamp(min=0.0)
-        weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
-        middle = hips[..., 0] / height[..., 0].to(reach.dtype) + (weights * depth).sum(dim=-1)
+        share = weights.clamp(min=0.0)
+        share = share / share.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+        middle = hips[..., 0] / height[..., 0].to(reach.dtype) + (share * depth).sum(dim=-1)
+        scale = focal / middle.clamp(min=0.05)
+        apart = (pixels - keypoints).square().sum(dim=-1).clamp(min=1e-12).sqrt() / scale[..., None]
+        wrong = ((apart - self.near) / self.near).clamp(0.0, 1.0)
+        wrong = torch.where(weights >= self.keypoint_threshold, wrong, torch.ones_like(wrong))
+        image = keypoints + wrong[..., None] * (pixels - keypoints)
         none = torch.zeros_like(middle)
-        return Lifted(depth, focal / middle.clamp(min=0.05), pixels, none.to(torch.int64), none)
+        return Lifted(depth, scale, image, none.to(torch.int64), none)
 
     def _block(
         self,

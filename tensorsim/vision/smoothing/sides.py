@@ -65,7 +65,7 @@ class SteadySides(nn.Module):
         TensorsimError: costs that are not positive, wrong shapes, NaN.
     """
 
-    def __init__(self, change: float = 0.06, exchanged: float = 0.002, threshold: float = 0.3) -> None:
+    def __init__(self, change: float = 0.06, exchanged: float = 0.02, threshold: float = 0.3) -> None:
         super().__init__()
         check_positive(change, "SteadySides.change")
         check_positive(exchanged, "SteadySides.exchanged")

@@ -58,11 +58,8 @@ class TestReceiverNoiseScripts(StageTester):
         module, (x, echo) = self.make(), self.inputs((3,), torch.float32)
         assert not torch.equal(module(x, echo), module(x, echo))
 
-    def test_batch_equals_loop(self):
-        pytest.skip("clips of a batch draw from one generator")
-
-    def test_float32_near_float64(self):
-        pytest.skip("precisions draw different noise")
+    test_batch_equals_loop = None  # clips of a batch draw from one generator
+    test_float32_near_float64 = None  # precisions draw different noise
 
     def test_scripted_equals_eager(self):
         module, (x, echo) = self.make(), self.inputs((3,), torch.float32)
@@ -182,8 +179,7 @@ class TestProfileNoise(StageTester):
         x = signal(*batch, 6, 8)
         return x.to(torch.complex128 if dtype == torch.float64 else torch.complex64), torch.zeros(*batch)
 
-    def test_refuses_bad_input(self):
-        pytest.skip("an inner stage: the simulator has checked its arguments")
+    test_refuses_bad_input = None  # an inner stage: the simulator has checked its arguments
 
 
 @pytest.mark.parametrize(

@@ -52,8 +52,7 @@ class TestPoseSearch(StageTester):
         weights[1:] = torch.where(torch.arange(batch[0])[1:, None] % 2 == 0, weights[1:], 1.0)
         return keypoints, weights
 
-    def test_refuses_bad_input(self) -> None:
-        """The lifter checks what it passes on."""
+    test_refuses_bad_input = None  # an inner stage: the lifter checks what it passes on
 
 
 def brute_force(keypoints: np.ndarray, poses: np.ndarray) -> np.ndarray:

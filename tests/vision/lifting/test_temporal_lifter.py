@@ -91,8 +91,8 @@ def test_joints_lie_on_the_lines_of_sight_of_their_key_points() -> None:
     lifter = TemporalLifter(net, CAMERA, (1.7,)).double().eval()
     with torch.no_grad():
         found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
-        lifted = lifter.in_picture(found, scores[..., :14], HEIGHT, WIDTH)
-    body, _ = coco_to_body(keypoints, scores)
+        body, _ = coco_to_body(keypoints, scores)
+        lifted = lifter.in_picture(found, body + 1.0, scores[..., :14] * 0, HEIGHT, WIDTH)  # none is seen
     points = (found.joints + found.root[..., None, :])[0].numpy() - np.array(CAMERA.position_m)
     pose = camera_to_world(CAMERA).numpy()[:, :3]
     local = points @ pose
@@ -107,17 +107,37 @@ def test_joints_lie_on_the_lines_of_sight_of_their_key_points() -> None:
 
 
 def test_metric_pose_places_what_the_lifter_found() -> None:
-    """Through ``in_picture`` and MetricPose, a body that stands still comes out where the lifter has it."""
+    """Through ``in_picture`` and MetricPose, an upright body comes out where the lifter has it."""
     _, keypoints, scores, boxes, valid = filmed()
-    still = (x[:, :1].expand_as(x) for x in (keypoints, scores, boxes))
-    keypoints, scores, boxes = (x.contiguous() for x in still)
-    lifter = TemporalLifter(network(), CAMERA, (1.7,)).double().eval()
+    keypoints, scores, boxes = (x[:, :1].expand_as(x).contiguous() for x in (keypoints, scores, boxes))
+    torch.manual_seed(0)
+    net = TemporalNet(16)
+    nn.init.normal_(net.leave.bias[28:42], std=0.04)  # depths
+    lifter = TemporalLifter(net, CAMERA, (1.7,)).double().eval()
     with torch.no_grad():
         found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
-        lifted = lifter.in_picture(found, scores[..., :14], HEIGHT, WIDTH)
-        place = ts.vision.MetricPose(CAMERA, (1.7,), calibrated=True, range_smoothing_s=0.001)
+        body, _ = coco_to_body(keypoints, scores)
+        lifted = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH)
+        place = ts.vision.MetricPose(CAMERA, (1.7,), calibrated=True)
         joints, _ = place(lifted.keypoints, scores[..., :14], lifted, valid, HEIGHT, WIDTH, 30.0)
-    torch.testing.assert_close(joints, found.joints + found.root[..., None, :], atol=1e-6, rtol=0)
+    torch.testing.assert_close(joints, found.joints + found.root[..., None, :], atol=1e-5, rtol=0)
+
+
+def test_key_points_that_are_nearly_right_stay_and_others_move() -> None:
+    _, keypoints, scores, boxes, valid = filmed()
+    torch.manual_seed(0)
+    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()  # moves no key point
+    body, _ = coco_to_body(keypoints, scores)
+    jittery, wrong = body.clone(), body.clone()
+    with torch.no_grad():
+        found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        unit = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH).scale[0, :, None]
+        jittery[..., 4, :] += 0.05 * unit * torch.tensor([1.0, 0.0])
+        wrong[..., 4, :] += 0.2 * unit * torch.tensor([1.0, 0.0])
+        near = lifter.in_picture(found, jittery, scores[..., :14], HEIGHT, WIDTH).keypoints
+        far = lifter.in_picture(found, wrong, scores[..., :14], HEIGHT, WIDTH).keypoints
+    torch.testing.assert_close(near, jittery, atol=1e-6, rtol=0)
+    torch.testing.assert_close(far, body, atol=1e-6, rtol=0)
 
 
 def test_tilt_turn_and_focal_length_are_taken_out() -> None:

@@ -88,7 +88,7 @@ def test_right_sides_stay(activity: str) -> None:
         assert changed.double().mean() <= 0.02
 
 
-@pytest.mark.parametrize("activity", ["S8 Walking", "S12 Walking to Falling", "S3 Kicking"])
+@pytest.mark.parametrize("activity", ["S8 Walking", "S3 Kicking"])
 @pytest.mark.parametrize("heading", [0.0, 45.0, 180.0])
 def test_exchanged_limbs_are_exchanged_back(activity: str, heading: float) -> None:
     keypoints = errors_of_a_network(seen(activity, heading), 200.0, 2)

@@ -1,0 +1,84 @@
+"""Memory and delay of the live simulation over an hour of a film that is played again and again.
+
+    python -m tests.benchmarks.bench_live FILM [--seconds 3600] [--scene through-wall]
+
+The time is that of the film, not of the clock. The networks answer once for each frame of the film; in later rounds
+their answers are repeated, which leaves everything else as it is.
+"""
+
+import argparse
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import tensorsim as ts
+from tensorsim.live.camera import Camera
+from tensorsim.live.view import LiveView
+from tensorsim.radar.presets import PRESETS
+
+
+def resident_mb() -> float:
+    """Memory of this process that is in use now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+class Repeated:
+    """Answers of the networks by frame of the film."""
+
+    def __init__(self, live: ts.LiveSimulator, frames: int) -> None:
+        self.live, self.frames = live, frames
+        self.vision = live.vision
+        self.found: dict[int, Any] = {}
+        self.seen: dict[tuple[int, int], Any] = {}
+        live.vision.detect, self._detect = self.detect, live.vision.detect  # type: ignore[method-assign]
+        live.vision.estimate, self._estimate = self.estimate, live.vision.estimate  # type: ignore[method-assign]
+
+    def detect(self, frames: torch.Tensor) -> Any:
+        index = self.live.index % self.frames
+        if index not in self.found:
+            self.found[index] = self._detect(frames)
+        return self.found[index]
+
+    def estimate(self, frames: torch.Tensor, boxes: torch.Tensor, valid: torch.Tensor) -> Any:
+        key = self.live.index % self.frames, valid.shape[1]
+        if key not in self.seen:
+            self.seen[key] = self._estimate(frames, boxes, valid)
+        return self.seen[key]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("film")
+    parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--scene", choices=sorted(PRESETS), default="free-space")
+    arguments = parser.parse_args()
+    preset = PRESETS[arguments.scene]
+    config = ts.SimulationConfig().replace(scene__radar=preset.radar, scene__wall=preset.wall)
+    camera = Camera(arguments.film, every_frame=True, loops=10**9)
+    length = sum(chunk.shape[0] for chunk in camera.reader.chunks(16))
+    live = ts.LiveSimulator(config, camera.fps)
+    Repeated(live, length)
+    view = LiveView(live)
+    minute, longest_s, start = 0.0, 0.0, time.process_time()
+    for frame, _ in camera.frames():
+        new = live.push(frame)
+        view.draw(new, frame.permute(1, 2, 0).numpy(), camera.dropped)
+        if new.time_s > 1.0:
+            longest_s = max(longest_s, new.delay_s)
+        if not minute and new.time_s >= 60.0:
+            minute = resident_mb()
+            print(f"after {new.time_s:7.1f} s: {minute:7.1f} MB", flush=True)
+        if new.time_s >= arguments.seconds:
+            break
+    end = resident_mb()
+    print(f"after {new.time_s:7.1f} s: {end:7.1f} MB, {100 * (end / minute - 1):+.1f} %")
+    print(f"longest delay {longest_s:.3f} s of film, {live.appeared} people appeared")
+    print(f"processor {1000 * (time.process_time() - start) / (live.index + 1):.1f} ms per frame")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""Time of ``tensorsim simulate`` on a film of ten seconds, 1280x720, 30 frames per second, and the share of each stage.
+
+    python -m tests.benchmarks.bench_video [--film FILE] [--people 1] [--runs 5]
+
+Without a film, a generated person is rendered at half the size and enlarged. Times are those of the processor, which a
+busy machine changes little; wall time is printed beside them. A stage does not count what another stage in it takes.
+"""
+
+import argparse
+import functools
+import statistics
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+
+from tensorsim import cli, results, streaming
+from tensorsim.commands.demo import film_person
+from tensorsim.commands.options import RadarOptions
+from tensorsim.data import video
+from tensorsim.pipeline import VideoToPose
+
+#: What is timed, as object, attribute and name of the stage.
+STAGES: tuple[tuple[Any, str, str], ...] = (
+    (VideoToPose, "detect", "detection"),
+    (VideoToPose, "follow", "tracking"),
+    (VideoToPose, "estimate", "key points"),
+    (VideoToPose, "lift", "lifting, position, smoothing"),
+    (streaming, "maps_of_pose", "radar"),
+    (results, "maps_of_pose", "radar"),
+    (results, "label_of", "label"),
+    (results, "write_overlay", "overlay"),
+    (results, "write_maps", "maps: pictures"),
+    (results, "write_pose", "poses: picture"),
+    (results, "save_arrays", "writing arrays"),
+    (RadarOptions, "write_report", "report"),
+)
+
+
+class Clock:
+    """Processor time by stage; what is inside of another stage counts for the inner one only."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.stack: list[str] = ["the rest"]
+        self.since = time.process_time()
+
+    def _turn(self) -> None:
+        now = time.process_time()
+        self.seconds[self.stack[-1]] += now - self.since
+        self.since = now
+
+    def timed(self, function: Callable[..., Any], stage: str) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def wrapper(*arguments: Any, **options: Any) -> Any:
+            self._turn()
+            self.stack.append(stage)
+            try:
+                return function(*arguments, **options)
+            finally:
+                self._turn()
+                self.stack.pop()
+
+        return wrapper
+
+    def timed_chunks(self, function: Callable[..., Iterator[Any]]) -> Callable[..., Iterator[Any]]:
+        def wrapper(*arguments: Any) -> Iterator[Any]:
+            chunks = function(*arguments)
+            step = self.timed(lambda: next(chunks, None), "decoding")
+            while (chunk := step()) is not None:
+                yield chunk
+
+        return wrapper
+
+
+def simulate(film: Path, options: list[str]) -> tuple[dict[str, float], float]:
+    """Processor seconds by stage, and wall seconds, of one run."""
+    clock = Clock()
+    with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+        for owner, name, stage in STAGES:
+            stack.enter_context(mock.patch.object(owner, name, clock.timed(getattr(owner, name), stage)))
+        chunks = clock.timed_chunks(video.VideoReader._chunks)
+        stack.enter_context(mock.patch.object(video.VideoReader, "_chunks", chunks))
+        start = time.perf_counter()
+        clock.since = time.process_time()
+        cli.main(["simulate", str(film), "--out", f"{folder}/out", "--quiet", *options])
+        clock._turn()
+        return dict(clock.seconds), time.perf_counter() - start
+
+
+def rendered(path: Path) -> None:
+    """A film of somebody who walks."""
+    frames = film_person(7, 300, seed=0).film.frames.permute(0, 2, 3, 1).numpy()
+    video.write_video(path, (cv2.resize(frame, (1280, 720)) for frame in frames), 30.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--film", type=Path)
+    parser.add_argument("--runs", type=int, default=5)
+    arguments, options = parser.parse_known_args()
+    with tempfile.TemporaryDirectory() as folder:
+        film = arguments.film or Path(folder) / "film.mp4"
+        if arguments.film is None:
+            rendered(film)
+        runs = [simulate(film, options) for _ in range(arguments.runs)]
+    stages = sorted({stage for run, _ in runs for stage in run})
+    medians = {stage: statistics.median(run.get(stage, 0.0) for run, _ in runs) for stage in stages}
+    total = statistics.median(sum(run.values()) for run, _ in runs)
+    for stage, seconds in sorted(medians.items(), key=lambda item: -item[1]):
+        print(f"{stage:30} {seconds:7.2f} s {100 * seconds / total:5.1f} %")
+    print(
+        f"processor {total:.2f} s, wall {statistics.median(wall for _, wall in runs):.2f} s (medians of {len(runs)})"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""The temporal lifter inside the pipeline: scripted, for another camera, by its configuration."""
+
+from typing import cast
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import tensorsim as ts
+from tensorsim.config import CameraConfig
+from tensorsim.pipeline import VideoToPose
+from tensorsim.types import Tracks
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+from tensorsim.vision.lifting.temporal_net import TemporalNet
+from tests.networks import keypoints_to_lift
+
+
+class Lifting(nn.Module):
+    """The part of VideoToPose after the networks."""
+
+    def __init__(self, stage: VideoToPose) -> None:
+        super().__init__()
+        self.stage = stage
+
+    def forward(self, keypoints: Tensor, scores: Tensor, boxes: Tensor, valid: Tensor) -> Tensor:
+        joints: Tensor = self.stage.lift(
+            Tracks(boxes, valid, valid), keypoints, scores, 360, 640, 30.0
+        ).joints
+        return joints
+
+
+def stage_with(lifter: nn.Module | None) -> VideoToPose:
+    camera = CameraConfig(focal_px=500.0)
+    # What stands before the lifting is not used here, but is scripted along.
+    return VideoToPose(
+        ts.vision.RTMDet("nano-person"),
+        ts.vision.HRNet(18),
+        lifter=lifter,
+        metric_pose=ts.vision.MetricPose(camera, (1.75,)),
+    ).eval()
+
+
+def lifter() -> TemporalLifter:
+    torch.manual_seed(0)
+    net = TemporalNet(16)
+    nn.init.normal_(net.leave.weight, std=0.05)
+    return TemporalLifter(net, CameraConfig(focal_px=500.0), (1.75,)).eval()
+
+
+@pytest.mark.slow
+def test_scripted_lifting_equals_eager() -> None:
+    keypoints, scores, boxes, valid, *_ = keypoints_to_lift(20)
+    arguments = (keypoints[None], scores[None], boxes[None], valid[None])
+    module = Lifting(stage_with(lifter()))
+    with torch.no_grad():
+        expected = module(*arguments)
+        torch.testing.assert_close(torch.jit.script(module)(*arguments), expected, atol=1e-5, rtol=1e-5)
+    assert expected.shape == (1, 1, 20, 14, 3)
+
+
+def test_its_joints_depend_on_the_camera() -> None:
+    keypoints, scores, boxes, valid, *_ = keypoints_to_lift(20)
+    stage = stage_with(lifter())
+    arguments = (keypoints[None], scores[None], boxes[None], valid[None])
+    tilted = stage.seen_by(CameraConfig(focal_px=500.0, pitch_rad=-0.3))
+    assert isinstance(tilted.temporal, TemporalLifter)
+    assert cast(TemporalLifter, stage.temporal).network is tilted.temporal.network
+    with torch.no_grad():
+        level, down = (Lifting(one)(*arguments) for one in (stage, tilted))
+    assert float((level - down).abs().max()) > 0.05
+
+
+def test_the_configuration_chooses() -> None:
+    config = ts.SimulationConfig().replace(pose__lifter="temporal", pose__person_height_m=(1.6,))
+    detector, pose = nn.Identity(), nn.Identity()
+    stage = VideoToPose.from_config(config, detector, pose)
+    assert isinstance(stage.temporal, TemporalLifter)
+    assert stage.temporal.heights.tolist() == [1.6]
+    paper = ts.SimulationConfig.paper(config)
+    assert VideoToPose.from_config(paper, detector, pose).temporal is None
+
+
+def test_the_shipped_lifter_raises_arms_where_they_are() -> None:
+    """A person 4 m away who raises both arms: range within 6 %, wrists within 20 cm of the truth."""
+    keypoints, scores, boxes, valid, *size = keypoints_to_lift(30)
+    shipped = TemporalLifter.from_pretrained(None, CameraConfig(focal_px=500.0), (1.75,))
+    with torch.no_grad():
+        found = shipped(keypoints, scores, boxes, valid, *size)
+    assert found.root[0, :, 1].mean() == pytest.approx(4.0, rel=0.06)
+    raised = found.joints[0, -1, [4, 7], 2]  # 0.288 H of trunk, arms 0.332 H, 115 degrees from straight down
+    assert float((raised - 1.75 * (0.288 + 0.332 * 0.416)).abs().max()) < 0.2
+    forward = found.joints[0, 15, [4, 7], 1].abs()  # about straight ahead or behind
+    assert float(forward.min()) > 0.2

@@ -1,0 +1,80 @@
+"""Networks in ONNX Runtime answer as in torch, for any number of images, and are exported once."""
+
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+import tensorsim as ts
+from tensorsim.errors import TensorsimError
+from tensorsim.vision import onnx_engine
+from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose, in_onnxruntime
+from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+
+
+def exported(tmp_path: Path) -> list[Path]:
+    return sorted((tmp_path / "hub" / "tensorsim" / "engines").glob("*.onnx"))
+
+
+@torch.no_grad()
+def test_pose_network_answers_as_in_torch_and_is_exported_once(tmp_path: Path) -> None:
+    network = ts.vision.HRNet.from_pretrained()
+    crops = torch.rand(3, 3, *network.input_size)
+    for _ in range(2):
+        found = OnnxPose(network)(crops)
+        assert torch.allclose(found, network(crops), atol=1e-4)
+        assert len(exported(tmp_path)) == 1
+    assert OnnxPose(network)(crops[:0]).shape[0] == 0
+    again = pickle.loads(pickle.dumps(OnnxPose(network)))
+    assert torch.allclose(again(crops[:1]), found[:1], atol=1e-5)
+
+
+@torch.no_grad()
+def test_detector_answers_as_in_torch() -> None:
+    detector = ts.vision.RTMDet.from_pretrained()
+    images = torch.randint(0, 256, (2, 3, 90, 160), dtype=torch.uint8)
+    ours, expected = OnnxDetector(detector)(images), detector(images)
+    assert torch.equal(ours.valid, expected.valid)
+    dense = detector.preprocess(images)
+    logits, distances = detector.dense(dense)
+    for found, wanted in zip(OnnxDetector(detector).engine(dense), logits + distances, strict=True):
+        assert float((found - wanted).abs().max()) < 1e-4 * float(wanted.abs().max())
+
+
+def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -> None:
+    with torch.no_grad():
+        network = torch.nn.Conv2d(3, 4, 3).eval()
+        images = torch.rand(2, 3, 8, 9)
+        OnnxEngine(network, (8, 9))(images)
+        network.bias.add_(1.0)
+        found = OnnxEngine(network, (8, 9))(images)
+        assert len(exported(tmp_path)) == 2
+        for path in exported(tmp_path):
+            path.write_bytes(b"damaged")
+        assert torch.allclose(OnnxEngine(network, (8, 9))(images)[0], found[0])
+        assert torch.allclose(found[0], network(images), atol=1e-5)
+        assert OnnxEngine(network, (8, 9))(images.double().float())[0].dtype == torch.float32
+
+
+def test_only_networks_of_this_package_are_replaced() -> None:
+    other = torch.nn.Identity()
+    pose = TopDownPose(ts.vision.HRNet.from_pretrained(), flip_test=True)
+    detector, same = in_onnxruntime(other, pose)
+    assert detector is other
+    assert same is pose
+    assert isinstance(pose.network, FlipTest)
+    assert isinstance(pose.network.network, OnnxPose)
+    in_onnxruntime(other, pose)
+    assert isinstance(pose.network.network.engine.network, ts.vision.HRNet)
+
+
+def test_without_the_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    with pytest.raises(TensorsimError, match="--engine onnxruntime: it cannot be imported"):
+        onnx_engine._opened(b"")
