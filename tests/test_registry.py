@@ -182,6 +182,7 @@ def test_shipped_entries_are_in_order(entry: ModelEntry) -> None:
 #: What each network of a shipped file is shown, by its class or the name of the file.
 SHOWN = {
     "RTMDet": (1, 3, 96, 128),
+    "AcfDetector": (1, 3, 160, 96),
     "HRNet": (1, 3, 64, 64),
     "DnCNN": (2, 24, 40),
     "SPNet": (2, 1, 64, 64),
