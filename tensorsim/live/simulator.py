@@ -110,6 +110,7 @@ class LiveSimulator:
             ("an initial distance", config.pose.initial_distance_m is not None),
             ("calibration", config.pose.calibrate),
             ("position 'paper'", config.pose.position == "paper"),
+            ("the temporal lifter", config.pose.lifter != "nearest"),
             (f"people {config.pose.people!r}", config.pose.people != "all"),
         ):
             if given:
