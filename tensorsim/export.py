@@ -67,6 +67,12 @@ def to_onnx(
         raise TensorsimError(f"{os.fspath(path)}: is a folder, expected a file to write")
     shapes: Any = None
     if dynamic:
+        for i, dimensions in dynamic.items():
+            for d, name in dimensions.items():
+                if example[i].shape[d] < 2:
+                    raise TensorsimError(
+                        f"to_onnx: got {example[i].shape[d]} for the dynamic dimension {name}, expected at least 2"
+                    )
         shapes = tuple(
             {d: torch.export.Dim(name) for d, name in dynamic.get(i, {}).items()} for i in range(len(example))
         )

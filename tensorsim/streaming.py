@@ -12,7 +12,12 @@ from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.progress import picture, progress_bar
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
-from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, camera_config
+from tensorsim.vision.calibration.calibrator import (
+    CameraCalibrator,
+    CameraEstimate,
+    camera_config,
+    with_reserve,
+)
 from tensorsim.vision.smoothing.even_time import to_even_time
 
 
@@ -68,7 +73,7 @@ def calibrated(
     heights = stage.metric_pose.heights
     assert isinstance(heights, Tensor)
     calibrator = CameraCalibrator(tuple(heights.tolist()), keypoint_threshold=stage.keypoint_threshold)
-    found = calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps)
+    found = with_reserve(calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps))
     return stage.seen_by(camera_config(found)), found
 
 

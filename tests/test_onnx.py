@@ -68,6 +68,11 @@ def test_a_folder_is_refused(tmp_path: Path) -> None:
         ts.export.to_onnx(nn.Linear(1, 1), tmp_path, (torch.zeros(1, 1),))
 
 
+def test_a_dynamic_dimension_needs_two(tmp_path: Path) -> None:
+    with pytest.raises(ts.TensorsimError, match="got 1 for the dynamic dimension batch, expected at least 2"):
+        ts.export.to_onnx(nn.Linear(1, 1), tmp_path / "m.onnx", (torch.zeros(1, 1),), {0: {0: "batch"}})
+
+
 def test_pairs_stand_for_complex_numbers() -> None:
     x = torch.randn(2, 64, 20, dtype=torch.complex64)
     mti = ts.radar.MovingTargetIndicator()

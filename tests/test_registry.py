@@ -182,6 +182,7 @@ def test_shipped_entries_are_in_order(entry: ModelEntry) -> None:
 #: What each network of a shipped file is shown, by its class or the name of the file.
 SHOWN = {
     "RTMDet": (1, 3, 96, 128),
+    "AcfDetector": (1, 3, 160, 96),
     "HRNet": (1, 3, 64, 64),
     "DnCNN": (2, 24, 40),
     "SPNet": (2, 1, 64, 64),
@@ -212,7 +213,8 @@ def test_shipped_networks_load_run_and_script(entry: ModelEntry) -> None:
 
 def test_shipped_files_are_small() -> None:
     sizes = {entry.name: entry.path.stat().st_size for entry in registry.shipped()}
-    assert sum(sizes.values()) <= 40e6
+    assert sum(sizes.values()) <= 45e6
+    assert sizes["temporal-lifter-small"] <= 4e6
     assert sizes["rtmdet-person-small"] <= 5e6
     assert sizes["hrnet-pose-small"] <= 10e6
 

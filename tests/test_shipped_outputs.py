@@ -11,6 +11,7 @@ from torch.nn import functional as F
 import tensorsim as ts
 from tensorsim import registry
 from tensorsim.recognition import SPGNet
+from tensorsim.vision.detection.acf_features import aggregate_channels
 from tests.networks import keypoints_to_lift
 
 
@@ -25,6 +26,13 @@ def detector_logits(network: ts.vision.RTMDet) -> Tensor:
     return torch.cat([part.flatten()[::97] for part in (*logits, *distances)])
 
 
+def tree_sums(network: ts.vision.AcfDetector) -> Tensor:
+    network.cascade = -1e9  # every window passes
+    channels = aggregate_channels(wave(1, 3, 144, 96))[0]
+    corners = torch.tensor([24 * row + column for row in range(5) for column in (0, 4, 8)])
+    return network.pass_cascade(channels, corners)[1]
+
+
 #: The numbers of each class that are looked at.
 LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "SPGNet": lambda network: network(wave(1, 1, 32, 32)),
@@ -33,6 +41,7 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "PictureNet": lambda network: network(wave(1, network.channels, network.rows, 64)),
     "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
     "RTMDet": detector_logits,  # type: ignore[dict-item]
+    "AcfDetector": tree_sums,  # type: ignore[dict-item]
     "TemporalLifter": lambda lifter: lifter(*keypoints_to_lift(20)).joints.flatten()[::41],
 }
 
@@ -45,6 +54,11 @@ EXPECTED: dict[str, tuple[list[float], float]] = {
     "5e71e3d3afbb393b": ([-1.27, -0.61743, 0.135903, -0.764562, -3.11734, -1.17418], 1.5107),  # PictureNet
     "635c86394040e891": ([-3.99982, 2.47428, -0.224426, -2.47148], 2.6589),  # PictureNet
     "873b467d3aef57f0": ([-0.62995, 1.20185, -1.79243, 0.190756, -0.119144], 1.0104),  # PictureNet
+    "12247fedcbf33d73": (
+        [0.00287815, -0.873291, -0.01087, -0.10664, -0.4385, 0.0679536],
+        0.36668,
+    ),  # TemporalLifter
+    "58e51ecca587dec2": ([-6.42517, -5.66322, -6.21195, -6.08765, -5.14814, -4.02888], 5.2342),  # AcfDetector
     "ac94cf65a655eeea": (  # HRNet
         [-0.00128937, -0.00141716, -0.00127411, -0.00194263, -0.00210953, -0.00169086],
         0.001421,

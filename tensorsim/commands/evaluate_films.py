@@ -65,7 +65,7 @@ class EvaluateFilms(NetworkOptions):
         if not films:
             raise TensorsimError(f"{self.data}: got no film to label, expected at least one")
         device = usable_device(self.device)
-        stage = VideoToPose(*load_networks(*networks, self.flip_test)).to(device).eval()
+        stage = VideoToPose(*load_networks(*networks, self.flip_test, self.engine)).to(device).eval()
         reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:

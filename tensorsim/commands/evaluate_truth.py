@@ -37,6 +37,8 @@ class EvaluateTruth:
     """For setting c: path or name. Default: $TENSORSIM_DETECTOR, else the shipped one."""
     pose: str | None = None
     """For setting c: path or name. Default: $TENSORSIM_POSE, else the shipped one."""
+    lifter: Literal["temporal", "nearest"] | None = None
+    """How key points are lifted. Default: as `tensorsim simulate` does."""
     seed: int = 0
     """Of the first clip of each activity; the next have the next."""
     jobs: int = 1
@@ -59,13 +61,11 @@ class EvaluateTruth:
 
         from tensorsim.errors import collected_warnings
         from tensorsim.evaluation.report import markdown, save_pictures, write_csv
-        from tensorsim.evaluation.settings import Pipelines
         from tensorsim.evaluation.truth import TruthLoop, example_maps
-        from tensorsim.radar.presets import PRESETS
 
         loop = TruthLoop(
             self.out, self.clips, self.activities, self.motion, self.motion_fps, self.scenes, self.settings,
-            self.stages, detector, pose, self.seed, self.jobs,
+            self.stages, detector, pose, self.seed, self.jobs, self.lifter,
         )  # fmt: skip
         with collected_warnings() as messages:
             cells = loop.run(self.quiet)
@@ -75,7 +75,7 @@ class EvaluateTruth:
         self.out.mkdir(parents=True, exist_ok=True)
         (self.out / "truth.md").write_text(text, encoding="utf-8")
         write_csv(self.out / "truth.csv", cells)
-        pipelines = Pipelines({scene: PRESETS[scene] for scene in self.scenes})
+        pipelines = loop.pipelines()
         for scene in self.scenes:
             pictures = example_maps(loop, pipelines, scene)
             if pictures:

@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from tensorsim.body.skeleton import mid_hips
+from tensorsim.config import PoseConfig
+from tensorsim.config.people import Lifting
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captured_clips
 from tensorsim.evaluation.films import FPS, Filmed, filmed
@@ -45,6 +47,7 @@ class TruthLoop:
         sources: of ``SOURCES``.
         stages: also replace every stage by the truth, in the last of the sources that has it.
         detector, pose: networks, for source "c".
+        lifter: lifter of settings that are not the paper's, in place of the default one.
         seed: of the first clip of each activity.
         jobs: processes.
     """
@@ -61,6 +64,12 @@ class TruthLoop:
     pose: Path | None = None
     seed: int = 0
     jobs: int = 1
+    lifter: Lifting | None = None
+
+    def pipelines(self) -> Pipelines:
+        """What makes the maps of the scenes."""
+        lifter = None if self.lifter is None else PoseConfig(lifter=self.lifter)
+        return Pipelines({name: PRESETS[name] for name in self.scenes}, lifter)
 
     def settings(self) -> list[Setting]:
         """All settings in the order of the tables."""
@@ -147,6 +156,8 @@ class TruthLoop:
             options |= {"motion_fps": self.motion_fps}
         if setting.startswith("c"):
             options |= {"networks": self._networks()}
+        if self.lifter is not None:
+            options |= {"lifter": self.lifter}
         return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{_key(options)}.json"
 
     def film(self, clip: Clip) -> Path:
@@ -195,7 +206,7 @@ def evaluate_row(loop: TruthLoop, row: str, tick: Callable[[], Any]) -> None:
         tick()
     if not missing:
         return
-    pipelines = Pipelines({name: PRESETS[name] for name in loop.scenes})
+    pipelines = loop.pipelines()
     guessing = any(name in GUESSES for _, name in missing)
     truths = _Truths(pipelines, clips, keep=guessing)
     networks: list[nn.Module] = []

@@ -201,7 +201,7 @@ _COLUMNS_AT_MOST = 1024
 
 
 def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
-    """Each denoiser's maps against those of the same echo at 60 dB."""
+    """Each denoiser's maps against those of the same echo at 50 dB."""
     denoisers: dict[str, Callable[[Tensor], Tensor] | None] = {
         name: map_denoiser(name) for name in config.denoisers
     }
@@ -234,7 +234,7 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
     columns = ["scene", "map", "SNR", "denoiser", *COLUMNS]
     notes = [
         f"{config.clips} clips per scene and ratio, the activities from S2 on in turn; each map against that of the "
-        "same echo at 60 dB. RTM is the range-time map after the moving target indicator, 1024 columns of it. "
+        "same echo at 50 dB. RTM is the range-time map after the moving target indicator, 1024 columns of it. "
         "Envelope and ridges are speed errors of the Doppler-time map. K-SVD learns its dictionary by "
         "scikit-learn's online method. DnCNN is the shipped network, trained on such maps of other people; the "
         "paper's was trained on photographs.",

@@ -91,12 +91,11 @@ class PictureSet:
         from safetensors.torch import save_file
 
         missing = [person for person in range(people) if not self._file(person).is_file()]
-        maker = RangeAndRidges(self.scene, self.size) if missing else None
-        motion = MotionMaker(self.settings)
-        for person in tqdm(
-            missing, desc=f"{self.scene}, range and ridges", unit="person", disable=self.work.quiet
-        ):
-            assert maker is not None
+        if not missing:
+            return
+        maker, motion = RangeAndRidges(self.scene, self.size), MotionMaker(self.settings)
+        heading = f"{self.scene}, range and ridges"
+        for person in tqdm(missing, desc=heading, unit="person", disable=self.work.quiet):
             moves = motion(person)
             seed = self.settings.seed * 1_000_003 + person
             found = maker.pictures(moves.joints, moves.valid, self.settings.motion_hz, seed)

@@ -85,10 +85,11 @@ class LiveSimulator:
         config: with range-time maps at a display rate.
 
     Example:
-        >>> live = ts.LiveSimulator(fps=30.0)
-        >>> for frame in frames:  # (3, H, W) uint8 RGB
+        >>> live = ts.LiveSimulator(fps=fps)
+        >>> for frame in video[0]:  # (3, H, W) uint8 RGB
         ...     new = live.push(frame)
-        ...     print(new.time_s, len(new.people), new.doppler_time.shape)
+        >>> new.number, len(new.people), new.doppler_time.shape[0]
+        (5, 0, 1024)
 
     Raises:
         TensorsimError: settings that need the whole film: a known initial distance, calibration, the paper's position,
@@ -110,6 +111,7 @@ class LiveSimulator:
             ("an initial distance", config.pose.initial_distance_m is not None),
             ("calibration", config.pose.calibrate),
             ("position 'paper'", config.pose.position == "paper"),
+            ("the temporal lifter", config.pose.lifter != "nearest"),
             (f"people {config.pose.people!r}", config.pose.people != "all"),
         ):
             if given:

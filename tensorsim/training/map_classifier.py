@@ -215,7 +215,8 @@ def write_outcome(recipe: MapRecipe, best: Path) -> None:
         scratch.write_text(f"Part validation, {len(maps)} samples.\n\n{table}", encoding="utf-8")
     print(table, end="")
     to_torchscript(net, folder / "picture_to_label.pt")
-    to_onnx(net, folder / "picture_to_label.onnx", (maps[0]["map"][None],), {0: {0: "batch"}})
+    example = torch.stack([maps[0]["map"]] * 2)
+    to_onnx(net, folder / "picture_to_label.onnx", (example,), {0: {0: "batch"}})
     outputs = maps.recipe.outputs
     if maps.names[0].endswith(".picture") and len(maps.names) == 1 and outputs.picture_size == recipe.size:
         stated = {k: v for k, v in recipe.metadata.items() if k not in ("maps", "map_size")}

@@ -25,7 +25,7 @@ from tests.film import RectangleDetector, StandingPose
 
 SCENE = "through-wall"
 #: Linear PSNR in dB of the Doppler-time map that every activity reaches, by source.
-FLOORS_DB = {"a": 45.0, "b": 20.0}
+FLOORS_DB = {"a": 38.0, "b": 20.0}
 
 
 @pytest.fixture(scope="module")
@@ -452,3 +452,15 @@ def test_every_activity_has_a_floor(activity: str, tmp_path: Path) -> None:
     for setting, least in FLOORS_DB.items():
         chosen = [c for c in cells if c["setting"] == setting]
         assert report.figure_of(chosen, SCENE, "doppler_time", "psnr") > least, setting
+
+
+def test_another_lifter_has_cells_of_its_own(tmp_path: Path) -> None:
+    loops = [
+        truth.TruthLoop(tmp_path, clips=1, activities=("S8 Walking",), lifter=name)
+        for name in (None, "temporal")
+    ]
+    clip = loops[0].rows()["S8 Walking"][0]
+    assert loops[0].cell("S8 Walking", clip, "b") != loops[1].cell("S8 Walking", clip, "b")
+    kinds = [type(loop.pipelines().lifters[False]).__name__ for loop in loops]
+    assert kinds == ["NearestPoseLifter", "TemporalLifter"]
+    assert type(loops[1].pipelines().lifters[True]).__name__ == "NearestPoseLifter"  # the paper's

@@ -269,6 +269,7 @@ def test_what_needs_the_whole_film_is_refused(walk: Tensor) -> None:
         {"pose__initial_distance_m": (4.0,)},
         {"pose__calibrate": True},
         {"pose__people": "nearest"},
+        {"pose__library": None, "pose__lifter": "temporal"},
         {"smoothing__smoothing_ratio": 0.25},
         {"processing__mti": "mean"},
         {"scene__sway": True},

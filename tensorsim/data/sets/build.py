@@ -121,6 +121,7 @@ def build_dataset(
         TensorsimError: another data set or other files in the folder, another run that is writing there, a source that
             is not there, every sample failed, or, if ``strict``, a clip that fails.
     """
+    out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
         if _starts_or_goes_on(out, recipe):
             done = json.loads((out / DONE).read_text(encoding="utf-8"))

@@ -3,6 +3,7 @@
 import json
 import logging
 import multiprocessing
+import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -132,10 +133,11 @@ class RayCluster:
             rows = ray.data.from_items(
                 [{"job": json.dumps(job)} for job in waiting], override_num_blocks=len(waiting)
             )
-            kind = type(waiting[0])
+            kind, here = type(waiting[0]), os.getcwd()
 
             def done(row: dict[str, Any]) -> dict[str, int]:
                 _one_thread()
+                os.chdir(here)  # paths of a recipe are relative
                 return {"count": work(kind(*json.loads(row["job"])))}
 
             for row in rows.map(done, num_cpus=1).iter_rows():

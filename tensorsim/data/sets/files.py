@@ -1,7 +1,6 @@
 """Files of people as a source of labelled clips: films, key points, captured motion, and the layouts of public sets."""
 
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 
 from tensorsim.data.layouts import listing
@@ -13,6 +12,8 @@ from tensorsim.data.sets.variations import Variation
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
 
+#: Motions that a source keeps in memory.
+_KEPT = 256
 #: How the clips of each kind of source are listed.
 LISTS: dict[str, Callable[[SourceConfig], list[Clip]]] = {
     "films": listing.folder_of_films,
@@ -55,8 +56,7 @@ class FileClips:
         self.clips = [clip for clip in found if clip.label in self.labels]
         self.finder = PeopleFinder(source, None if cache is None else Path(cache))
         self.finds_people = any(is_film(Path(clip.path)) for clip in self.clips)
-        # Variations of one clip often follow one another.
-        self._motion = lru_cache(maxsize=8)(self.finder.motion)
+        self._motions: dict[tuple[str, str], Motion] = {}
 
     def __len__(self) -> int:
         return len(self.clips)
@@ -75,9 +75,18 @@ class FileClips:
 
     def scene(self, clip: Clip, variation: Variation) -> Scene:
         """See :class:`~tensorsim.data.sets.clips.ClipSource`."""
-        motion = cut(self._motion(clip.path, clip.key), clip)
+        motion = cut(self._motion(clip), clip)
         moved = varied(motion, variation)
         return part_of(moved, self.recipe.duration_s, self.recipe.motion_hz, variation.start)
+
+    def _motion(self, clip: Clip) -> Motion:
+        """The people of a clip's file; the last ones are kept, since files with many motions take long to read."""
+        key = (clip.path, clip.key)
+        if key not in self._motions:
+            if len(self._motions) >= _KEPT:
+                self._motions.pop(next(iter(self._motions)))
+            self._motions[key] = self.finder.motion(*key)
+        return self._motions[key]
 
     def prepare(self, clip: Clip) -> None:
         """Find the people of the clip's file."""

@@ -39,6 +39,7 @@ class PeopleFinder:
     def __init__(self, source: SourceConfig, cache: Path | None) -> None:
         self.source, self.cache = source, cache
 
+    @torch.no_grad()
     def motion(self, path: str, key: str) -> Motion:
         """The people of a file; joints are finite everywhere.
 

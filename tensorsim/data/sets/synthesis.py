@@ -117,7 +117,8 @@ def _pair_outputs(
     magnitudes: dict[str, Tensor] = {}
     if kinds & set(outputs.SIGNALS):
         target = simulator.echo.target_echo(points, rcs)
-        signal = simulator.recorder.noise(simulator.echo(points, rcs), target)
+        noise: Any = simulator.recorder.noise
+        signal = noise(simulator.echo(points, rcs), target)
         profiles = simulator.range_profile(signal)
         moving = simulator.mti(profiles)
         found["if_signal"] = outputs.stored_signal(signal[0])

@@ -45,6 +45,23 @@ class CameraEstimate(NamedTuple):
     frames: Tensor
 
 
+def with_reserve(found: CameraEstimate, good_rad: float = math.radians(5.0)) -> CameraEstimate:
+    """Estimates drawn towards a level camera 1.5 m above the floor, the more the less is known of its tilt.
+
+    A few steps may fit a camera that looks steeply down as well as one that is level. A tilt with a standard deviation
+    of ``good_rad`` or less stays as it is; beyond, tilt and roll shrink by ``(good_rad / deviation)^2``, and so do the
+    logarithm of the height against 1.5 m and the field of view against 60 degrees.
+    """
+    share = (good_rad / found.pitch_sd_rad).square().clamp(max=1.0)
+    usual_fov = math.pi / 3
+    return found._replace(
+        pitch_rad=share * found.pitch_rad,
+        roll_rad=share * found.roll_rad,
+        height_m=1.5 * (found.height_m / 1.5) ** share,
+        horizontal_fov_rad=usual_fov + share * (found.horizontal_fov_rad - usual_fov),
+    )
+
+
 def camera_config(found: CameraEstimate) -> CameraConfig:
     """The camera of one clip above the origin, looking along +y.
 

@@ -300,17 +300,18 @@ class MetricPose(nn.Module):
         # Without feet the lowest joint that is seen may be anything.
         feet = seen[..., 10] | seen[..., 13]
         # The floor is where this person stood last, or will stand next.
-        stands = whole & feet & (upright >= 0.9)
-        ankle = robust_smooth(lowest_ankle(joints), stands, self.floor_window_s * fps)
-        floor = fill_gaps(ankle, stands)
+        stands = whole & (upright >= 0.9)
+        rests = stands & feet
+        ankle = robust_smooth(lowest_ankle(joints), rests, self.floor_window_s * fps)
+        floor = fill_gaps(ankle, rests)
         ahead = torch.cat(
             [(image - center) / focal[..., None, None], torch.ones_like(image[..., :1])], dim=-1
         )
         rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
         by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
         # Nobody falls further than by two fifths of the range.
-        stood = fill_gaps(smooth, stands)
-        near = stands.any(dim=-1, keepdim=True) & ((by_floor - stood).abs() < 0.4 * stood)
+        stood = fill_gaps(smooth, rests)
+        near = rests.any(dim=-1, keepdim=True) & ((by_floor - stood).abs() < 0.4 * stood)
         by_floor = torch.where(near, by_floor, torch.full_like(by_floor, float("inf")))
         error_m = torch.full_like(floor, 0.06)
         fused, share = fused_range(by_size, upright, by_floor, gain, error_m)

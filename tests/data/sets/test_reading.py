@@ -169,3 +169,16 @@ def test_folded_doppler_keeps_the_stronger_sign() -> None:
 def test_settings_that_make_no_sense(make: object) -> None:
     with pytest.raises(TensorsimError, match="got"):
         make()  # type: ignore[operator]
+
+
+def test_sources_travel_to_the_workers_of_a_loader(tmp_path: Path) -> None:
+    import pickle
+
+    motion = ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=1.0, rate_hz=30.0)
+    (tmp_path / "walk").mkdir()
+    np.savez(tmp_path / "walk" / "a.npz", joints_m=motion.joints[0].numpy(), fps=30.0)
+    recipe = small_recipe(sources=(ts.data.SourceConfig("motion", str(tmp_path)),))
+    simulated = ts.data.SimulatedMaps(recipe, "train", rounds=1)
+    (sample,) = pickle.loads(pickle.dumps(simulated))
+    assert sample["map"].equal(next(iter(simulated))["map"])
+    assert sample["id"] == "00000000-0"

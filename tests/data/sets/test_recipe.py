@@ -222,6 +222,31 @@ def test_a_sample_is_the_map_of_the_stages() -> None:
     assert (made.arrays["front.joints"] == scene.joints.numpy()).all()
 
 
+def test_signals_and_maps_of_a_sample_are_of_one_recording() -> None:
+    kinds = ("if_signal", "profiles", "range_time", "range_time_mti", "doppler_time", "ridges", "picture")
+    recipe = small_recipe(outputs=OutputConfig(kinds=kinds, dtype="float16", rate_hz=None))
+    plan = Plan(recipe)
+    variation = plan.variation(0, 0)
+    scene = plan.scene(0, "train", variation)
+    made = synthesize(recipe, scene, variation).arrays
+    profiles = made["front.profiles"].astype(np.float64) @ np.array([1, 1j])
+    signal = made["front.if_signal"].astype(np.float64) @ np.array([1, 1j])
+    pulses, bins = profiles.shape
+    assert signal.shape == (128, 400)
+    assert pulses == 128
+    range_time = made["front.range_time"].astype(np.float64)
+    assert range_time.shape == (bins, pulses)
+    below = 20 * np.log10(np.abs(profiles).T.clip(1e-9))
+    strong = below > -30
+    assert np.abs((range_time - below)[strong]).max() < 0.2
+    spectrum = np.abs(np.fft.fft(signal * np.hamming(400))).max(1)
+    assert np.corrcoef(spectrum, np.abs(profiles).max(1))[0, 1] > 0.999
+    assert made["front.picture"].dtype == np.uint8
+    other = synthesize(replace(recipe, outputs=OutputConfig(dtype="float16", rate_hz=None)), scene, variation)
+    both = np.stack([made["front.doppler_time"], other.arrays["front.doppler_time"]]).astype(np.float64)
+    assert np.abs(np.diff(both, axis=0)[0][(both > -15).all(0)]).mean() < 0.5
+
+
 def test_the_gate_holds_everything_that_people_reflect() -> None:
     recipe = small_recipe(outputs=OutputConfig(dtype="float16", rate_hz=None))
     recipe = replace(

@@ -16,7 +16,7 @@ from tensorsim.evaluation.camera import (
     known_camera,
     walk_before,
 )
-from tensorsim.vision.calibration.calibrator import CameraCalibrator
+from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, with_reserve
 from tensorsim.vision.calibration.camera_fit import camera_axes, place_upright
 from tensorsim.vision.calibration.upright import is_upright, walking_share
 from tests.film import STANDING
@@ -155,3 +155,18 @@ def test_upright_is_upright() -> None:
     hidden = seen.clone()
     hidden[15] = 0.1
     assert not bool(is_upright(body, hidden, 0.3))
+
+
+def test_a_tilt_that_is_hardly_known_is_drawn_towards_level() -> None:
+    value = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    deviation = torch.tensor([math.radians(5), math.radians(10)], dtype=torch.float64)
+    frames = torch.ones(2, dtype=torch.int64)
+    found = CameraEstimate(
+        value, value, 3 * value / 0.5, 2 * value, deviation, deviation, value, value, frames
+    )
+    kept = with_reserve(found)
+    assert kept.pitch_rad.tolist() == pytest.approx([0.5, 0.125])
+    assert kept.roll_rad.tolist() == pytest.approx([0.5, 0.125])
+    assert kept.height_m.tolist() == pytest.approx([3.0, 1.5 * 2**0.25])
+    assert kept.horizontal_fov_rad.tolist() == pytest.approx([1.0, math.pi / 3 + (1 - math.pi / 3) / 4])
+    assert torch.equal(kept.pitch_sd_rad, deviation)
