@@ -3,10 +3,6 @@
 Source: R. Boulic, N. Magnenat-Thalmann, D. Thalmann, "A global human walking model with real-time kinematic
 personification", The Visual Computer 6 (1990), 344-358. Speeds are relative: leg lengths (thigh and shank, hip
 to ankle) per second, valid from 0 to 3.
-
-One number is not the source's: the knee bends up to 60 degrees in the swing, as in normal gait (Perry and Burnfield,
-*Gait Analysis*, 2nd ed., ch. 5), not 70. With 70 the ankle swings 3.8 times as fast as the body walks; recorded walkers
-(CMU) have 3.3 to 3.4, and 60 degrees give 3.6.
 """
 
 import math
@@ -18,8 +14,6 @@ from torch import Tensor
 from tensorsim.errors import TensorsimError, check_finite, check_floating
 
 _DEGREE = math.pi / 180
-#: Largest flexion of the knee over that of the source.
-_KNEE_SHARE = 60 / 70
 
 
 class Gait(NamedTuple):
@@ -87,10 +81,9 @@ def periodic_pchip(knots: Tensor, values: Tensor, phase: Tensor) -> Tensor:
 
 
 def control_points(relative_speed: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-    """Control points by joint: phases (..., K) and degrees (..., K), for a right limb at phase 0.
+    """Published control points by joint: phases (..., K) and degrees (..., K), for a right limb at phase 0.
 
-    Those of the source but for the largest flexion of the knee, see the module. Three ranges of speed: below 0.5, below
-    1.3, and above.
+    Three ranges of speed: below 0.5, below 1.3, and above.
     """
     rv = relative_speed
     u, w = (rv - 1.3) / 1.7, (rv - 0.5) / 0.8
@@ -117,9 +110,7 @@ def control_points(relative_speed: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         "knee": (
             by_speed(knee_x, knee_x, points(0.17 - 0.05 * u, 0.4, 0.75 - 0.05 * u, 1 - 0.03 * u)),
             by_speed(
-                points(3, 3, 140 * _KNEE_SHARE * rv, 3),
-                points(3, 3, 70 * _KNEE_SHARE, 3),
-                points(22 * u + 3, 3, (70 - 5 * u) * _KNEE_SHARE, 3 + 3 * u),
+                points(3, 3, 140 * rv, 3), points(3, 3, 70, 3), points(22 * u + 3, 3, 70 - 5 * u, 3 + 3 * u)
             ),
         ),
         "ankle": (
