@@ -442,8 +442,10 @@ def test_a_guess_that_a_radar_cannot_follow_is_left_out(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("activity", [name for name in ACTIVITIES if name != "S1 Empty"])
-def test_every_activity_has_a_floor(activity: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "activity", ["S2 Punching", "S5 Sitting Down", "S8 Walking", "S12 Walking to Falling"]
+)
+def test_an_activity_by_itself_has_a_floor(activity: str, tmp_path: Path) -> None:
     """From true joints and from true key points, each activity by itself: a mean hides one that is lost."""
     loop = truth.TruthLoop(
         tmp_path, clips=1, activities=(activity,), scenes=(SCENE,), stages=False, seed=3000

@@ -230,7 +230,9 @@ def test_figures_of_a_detector_that_is_told_the_answer(tmp_path: Path) -> None:
     samples = shard(tmp_path / "p.tar", True) + shard(tmp_path / "e.tar", False)
 
     class Told(nn.Module):
-        mean = torch.zeros(1)
+        def __init__(self) -> None:
+            super().__init__()
+            self.register_buffer("mean", torch.zeros(1))
 
         def forward(self, images: Tensor) -> Detections:
             boxes = torch.tensor([[[40.0, 20, 70, 80], [0, 0, 10, 10], [100, 0, 120, 30]]])

@@ -81,10 +81,6 @@ class MapDataset(Dataset[dict[str, Any]]):
 
     Raises:
         TensorsimError: no data set there, an unknown part, output, radar or class, or no samples.
-
-    Example:
-        >>> train = ts.data.MapDataset("data", split="train")  # doctest: +SKIP
-        >>> loader = torch.utils.data.DataLoader(train, 32, shuffle=True)  # doctest: +SKIP
     """
 
     def __init__(
