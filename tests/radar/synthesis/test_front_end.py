@@ -67,6 +67,10 @@ class TestSimulatorWithReceiver(SimulatorCase):
     def bad_inputs(self) -> Any:
         return SceneCase.bad_inputs(self)
 
+    @pytest.mark.slow  # compiles the whole simulator once more
+    def test_scripted_equals_eager(self) -> None:
+        super().test_scripted_equals_eager()
+
     def test_gradients_against_finite_differences(self) -> None:
         super(SimulatorCase, self).test_gradients_against_finite_differences()
 

@@ -111,6 +111,7 @@ class TestRTMDet(StageTester):
         )
         subprocess.run([sys.executable, "-W", "ignore", "-c", program], cwd=tmp_path, check=True)
 
+    @pytest.mark.slow
     def test_exports(self) -> None:  # with a dynamic batch
         module = self.make()
         (images,) = self.inputs((3,), torch.float32)

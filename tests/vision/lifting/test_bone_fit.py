@@ -78,6 +78,10 @@ class TestBoneFit(StageTester):
         seen &= torch.rand(*batch, 2, 7, 1, generator=generator) > 0.2
         return (body + 0.02 * noise).to(dtype), seen
 
+    @pytest.mark.slow  # thousands of small operations
+    def test_exports(self) -> None:
+        super().test_exports()
+
     def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
         joints, seen = self.inputs((), torch.float32)
         return [
