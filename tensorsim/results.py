@@ -15,7 +15,7 @@ from tensorsim import plot
 from tensorsim.config import SimulationConfig
 from tensorsim.data.array_files import save_arrays
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
-from tensorsim.data.video import VideoWriter
+from tensorsim.data.video_writer import VideoWriter
 from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.progress import picture, progress_bar

@@ -12,7 +12,8 @@ from torch import nn
 
 import tensorsim as ts
 from tensorsim.body.skeleton import mid_hips
-from tensorsim.data.video import VideoReader, write_video
+from tensorsim.data.video import VideoReader
+from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.framing import camera_on, seen_keypoints
 from tensorsim.sources import CANVAS, NEAREST_M, Cut, keypoint_source, kind_of, motion_source

@@ -58,7 +58,8 @@ class Demo(NetworkOptions, RadarOptions):
 
         from tensorsim import results
         from tensorsim.config import ACTIVITIES, SmoothingConfig
-        from tensorsim.data.video import VideoReader, write_video
+        from tensorsim.data.video import VideoReader
+        from tensorsim.data.video_writer import write_video
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
         from tensorsim.pipeline import PoseToDoppler, VideoToPose

@@ -89,7 +89,7 @@ class Live(NetworkOptions, RadarOptions):
     def _play(self, live: "LiveSimulator", camera: "Camera") -> None:
         """Simulate frame by frame, and show and record what comes out."""
         from tensorsim import plot
-        from tensorsim.data.video import VideoWriter
+        from tensorsim.data.video_writer import VideoWriter
         from tensorsim.live.page import serving
         from tensorsim.live.view import LiveView
 

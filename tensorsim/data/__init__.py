@@ -11,7 +11,8 @@ from tensorsim.data.sets.transforms import AddNoise, RandomShift, SignFold, Spec
 from tensorsim.data.sets.variations import VariationConfig
 from tensorsim.data.skeletons import Motion
 from tensorsim.data.sound import Sound, doppler_sound, slow_time_signal, write_sound
-from tensorsim.data.video import VideoReader, VideoWriter, write_video
+from tensorsim.data.video import VideoReader
+from tensorsim.data.video_writer import VideoWriter, write_video
 from tensorsim.geometry.framing import camera_on
 from tensorsim.render.renderer import PersonRenderer, RenderedVideo
 

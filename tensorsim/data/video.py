@@ -1,10 +1,9 @@
-"""Video files in and out, through OpenCV: whatever its build decodes, streamed in chunks."""
+"""Video files in, through OpenCV: whatever its build decodes, streamed in chunks."""
 
 import math
 import os
-import tempfile
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -86,7 +85,7 @@ class VideoReader:
         _check_cut(fps, start_s, end_s, stride)
         _check_is_film(self.path)
         with self._opened() as capture:
-            file_fps, announced = _properties(capture)
+            file_fps, announced = properties(capture)
             if fps is None and not 0 < file_fps < ABSURD_FPS:
                 raise TensorsimError(
                     f"{self.path}: the file announces {file_fps} frames per second, expected a positive "
@@ -212,7 +211,7 @@ class VideoReader:
     def _opened(self) -> Iterator[Any]:
         import cv2
 
-        with _opening():
+        with opening():
             capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         try:
             if not capture.isOpened():
@@ -221,92 +220,6 @@ class VideoReader:
             yield capture
         finally:
             capture.release()
-
-
-class VideoWriter:
-    """A film that is written frame by frame; the file appears when it is complete, or not at all.
-
-    Args:
-        path: ending in ``.mp4`` (MPEG-4), ``.webm`` (VP8, which browsers play) or another container that OpenCV writes
-            with MPEG-4. An odd height or width gets its last row or column twice, because the codecs halve the
-            colours.
-        fps: frames per second.
-
-    Example:
-        >>> with VideoWriter("grey.mp4", fps=10.0) as film:
-        ...     for _ in range(3):
-        ...         film.add(np.full((48, 64, 3), 128, np.uint8))
-
-    Raises:
-        TensorsimError: no frames, frames of another kind or of several sizes, or a file that OpenCV cannot
-            write.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], fps: float) -> None:
-        check_positive(fps, "fps")
-        self.path, self.fps, self.count = Path(path), fps, 0
-        if not self.path.parent.is_dir():
-            raise TensorsimError(
-                f"{self.path}: no such folder {self.path.parent}, expected one to write into"
-            )
-        self._shape: tuple[int, ...] | None = None
-
-    def __enter__(self) -> "VideoWriter":
-        import cv2
-
-        self._folder = tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".writing-")
-        self._partial = Path(self._folder.name) / self.path.name
-        self._writer = cv2.VideoWriter()
-        return self
-
-    def add(self, frame: np.ndarray) -> None:
-        """Append a frame (H, W, 3) uint8 RGB, of the size of the first."""
-        import cv2
-
-        is_image = frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3
-        if not is_image or frame.shape != (self._shape or frame.shape):
-            raise TensorsimError(
-                f"write_video: got a frame of {frame.dtype} {frame.shape}, "
-                f"expected uint8 {self._shape or '(H, W, 3)'}"
-            )
-        height, width = frame.shape[:2]
-        if self._shape is None:
-            self._shape = frame.shape
-            _open_writer(self._writer, self._partial, self.fps, (width + width % 2, height + height % 2))
-        bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-        self._writer.write(cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
-        self.count += 1
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        with self._folder:
-            self._writer.release()
-            if kind is not None:
-                return
-            if self.count == 0:
-                raise TensorsimError(f"{self.path}: got no frames, expected at least one")
-            # OpenCV says nothing of writes that fail, as on a full disk; what is missing shows when it is read.
-            if _frames_in(self._partial) != self.count:
-                raise TensorsimError(f"{self.path}: the film could not be written whole; is the disk full?")
-            os.replace(self._partial, self.path)
-
-
-def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write a film of frames (H, W, 3) uint8 RGB: see :class:`VideoWriter` for arguments and errors."""
-    with VideoWriter(path, fps) as film:
-        for frame in frames:
-            film.add(frame)
-
-
-def _frames_in(path: Path) -> int | None:
-    """Number of frames that a complete file announces; None of a file that is not complete."""
-    import cv2
-
-    with _opening():
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        return _properties(capture)[1] if capture.isOpened() else None
-    finally:
-        capture.release()
 
 
 def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: int) -> None:
@@ -340,26 +253,12 @@ def _begins_like_a_film(path: Path) -> bool:
     return any(head[at : at + len(kind)] == kind for at, kind in _CONTAINERS)
 
 
-def _open_writer(writer: Any, path: Path, fps: float, size: tuple[int, int]) -> None:
-    import cv2
-
-    codec = "VP80" if path.suffix.lower() == ".webm" else "mp4v"
-    # OpenCV remarks that WebM has another tag for its own codec, and takes that.
-    with _opening(), _silent_stderr():
-        opened = writer.open(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
-    if not opened:
-        raise TensorsimError(
-            f"{path.name}: OpenCV cannot write this file at {fps:g} frames per second, expected a name ending in .mp4 "
-            "and a usual rate"
-        )
-
-
 def _planes(frames: np.ndarray) -> Tensor:
     """(n, H, W, 3) of a buffer that is used again -> (n, 3, H, W) of its own."""
     return torch.from_numpy(frames).permute(0, 3, 1, 2).clone(memory_format=torch.contiguous_format)
 
 
-def _properties(capture: Any) -> tuple[float, int | None]:
+def properties(capture: Any) -> tuple[float, int | None]:
     """Frames per second and number of frames that a file announces (None if it does not)."""
     import cv2
 
@@ -381,20 +280,7 @@ def _skip(capture: Any, count: int) -> int:
 
 
 @contextmanager
-def _silent_stderr() -> Iterator[None]:
-    """Drop what libraries print to the standard error of the process."""
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-            yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-
-
-@contextmanager
-def _opening() -> Iterator[None]:
+def opening() -> Iterator[None]:
     """Open films without OpenCV's and FFmpeg's log on stderr, and without FFmpeg's protocols but files."""
     # FFmpeg's level is read once, by the first film of the process.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tensorsim.data.video import VideoWriter
+from tensorsim.data.video_writer import VideoWriter
 
 #: A film of at most so many frames goes into the page, as JPEG pictures of at most so many bytes together.
 MOST_FRAMES, MOST_BYTES = 900, 8_000_000
@@ -24,7 +24,7 @@ class FilmStrip:
         fps: frames per second.
 
     Raises:
-        TensorsimError: see :class:`~tensorsim.data.video.VideoWriter`.
+        TensorsimError: see :class:`~tensorsim.data.video_writer.VideoWriter`.
     """
 
     def __init__(self, folder: Path, frames: int, fps: float) -> None:

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from tensorsim.data import read_video, video
-from tensorsim.data.video import VideoReader, write_video
+from tensorsim.data.video import VideoReader
+from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError, TensorsimWarning, collected_warnings
 
 HEIGHT, WIDTH, SIDE = 48, 64, 12
@@ -174,7 +175,7 @@ def test_frame_counts_that_are_none(count: float) -> None:
         def get(self, name: int) -> float:
             return count if name == cv2.CAP_PROP_FRAME_COUNT else 25.0
 
-    assert video._properties(Capture()) == (25.0, None)
+    assert video.properties(Capture()) == (25.0, None)
 
 
 def test_cut_off_film_gives_what_is_there(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ import tensorsim as ts
 from tensorsim import cli
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.commands import live as live_command
-from tensorsim.data.video import VideoReader, write_video
+from tensorsim.data.video import VideoReader
+from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.live import LiveFrame, LiveSimulator
 from tensorsim.live.camera import Camera
