@@ -208,7 +208,10 @@ def make_group(index: int, settings: EverydaySettings, maker: ClipMaker, radars:
                     shares = torch.tensor(list(BODIES.values()))
                     body = list(BODIES)[int(torch.multinomial(shares, 1, generator=generator))]
                     seed = int(one(0.0, 2.0**20))
-                    pictures.append(radars(clip, body, bool(one(0.0, 1.0) < 0.5), seed))
+                    seen = radars(clip, body, bool(one(0.0, 1.0) < 0.5), seed)
+                    # Who is beyond the range axis of a radar teaches nothing.
+                    if bool((seen.flatten(1).amax(-1) > 0).all()):
+                        pictures.append(seen)
             labels += [activity] * (len(pictures) - len(labels))
             films += [filmed] * (len(pictures) - len(films))
     return {

@@ -143,7 +143,7 @@ def test_fps_given_replaces_that_of_the_file(clip: Path) -> None:
 def test_refuses_absurd_fps_unless_one_is_given(
     clip: Path, monkeypatch: pytest.MonkeyPatch, fps: float
 ) -> None:
-    monkeypatch.setattr(video, "_properties", lambda capture: (fps, 20))
+    monkeypatch.setattr(video, "properties", lambda capture: (fps, 20))
     with pytest.raises(
         TensorsimError, match=f"the file announces {fps} frames per second.*give the frame rate"
     ):
@@ -163,7 +163,7 @@ def test_reads_the_rate_of_a_file_with_a_broken_header(tmp_path: Path) -> None:
 
 
 def test_film_that_does_not_say_how_long_it_is(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video, "_properties", lambda capture: (25.0, None))
+    monkeypatch.setattr(video, "properties", lambda capture: (25.0, None))
     reader = VideoReader(clip)
     assert reader.frame_count is None
     assert sum(c.shape[0] for c in reader.chunks(6)) == 20

@@ -1,6 +1,7 @@
 """Building a data set: what is missing is made, shard by shard, and at the end listed in the manifest."""
 
 import json
+import os
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -98,7 +99,7 @@ def rows_path(out: Path, shard: Shard) -> Path:
 
 def build_dataset(
     recipe: DatasetRecipe,
-    out: Path,
+    out: str | os.PathLike[str],
     engine: Engine | None = None,
     cache: Path | None = None,
     strict: bool = False,
@@ -121,6 +122,7 @@ def build_dataset(
         TensorsimError: another data set or other files in the folder, another run that is writing there, a source that
             is not there, every sample failed, or, if ``strict``, a clip that fails.
     """
+    out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
         if _starts_or_goes_on(out, recipe):

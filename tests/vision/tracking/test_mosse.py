@@ -166,7 +166,7 @@ def test_refuses_bad_settings(settings: dict[str, Any], message: str) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not FILM.is_file(), reason=f"{FILM} is not there")
 def test_follows_a_person_in_a_real_film() -> None:
-    from tensorsim.data.video import read_video
+    from tensorsim.data import read_video
     from tensorsim.geometry.boxes import box_iou
     from tensorsim.vision.detection.rtmdet import RTMDet
 
