@@ -63,6 +63,7 @@ def test_writes_the_film_its_maps_and_the_truth(stand_ins: dict[str, str], tmp_p
     assert truth["doppler_time"] == pytest.approx(expected, abs=0.02 * float(expected.max()))
 
 
+@pytest.mark.slow
 def test_nobody_is_filmed_for_empty(
     stand_ins: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

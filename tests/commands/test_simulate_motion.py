@@ -89,6 +89,7 @@ def test_place_heading_and_part(walk: np.ndarray, tmp_path: Path) -> None:
     assert hips[-1] - hips[0] == pytest.approx([-way[1], way[0]], abs=1e-4), "a quarter turn to the left"
 
 
+@pytest.mark.slow
 def test_keypoints_give_what_a_video_gives(
     motion: ts.motion.GeneratedMotion, walk: np.ndarray, tmp_path: Path
 ) -> None:

@@ -140,6 +140,7 @@ def test_a_summary_repeats_its_run_to_the_bit(tmp_path: Path) -> None:
     assert summaries[0]["config"]["processing"]["ridge_count"] == 2
 
 
+@pytest.mark.slow
 def test_a_graph_made_by_hand_equals_that_of_the_configuration() -> None:
     """The composition of the README, ``from_config`` and ``from_pretrained`` ask about the mirror image alike."""
     detector, network = ts.vision.RTMDet.from_pretrained(), ts.vision.HRNet.from_pretrained()

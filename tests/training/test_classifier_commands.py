@@ -47,6 +47,7 @@ def command(tmp_path: Path, **options: Any) -> TrainClassifier:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_trains_on_true_motion_and_on_motion_as_films_show_it(
     films: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

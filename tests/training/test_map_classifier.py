@@ -35,6 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_the_recipe_of_a_data_set(folder: Path) -> None:
     recipe = MapRecipe(folder, masks=(0.1, 0.1))
     assert list(recipe.labels) == ["S8 Walking", "S5 Sitting Down"]

@@ -26,6 +26,7 @@ def data(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = data / "out"
     options = {"cutouts": data, "rendered": 13, "size": (64, 64), "first_size": (32, 32), "width": 4}
