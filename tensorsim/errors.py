@@ -116,6 +116,19 @@ def check_points(x: Tensor, rank: int, count: int, coordinates: int, name: str, 
     check_size(x, -1, coordinates, name, layout)
 
 
+def check_key_points(keypoints: Tensor, scores: Tensor, valid: Tensor, rank: int, layout: str) -> None:
+    """Refuse anything but finite key points (..., T, 17, 2), scores (..., T, 17) and valid (..., T), bool."""
+    check_points(keypoints, rank, 17, 2, "keypoints", layout)
+    if list(scores.shape) != list(keypoints.shape[:-1]):
+        raise TensorsimError(f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}")
+    if list(valid.shape) != list(keypoints.shape[:-2]) or valid.dtype != torch.bool:
+        raise TensorsimError(
+            f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(keypoints.shape[:-2])}"
+        )
+    check_finite(keypoints, "keypoints")
+    check_finite(scores, "scores")
+
+
 def check_not_empty(x: Tensor, name: str) -> None:
     """Refuse a tensor without elements."""
     if x.numel() == 0:

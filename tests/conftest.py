@@ -10,9 +10,11 @@ from hypothesis import settings
 # FFmpeg reads its log level when OpenCV first uses it, which is often a test that writes a film, not the reader.
 os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
 
-# Tests run in a process per core: more threads in each would only wait for each other.
+# Tests run in a process per core: more threads in each would only wait for each other. Programs that tests start
+# read it from the environment.
 if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
 
 # The same examples at every run: a failure on one machine is a failure on all.
 settings.register_profile("seeded", derandomize=True)

@@ -87,14 +87,7 @@ class TrainClassifier(TrainOptions):
             self.learning_rate,
             self.masks,
         )
-        epoch = max(1, len(recipe.training) // self.batch)
-        loop = self.loop(
-            steps=self.epochs * epoch,
-            batch=self.batch,
-            checkpoint_every=min(50, epoch),
-            validate_every=epoch,
-            ema_decay=0.0,
-        )
+        loop = self.epochs_loop(self.epochs, len(recipe.training), self.batch, ema_decay=0.0)
         best = self.train(recipe, loop)
         if int(os.environ.get("RANK", 0)) == 0:
             write_outcome(recipe, best)
@@ -111,14 +104,8 @@ class TrainClassifier(TrainOptions):
             raise TensorsimError("--films, --film-maps: got one of them, expected both or none")
         people = [self.people] if self.films is None else [self.people, self.film_people]
         trained = sum(not held_out(person) for count in people for person in range(count))
-        epoch = max(1, trained * len(ACTIVITIES) * len(self.scenes) // max(1, self.batch))
-        loop = self.loop(
-            steps=self.epochs * epoch,
-            batch=self.batch,
-            checkpoint_every=min(50, epoch),
-            validate_every=epoch,
-            ema_decay=0.0,
-        )
+        clips = trained * len(ACTIVITIES) * len(self.scenes)
+        loop = self.epochs_loop(self.epochs, clips, self.batch, ema_decay=0.0)
         filmed = None
         if self.films is not None and self.film_maps is not None:
             errors = FilmErrors(watched_films(self.films))

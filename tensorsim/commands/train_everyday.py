@@ -60,14 +60,7 @@ class TrainEveryday(TrainOptions):
             self.init,
             self.learning_rate,
         )
-        epoch = max(1, len(recipe.training) // self.batch)
-        loop = self.loop(
-            steps=self.epochs * epoch,
-            batch=self.batch,
-            checkpoint_every=min(50, epoch),
-            validate_every=epoch,
-            ema_decay=0.99,
-        )
+        loop = self.epochs_loop(self.epochs, len(recipe.training), self.batch, ema_decay=0.99)
         best = self.train(recipe, loop)
         load_between(recipe.net, best if self.init is None else self.init, best, self.share)
         path = self.out / "classifier.safetensors"

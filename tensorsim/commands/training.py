@@ -47,6 +47,17 @@ class TrainOptions:
             **settings,
         )
 
+    def epochs_loop(self, epochs: int, samples: int, batch: int, ema_decay: float) -> "LoopConfig":
+        """The loop of so many epochs of ``samples`` training samples, measured after each."""
+        epoch = max(1, samples // max(1, batch))
+        return self.loop(
+            steps=epochs * epoch,
+            batch=batch,
+            checkpoint_every=min(50, epoch),
+            validate_every=epoch,
+            ema_decay=ema_decay,
+        )
+
     def begin(self, net: "nn.Module") -> None:
         """Give a network the weights to start from, if there are any."""
         from tensorsim.weights import load_state_dict, load_strict

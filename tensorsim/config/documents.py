@@ -4,9 +4,12 @@ import dataclasses
 import difflib
 import types
 import typing
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
 from tensorsim.errors import TensorsimError
+
+T = TypeVar("T")
 
 
 def to_document(value: Any) -> Any:
@@ -43,6 +46,20 @@ def from_document(where: str, config: type, document: Any, more_keys: tuple[str,
         return config(**values)
     except TensorsimError as error:
         raise TensorsimError(f"{where}: {error}") from None
+
+
+def find_named(table: Mapping[str, T], name: str, kind: str) -> T:
+    """The entry of this name.
+
+    Raises:
+        TensorsimError: no such one; the message lists the known ones.
+    """
+    if name not in table:
+        known = list(table)
+        raise TensorsimError(
+            f"{kind}: got {name!r}, expected one of {', '.join(known)}{suggestion(name, known)}"
+        )
+    return table[name]
 
 
 def suggestion(name: str, known: list[str]) -> str:

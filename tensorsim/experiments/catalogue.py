@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from tensorsim.config.documents import from_document, suggestion, to_document
+from tensorsim.config.documents import find_named, from_document, to_document
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
 from tensorsim.experiments import ablations, networks, paper, real, video
@@ -78,12 +78,7 @@ def find_experiment(name: str) -> Experiment:
     Raises:
         TensorsimError: no such one; the message lists the known ones.
     """
-    if name not in EXPERIMENTS:
-        known = list(EXPERIMENTS)
-        raise TensorsimError(
-            f"experiment: got {name!r}, expected one of {', '.join(known)}{suggestion(name, known)}"
-        )
-    return EXPERIMENTS[name]
+    return find_named(EXPERIMENTS, name, "experiment")
 
 
 def configuration(name: str, quick: bool, file: Path | None, options: dict[str, Any]) -> Any:

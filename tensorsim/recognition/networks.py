@@ -6,8 +6,7 @@ from functools import partial
 
 from torch import nn
 
-from tensorsim.config.documents import suggestion
-from tensorsim.errors import TensorsimError
+from tensorsim.config.documents import find_named
 from tensorsim.recognition.adfe_net import ADFENet
 from tensorsim.recognition.ccln import CCLN
 from tensorsim.recognition.diat_radharnet import DIATRadHARNet
@@ -71,9 +70,4 @@ def find_classifier(name: str) -> Classifier:
     Raises:
         TensorsimError: an unknown name; the message lists the known ones.
     """
-    if name not in CLASSIFIERS:
-        known = list(CLASSIFIERS)
-        raise TensorsimError(
-            f"network: got {name!r}, expected one of {', '.join(known)}{suggestion(name, known)}"
-        )
-    return CLASSIFIERS[name]
+    return find_named(CLASSIFIERS, name, "network")

@@ -1,6 +1,5 @@
 """The recipe of the activity classifiers: cross-entropy on stored pictures, with new noise at every use."""
 
-import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.maps import MapStore
+from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict, read_metadata
 
 #: Networks by name, each with the size of the pictures that its authors give it.
@@ -179,16 +179,9 @@ class ClassifierRecipe(Recipe):
         if init is not None:
             load_strict(net, load_state_dict(init), init)
 
-    @functools.lru_cache(maxsize=2)  # noqa: B019  # two epochs, of the one recipe of a run
-    def order(self, epoch: int) -> Tensor:
-        """The order of the training clips in an epoch."""
-        generator = torch.Generator().manual_seed(self.seed * 7919 + epoch)
-        return torch.randperm(len(self.training), generator=generator)
-
     def sample(self, index: int) -> dict[str, Any]:
         """Picture (1, H, W) and label."""
-        epoch, place = divmod(index, len(self.training))
-        store, clip = self.training[int(self.order(epoch)[place])]
+        store, clip = self.training[shuffled(index, len(self.training), self.seed)]
         snr_db = drawn_snr(self.seed, index, self.snr_db)
         look = masked(picture(store, clip, snr_db, self.size), self.masks, self.seed * 1_000_003 + index)
         return {"picture": look, "label": clip.activity}

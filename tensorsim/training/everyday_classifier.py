@@ -1,6 +1,5 @@
 """The recipe of the activity classifiers for films: cross-entropy on stored pictures of everyday motion."""
 
-import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from tensorsim.training.everyday_maps import EverydayStore
 from tensorsim.training.expected_map import noise_rows
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.maps import SCENES
+from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict, save_weights
 
 #: Level of the noise that is added, in dB against the peak of the picture.
@@ -146,16 +146,9 @@ class EverydayRecipe(Recipe):
         """Power (H, W) to the network's input (1, size, size)."""
         return scaled(F.avg_pool2d(power[None], power.shape[-1] // self.size), "db", RANGE_DB)
 
-    @functools.lru_cache(maxsize=2)  # noqa: B019  # two epochs, of the one recipe of a run
-    def order(self, epoch: int) -> Tensor:
-        """The order of the training pictures in an epoch."""
-        generator = torch.Generator().manual_seed(self.seed * 7919 + epoch)
-        return torch.randperm(len(self.training), generator=generator)
-
     def sample(self, index: int) -> dict[str, Any]:
         """Picture (1, size, size) and label."""
-        epoch, place = divmod(index, len(self.training))
-        clip, scene = self.training[self.order(epoch)[place]].tolist()
+        clip, scene = self.training[shuffled(index, len(self.training), self.seed)].tolist()
         generator = torch.Generator().manual_seed(self.seed * 1_000_003_139 + index)
         power, label = augmented(
             self.store.picture(clip, scene), int(self.store.activity[clip]), self.noise[scene], generator

@@ -199,17 +199,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
             missing.
     """
     rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    device = usable_device(config.device)
-    if processes > 1:
-        if device.type == "cuda":
-            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-            torch.cuda.set_device(device)
-        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
-    if config.batch % processes:
-        raise TensorsimError(
-            f"fit: got a batch of {config.batch}, expected a multiple of {processes} processes"
-        )
-
+    device = _joined(config, processes)
     recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
     averaged = AveragedModel(
         recipe.net,
@@ -240,19 +230,13 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     began, trained = time.perf_counter(), 0
     for step, batch in enumerate(_batches(loader), start=first):
         torch.manual_seed(config.seed * 1_000_003 + step * processes + rank)
-        recipe.net.train()
         factor = recipe.rate(step, config.steps)
         for group, rate in zip(optimiser.param_groups, base_rates, strict=True):
             group["lr"] = rate * factor
-        batch = _to(batch, device)
-        with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
-            losses = recipe.loss(wrapped, batch)
+        losses = _optimise(recipe, wrapped, optimiser, _to(batch, device), config.precision)
         value = float(losses["loss"].detach())
         if not math.isfinite(value):
             raise TensorsimError(f"fit: the loss of step {step} is {value}; lower the learning rate")
-        optimiser.zero_grad(set_to_none=True)
-        losses["loss"].backward()
-        optimiser.step()
         averaged.update_parameters(recipe.net)
 
         done, trained = step + 1, trained + config.batch
@@ -280,6 +264,35 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     if processes > 1:
         distributed.destroy_process_group()
     return best
+
+
+def _joined(config: LoopConfig, processes: int) -> torch.device:
+    """The device of this process, which joins the others where there are several."""
+    device = usable_device(config.device)
+    if processes > 1:
+        if device.type == "cuda":
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(device)
+        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    if config.batch % processes:
+        raise TensorsimError(
+            f"fit: got a batch of {config.batch}, expected a multiple of {processes} processes"
+        )
+    return device
+
+
+def _optimise(
+    recipe: Recipe, net: nn.Module, optimiser: torch.optim.Optimizer, batch: Batch, precision: str
+) -> dict[str, Tensor]:
+    """One step of the optimiser; the losses before it."""
+    recipe.net.train()
+    device = next(net.parameters()).device.type
+    with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
+        losses = recipe.loss(net, batch)
+    optimiser.zero_grad(set_to_none=True)
+    losses["loss"].backward()
+    optimiser.step()
+    return losses
 
 
 def _batches(loader: DataLoader[Batch]) -> Iterator[Batch]:

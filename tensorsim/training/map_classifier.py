@@ -1,6 +1,5 @@
 """The recipe of a classifier of your own classes: cross-entropy on a data set that ``tensorsim dataset build`` made."""
 
-import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.training.classifier import LEARNING_RATE, NETWORKS
 from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict
 
 
@@ -127,16 +127,9 @@ class MapRecipe(Recipe):
             "range_db": repr(outputs.picture_range_db),
         }
 
-    @functools.lru_cache(maxsize=2)  # noqa: B019  # two epochs, of the one recipe of a run
-    def order(self, epoch: int) -> Tensor:
-        """The order of the training samples in an epoch."""
-        generator = torch.Generator().manual_seed(self.seed * 7919 + epoch)
-        return torch.randperm(len(self.training), generator=generator)
-
     def sample(self, index: int) -> dict[str, Any]:
         """Map (C, H, W), label and the seed of its augmentation."""
-        epoch, place = divmod(index, len(self.training))
-        return self.training[int(self.order(epoch)[place])]
+        return self.training[shuffled(index, len(self.training), self.seed)]
 
     def collate(self, samples: list[dict[str, Any]]) -> Batch:
         """Maps and labels of samples."""

@@ -110,6 +110,14 @@ def _write_manifest(out: Path, recipe: DatasetRecipe, finished: Sequence[Path]) 
                 lines.writerows(rows)
 
 
+def _finished(out: Path) -> Path:
+    """The manifest of a data set, which is written last."""
+    path = out / "manifest.parquet"
+    if not path.is_file():
+        raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")
+    return path
+
+
 def recipe_of(out: Path) -> DatasetRecipe:
     """The recipe that the manifest of a data set holds.
 
@@ -118,9 +126,7 @@ def recipe_of(out: Path) -> DatasetRecipe:
     """
     import pyarrow.parquet as pq
 
-    path = out / "manifest.parquet"
-    if not path.is_file():
-        raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")
+    path = _finished(out)
     with reading(path, "a manifest"):
         stored = json.loads(pq.read_schema(path).metadata[b"tensorsim.recipe"])
     return DatasetRecipe.from_document(stored, str(path))
@@ -134,9 +140,7 @@ def rows_of(out: Path, **wanted: str) -> Iterator[Row]:
     """
     import pyarrow.parquet as pq
 
-    path = out / "manifest.parquet"
-    if not path.is_file():
-        raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")
+    path = _finished(out)
     with reading(path, "a manifest"):
         file = pq.ParquetFile(path)
         for group in range(file.num_row_groups):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
-from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive
+from tensorsim.errors import TensorsimError, check_key_points, check_positive
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
     LEAN,
@@ -155,18 +155,7 @@ class CameraCalibrator(nn.Module):
         fps: float,
     ) -> CameraEstimate:
         """Key points, scores, valid, image size, frame rate -> the cameras of the clips."""
-        layout = "(..., P, T, 17, 2) key points in pixels"
-        check_points(keypoints, 4, 17, 2, "keypoints", layout)
-        if list(scores.shape) != list(keypoints.shape[:-1]):
-            raise TensorsimError(
-                f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}"
-            )
-        if list(valid.shape) != list(keypoints.shape[:-2]) or valid.dtype != torch.bool:
-            raise TensorsimError(
-                f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(keypoints.shape[:-2])}"
-            )
-        check_finite(keypoints, "keypoints")
-        check_finite(scores, "scores")
+        check_key_points(keypoints, scores, valid, 4, "(..., P, T, 17, 2) key points in pixels")
         if image_height < 1 or image_width < 1:
             raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
         check_positive(fps, "fps")

@@ -7,7 +7,7 @@ exchange jumps: the vector from the right to the left ankle turns round from one
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive
+from tensorsim.errors import check_key_points, check_positive
 
 
 def viterbi_two_states(stay: Tensor, change: Tensor, second: float) -> Tensor:
@@ -74,18 +74,8 @@ class SteadySides(nn.Module):
 
     def forward(self, keypoints: Tensor, scores: Tensor, valid: Tensor, fps: float) -> tuple[Tensor, Tensor]:
         """Key points, scores, valid, frame rate -> key points and scores of steady sides."""
-        check_points(keypoints, 3, 17, 2, "keypoints", "(..., T, 17, 2) key points in pixels")
-        check_finite(keypoints, "keypoints")
-        check_finite(scores, "scores")
+        check_key_points(keypoints, scores, valid, 3, "(..., T, 17, 2) key points in pixels")
         check_positive(fps, "fps")
-        if list(scores.shape) != list(keypoints.shape[:-1]):
-            raise TensorsimError(
-                f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}"
-            )
-        if list(valid.shape) != list(keypoints.shape[:-2]) or valid.dtype != torch.bool:
-            raise TensorsimError(
-                f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(keypoints.shape[:-2])}"
-            )
         if valid.numel() == 0:
             return keypoints, scores
         shape, frames = keypoints.shape, keypoints.shape[-3]
