@@ -18,6 +18,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.motions import Draw
 from tensorsim.files import complete_file
+from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.resample import PoseResampler
@@ -46,6 +47,8 @@ _FARTHEST_M = 12.0
 BODIES = {"joints": 0.35, "limbs": 0.15, "surface": 0.5}
 #: Share of films with a second person, who stands or sits.
 _COMPANY = 0.1
+#: Share of clips of an activity done towards the radar, at the moments of a clip of 4 s, as in generated data sets.
+_REHEARSED = 0.25
 
 
 @dataclass(frozen=True)
@@ -163,18 +166,24 @@ class ClipMaker:
 
     def __init__(self) -> None:
         self.filmed = FilmedMotion()
+        self.generator = ActivityGenerator()
 
     def __call__(self, activity: int, count: int, filmed: bool, generator: torch.Generator) -> list[Watched]:
         """``count`` clips of one length, before one camera; fewer where somebody was never found."""
         draw = Draw(1, generator)
-        length_s = 4.0 if bool(draw(0.0, 1.0) < 0.7) else float(draw(2.4, 4.9))
-        motion, heights = everyday_motion(activity, count, torch.full((count,), length_s), generator)
+        rehearsed = bool(draw(0.0, 1.0) < _REHEARSED)
+        length_s = 4.0 if rehearsed or bool(draw(0.0, 1.0) < 0.7) else float(draw(2.4, 4.9))
         fps = _FILM_HZ[int(draw(0.0, len(_FILM_HZ)))] if filmed else _TRUE_HZ
         frames = round(length_s * fps)
-        people = [
-            (at_rate(joints, frames, fps), tall)
-            for joints, tall in zip(motion, heights.tolist(), strict=True)
-        ]
+        if rehearsed:
+            made = self.generator.generate(activity, count, generator, length_s, fps)
+            people = list(zip(made.joints, made.people.height_m.tolist(), strict=True))
+        else:
+            motion, heights = everyday_motion(activity, count, torch.full((count,), length_s), generator)
+            people = [
+                (at_rate(joints, frames, fps), tall)
+                for joints, tall in zip(motion, heights.tolist(), strict=True)
+            ]
         if not filmed:
             there = torch.ones(1, frames, dtype=torch.bool)
             return [Watched(joints[None], there, fps) for joints, _ in people]
