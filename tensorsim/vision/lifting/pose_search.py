@@ -15,6 +15,8 @@ from tensorsim.vision.lifting.pose_library import all_headings, seen_from, turn
 
 #: Poses of a block at most; half as many at least, in a pool that needs more than one.
 BLOCK = 8192
+#: Cosines in float32 may be this much too low.
+ROUNDING = 1e-5
 #: Blocks but the last hold a multiple of this many.
 _STRIDE = 64
 
@@ -172,6 +174,7 @@ class PoseSearch(nn.Module):
         super().__init__()
         self.yaws, self.neighbours, self.chunk = yaws, neighbours, chunk
         self.pitch_rad = float(pitch_rad)
+        self.margin = ROUNDING
         seen = torch.cat(
             [
                 seen_along_depth(seen_from(all_headings(part, yaws), pitch_rad)).float()
@@ -243,12 +246,14 @@ class PoseSearch(nn.Module):
             rows = torch.nonzero(home == block)[:, 0]
             score, _ = self._scores(block, moment[rows], weights[rows], uniform)
             guess[rows] = self.order[self.starts[block] + score.topk(self.neighbours, dim=-1)[1]]
-        least = weighted_cosine(keypoints[:, None], weights[:, None], self.poses(guess)).amin(dim=-1)
+        first_fit = weighted_cosine(keypoints[:, None], weights[:, None], self.poses(guess))
+        least = first_fit.amin(dim=-1)
 
-        frame = torch.empty(0, dtype=torch.int64, device=keypoints.device)
-        pose, fit = frame, least[:0]
-        new_frames, new_poses, waiting = [frame], [pose], 0
-        alive = bound >= least[:, None] - 1e-5
+        # Every frame begins with these, so that it has enough poses however its scores are rounded.
+        every = torch.arange(frames, device=keypoints.device).repeat_interleave(self.neighbours)
+        frame, pose, fit = best_per_frame(every, guess.flatten(), first_fit.flatten(), self.neighbours)
+        new_frames, new_poses, waiting = [frame[:0]], [pose[:0]], 0
+        alive = bound >= least[:, None] - self.margin
         blocks: list[int] = torch.nonzero(alive.any(dim=0))[:, 0].tolist()
         for i in range(len(blocks)):
             block = blocks[i]
@@ -257,9 +262,11 @@ class PoseSearch(nn.Module):
             # Scores are cosines less one; they and the threshold are rounded by 2^-8 of themselves at most.
             threshold = ((least[rows] - 1.0 - slack) * (1.0 + 2.0**-6)).to(score.dtype)
             row, column = at_least(score, threshold)
-            new_frames.append(rows[row])
-            new_poses.append(self.order[self.starts[block] + column])
-            waiting += row.shape[0]
+            found, candidate = rows[row], self.order[self.starts[block] + column]
+            fresh = (guess[found] != candidate[:, None]).all(dim=-1)
+            new_frames.append(found[fresh])
+            new_poses.append(candidate[fresh])
+            waiting += int(fresh.sum())
             if waiting > 4096 or i == len(blocks) - 1:
                 joined, candidates = torch.cat(new_frames), torch.cat(new_poses)
                 for at in range(0, waiting, 16384):
@@ -284,7 +291,8 @@ class PoseSearch(nn.Module):
         rows = slice(self.starts[block], self.starts[block + 1])
         if not uniform:
             seen = seen_along_depth(self.poses(self.order[rows])).to(moment.dtype)
-            return cosine_table(moment, weights, seen)[0] - 1.0, torch.zeros_like(moment[:, 0])
+            # Rounding of float32, as in the bound of a whole block.
+            return cosine_table(moment, weights, seen)[0] - 1.0, torch.full_like(moment[:, 0], self.margin)
         centre = self.centres[block]
         point = math.sqrt(14.0) * moment
         offset = point - centre

@@ -136,6 +136,19 @@ def test_few_joints_are_searched_exactly(seen: int) -> None:
 
 
 @pytest.mark.usefixtures("small_blocks")
+def test_two_joints_of_different_weights_get_as_many_poses_as_all() -> None:
+    library = standardise_poses(sample_poses(2000, seed=4)).float()
+    keypoints = pictures(200, 5).float()
+    weights = torch.zeros(200, 14)
+    weights[:, 0], weights[:, 5] = 0.6103, 0.5931
+    index = PoseSearch(library, 24, 16, 2**20)(keypoints, weights)
+    normal = pose_search.normalise_weights(weights)
+    every = weighted_cosine(keypoints[:, None], normal[:, None], all_headings(library, 24)[None])
+    found = every.gather(1, index)
+    torch.testing.assert_close(found, every.topk(16, dim=-1)[0], atol=1e-12, rtol=0)
+
+
+@pytest.mark.usefixtures("small_blocks")
 def test_ties_go_to_the_lower_index() -> None:
     library = standardise_poses(sample_poses(200, seed=4))
     library = torch.cat([library, library, library])  # thrice the same
