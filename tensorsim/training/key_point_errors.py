@@ -165,9 +165,9 @@ class FilmedMotion:
         every: only every n-th pose of the shipped library is searched, for speed.
     """
 
-    def __init__(self, every: int = 24) -> None:
+    def __init__(self, every: int = 8) -> None:
         nothing = nn.Identity()
-        lifter = NearestPoseLifter(load_pose_library()[::every], neighbours=16)
+        lifter = NearestPoseLifter(load_pose_library()[::every], neighbours=32)
         self.stage = VideoToPose(nothing, nothing, lifter=lifter).eval()
         self._tilted: dict[float, nn.Module | None] = {}
 
