@@ -87,7 +87,8 @@ class Smoother(Protocol):
             joints: anything where not valid.
             valid: (..., T, J) bool; the other joints are filled in.
             fps: frames per second.
-            noise_std_m: (..., T, J, 1) standard deviation of the joints in metres, from scores and pixel size.
+            noise_std_m: (..., T, J, 3) or (..., T, J, 1) standard deviation of the joints in metres, from scores, pixel
+                size and the spread of depths.
         """
         ...
 

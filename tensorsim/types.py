@@ -63,6 +63,7 @@ class Lifted(NamedTuple):
         keypoints: (..., T, 14, 2) pixels, the found pose placed in the image: stands in for hidden joints.
         nearest: (..., T) int64 of the best match, ``pose * yaws + heading``.
         distance: (..., T) its weighted squared error over the spread of the joints; 0 is a perfect fit.
+        deviation: (..., T, 14) standard deviation of ``depth`` in body heights, among the poses that fit; 0 of one.
     """
 
     depth: Tensor
@@ -70,6 +71,7 @@ class Lifted(NamedTuple):
     keypoints: Tensor
     nearest: Tensor
     distance: Tensor
+    deviation: Tensor
 
 
 class Pose(NamedTuple):

@@ -112,7 +112,7 @@ class PoseConfig:
     lifter: Lifting = "nearest"
     lifter_weights: str | None = None
     library: str | None = None
-    neighbours: int = 32
+    neighbours: int = 128
     temporal: float = 1.0
     fewest_joints: int = 5
     people: str = "all"

@@ -74,6 +74,7 @@ def true_lifting(clip: Clip) -> Lifted:
         pixels.float()[None],
         torch.zeros(1, frames, dtype=torch.int64),
         torch.zeros(1, frames),
+        torch.zeros(1, frames, 14),
     )
 
 

@@ -17,7 +17,7 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps
 from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
-from tensorsim.vision.smoothing.noise import keypoint_noise
+from tensorsim.vision.smoothing.noise import keypoint_noise, noise_with_depth
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
 from tensorsim.vision.smoothing.sides import SteadySides
 from tensorsim.vision.tracking.tracker import GNNTracker
@@ -96,6 +96,7 @@ class VideoToPose(nn.Module):
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
         self.metric_pose = metric_pose
+        self.camera_m = _camera_position(metric_pose)
         self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
@@ -179,6 +180,7 @@ class VideoToPose(nn.Module):
         else:
             other.lifter = lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
+        other.camera_m = camera.position_m
         return other.eval()
 
     def forward(
@@ -326,6 +328,8 @@ class VideoToPose(nn.Module):
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)
         joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
+        if self.temporal is None:
+            noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
         # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there
@@ -336,6 +340,14 @@ class VideoToPose(nn.Module):
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
         # Nobody is where no frame of a track shows a joint.
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & usable.any(dim=-1, keepdim=True))
+
+
+def _camera_position(metric_pose: nn.Module) -> tuple[float, float, float]:
+    """Of the camera of a metric pose, in metres; that of the default one if it says nothing of a camera."""
+    if not isinstance(metric_pose, MetricPose):
+        return CameraConfig().position_m
+    x, y, z = metric_pose.camera_pose[:, 3].tolist()
+    return x, y, z
 
 
 class _AsPlaced(nn.Module):

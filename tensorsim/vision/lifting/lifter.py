@@ -108,7 +108,7 @@ class NearestPoseLifter(nn.Module):
         self,
         library: Tensor | None = None,
         yaws: int = 24,
-        neighbours: int = 32,
+        neighbours: int = 128,
         search_joints: int = 8,
         tolerance: float = 0.05,
         temporal: float = 1.0,
@@ -179,12 +179,15 @@ class NearestPoseLifter(nn.Module):
         scale, placed, distance = fit_poses(keypoints[:, :, None], weights[:, :, None], poses)
 
         share = self._share(poses, scale, distance, placeable)
+        depth = (share[..., None] * poses[..., 1]).sum(dim=2)
+        variance = (share[..., None] * (poses[..., 1] - depth[:, :, None]).square()).sum(dim=2)
         return Lifted(
-            depth=(share[..., None] * poses[..., 1]).sum(dim=2).reshape(shape[:-1]),
+            depth=depth.reshape(shape[:-1]),
             scale=(share * scale).sum(dim=2).reshape(shape[:-2]),
             keypoints=rolled((share[..., None, None] * placed).sum(dim=2), -self.roll_rad).reshape(shape),
             nearest=index[..., 0].reshape(shape[:-2]),
             distance=distance[..., 0].reshape(shape[:-2]),
+            deviation=(variance + 1e-12).sqrt().reshape(shape[:-1]),
         )
 
     def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:

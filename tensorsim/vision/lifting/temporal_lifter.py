@@ -199,7 +199,8 @@ class TemporalLifter(nn.Module):
         wrong = torch.where(weights >= self.keypoint_threshold, wrong, torch.ones_like(wrong))
         image = keypoints + wrong[..., None] * (pixels - keypoints)
         none = torch.zeros_like(middle)
-        return Lifted(depth, scale, image, none.to(torch.int64), none)
+        # What it says of its errors is of joints in the world, see :class:`TemporalPose`, not of depths.
+        return Lifted(depth, scale, image, none.to(torch.int64), none, torch.zeros_like(depth))
 
     def _block(
         self,

@@ -91,3 +91,25 @@ def keypoint_noise(scores: Tensor, height_px: Tensor, height_m: float = 1.75) ->
     """
     cell = (1.0 / height_px.clamp(min=1.0)).clamp(min=1.25 / 64.0)
     return (0.5 * height_m * cell.unsqueeze(-1) / scores.clamp(min=0.2, max=1.0)).unsqueeze(-1)
+
+
+def noise_with_depth(
+    noise: Tensor, deviation: Tensor, joints: Tensor, camera_m: Tensor, height_m: float = 1.75
+) -> Tensor:
+    """Standard deviation of joints along world axes whose depth is less certain than their place in the picture.
+
+    Errors of depth move a joint along its line of sight. Only the diagonal of the covariance is kept, as the smoother
+    takes coordinates for independent.
+
+    Args:
+        noise: (..., J, 1) metres, across the line of sight, of :func:`keypoint_noise`.
+        deviation: (..., J) of depths in body heights, ``Lifted.deviation``.
+        joints: (..., J, 3) metres.
+        camera_m: (3,) position of the camera.
+        height_m: of the body.
+
+    Returns:
+        (..., J, 3) metres.
+    """
+    sight = F.normalize(joints.detach() - camera_m, dim=-1)
+    return (noise.square() + (height_m * deviation.unsqueeze(-1) * sight).square()).sqrt()

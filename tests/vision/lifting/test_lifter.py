@@ -220,6 +220,21 @@ def test_a_body_half_out_of_the_picture_keeps_the_pose_of_its_better_frames() ->
     assert guess > 3 * error
 
 
+def test_deviation_is_the_spread_of_the_poses_that_fit() -> None:
+    """A pose and its mirror image along depth look alike: half of each, depth zero, and the depth of one as deviation."""
+    poses = standardise_poses(sample_poses(8, seed=3))[:4]
+    library = torch.cat([poses, poses * torch.tensor([1.0, -1.0, 1.0])])
+    lifted = NearestPoseLifter(library, yaws=1, neighbours=2, temporal=0.0)(
+        projected(poses), torch.ones(4, 14)
+    )
+    torch.testing.assert_close(
+        lifted.deviation, poses[..., 1].abs().to(lifted.deviation), atol=1e-5, rtol=1e-4
+    )
+    assert float(lifted.depth.abs().max()) < 1e-5
+    single = NearestPoseLifter(library, yaws=1, neighbours=1)(projected(poses), torch.ones(4, 14))
+    assert float(single.deviation.max()) < 1e-5
+
+
 def test_frames_without_joints_take_their_neighbours() -> None:
     image = projected(sample_poses(20, seed=3))[:6]
     weights = torch.ones(6, 14, dtype=torch.float64)

@@ -40,7 +40,7 @@ class Placed(nn.Module):
         self, keypoints: Tensor, scores: Tensor, depth: Tensor, scale: Tensor, fit: Tensor, valid: Tensor
     ) -> tuple[Tensor, Tensor]:
         index = torch.zeros(scale.shape, dtype=torch.int64, device=scale.device)
-        lifted = Lifted(depth, scale, fit, index, torch.zeros_like(scale))
+        lifted = Lifted(depth, scale, fit, index, torch.zeros_like(scale), torch.zeros_like(depth))
         return self.place(keypoints, scores, lifted, valid, 480, 640, 30.0)
 
 
@@ -162,7 +162,7 @@ def film(world: Tensor, camera: CameraConfig = CameraConfig()) -> tuple[Tensor, 
     focal = FOCAL if camera.focal_px is None else camera.focal_px
     scale = focal / (root[:, 0] / TALL + depth.mean(dim=-1))
     nothing = torch.zeros(len(world), dtype=torch.float64)
-    return image, Lifted(depth, scale, image, nothing.long(), nothing)
+    return image, Lifted(depth, scale, image, nothing.long(), nothing, torch.zeros_like(depth))
 
 
 def place(module: MetricPose, image: Tensor, lifted: Lifted, **options: Any) -> Tensor:

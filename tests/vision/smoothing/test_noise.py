@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from tensorsim.vision.smoothing.noise import acceleration_density, jitter, keypoint_noise
+from tensorsim.vision.smoothing.kalman import KalmanSmoother
+from tensorsim.vision.smoothing.noise import acceleration_density, jitter, keypoint_noise, noise_with_depth
 
 FPS = 30.0
 
@@ -63,3 +64,34 @@ def test_keypoint_noise_by_hand() -> None:
     half = 0.5 * 1.76 / 17.5  # far away a pixel is larger than a cell
     expected = torch.tensor([[0.0171875, 0.034375, 0.0859375], [half, 4 * half, half / 0.9]])
     torch.testing.assert_close(found, expected[..., None])
+
+
+def test_noise_of_depth_by_hand() -> None:
+    noise = torch.full((1, 2, 1), 0.03)
+    joints = torch.tensor([[[1.0, 4.0, 1.0], [4.0, 5.0, 1.0]]])  # straight ahead, and to the side by 3 and 4
+    found = noise_with_depth(noise, torch.tensor([[0.04, 0.1]]), joints, torch.tensor([1.0, 1.0, 1.0]), 1.0)
+    aside, ahead = math.hypot(0.03, 0.06), math.hypot(0.03, 0.08)
+    torch.testing.assert_close(found, torch.tensor([[[0.03, 0.05, 0.03], [aside, ahead, 0.03]]]))
+
+
+def test_uncertain_depths_are_smoothed_and_what_the_picture_shows_is_not() -> None:
+    """A wrist moves across the picture at 2 Hz; its depth, which is not known, jumps by 10 cm every sixth frame."""
+    time = torch.arange(120, dtype=torch.float64) / FPS
+    swing = 0.2 * torch.sin(2 * math.pi * 2.0 * time)
+    jumps = 0.05 * torch.where(torch.arange(120) // 6 % 2 == 0, 1.0, -1.0).double()
+    joints = torch.stack([swing, 4.0 + jumps, torch.ones_like(time)], dim=-1)[:, None]
+    noise = torch.full((120, 1, 1), 0.02, dtype=torch.float64)
+    camera = torch.zeros(3, dtype=torch.float64)
+    inside = slice(20, 100)
+
+    def smooth(deviation: float) -> tuple[float, float]:
+        spread = torch.full((120, 1), deviation, dtype=torch.float64)
+        found = KalmanSmoother()(joints, None, FPS, noise_with_depth(noise, spread, joints, camera))[
+            inside, 0
+        ]
+        speed = found[:, 1].diff().abs().max() * FPS
+        return float(found[:, 0].square().mean() / swing[inside].square().mean()) ** 0.5, float(speed)
+
+    (gain, speed), (_, before) = smooth(0.05), smooth(0.0)
+    assert gain > 0.9
+    assert speed < 0.5 * before
