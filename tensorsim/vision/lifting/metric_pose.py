@@ -19,6 +19,7 @@ from tensorsim.vision.lifting.floor import (
     lowest_ankle,
     range_on_floor,
     upright_share,
+    within_reach,
 )
 from tensorsim.vision.smoothing.along_time import (
     fill_gaps,
@@ -221,10 +222,10 @@ class MetricPose(nn.Module):
             depth = height[..., None] * lifted.depth
             # What is found at the lower edge of the picture is cut off by it, and no foot on the floor.
             inside = seen & (keypoints[..., 1] < 0.97 * image_height)
-            hips_range, whole, stands = self._on_floor(
+            hips_range, whole, stands, precision = self._on_floor(
                 hips_range, image, depth, focal, center, pose, height, inside, whole, fps
             )
-            hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps)
+            hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
             body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
             valid = valid & (many | (scale > self.least_size * body_px))
@@ -285,10 +286,10 @@ class MetricPose(nn.Module):
         seen: Tensor,
         whole: Tensor,
         fps: float,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Range of the hips (..., P, T) from the size of the body or, where it is not upright, from the floor.
 
-        Also which frames tell it, and in which of them the person stands.
+        Also which frames tell it, in which of them the person stands, and how precise it is.
         """
         bent = looks_bent(image, seen)
         straight = whole & ~bent
@@ -309,13 +310,14 @@ class MetricPose(nn.Module):
         )
         rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
         by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
-        # Nobody falls further than by two fifths of the range.
-        stood = fill_gaps(smooth, rests)
-        near = rests.any(dim=-1, keepdim=True) & ((by_floor - stood).abs() < 0.4 * stood)
+        # Nobody falls further than by two fifths of the range, or out of reach of where they stood.
+        stood, known = fill_gaps(smooth, rests), rests.any(dim=-1, keepdim=True)
+        by_size = torch.where(known, within_reach(by_size, stood, height, upright), by_size)
+        near = known & ((by_floor - stood).abs() < 0.4 * stood)
         by_floor = torch.where(near, by_floor, torch.full_like(by_floor, float("inf")))
         error_m = torch.full_like(floor, 0.06)
-        fused, share = fused_range(by_size, upright, by_floor, gain, error_m)
-        return fused, whole | (seen.any(dim=-1) & (share > 0.5)), stands
+        fused, share, precision = fused_range(by_size, upright, by_floor, gain, error_m)
+        return fused, whole | (seen.any(dim=-1) & (share > 0.5)), stands, precision
 
 
 def _check(

@@ -72,7 +72,9 @@ def masked_median(x: Tensor, valid: Tensor) -> Tensor:
     )
 
 
-def robust_smooth(x: Tensor, valid: Tensor, sigma: float, rounds: int = 3) -> Tensor:
+def robust_smooth(
+    x: Tensor, valid: Tensor, sigma: float, rounds: int = 3, precision: Tensor | None = None
+) -> Tensor:
     """Local linear smoothing, robust against outliers (lowess: Cleveland, 1979, with bisquare weights).
 
     Args:
@@ -80,16 +82,21 @@ def robust_smooth(x: Tensor, valid: Tensor, sigma: float, rounds: int = 3) -> Te
         valid: (..., T) bool.
         sigma: standard deviation of the kernel in frames.
         rounds: number of reweightings by the residuals.
+        precision: (..., T) positive, inverse variances in any unit; None: all values are equally good.
 
     Returns:
         (..., T), continued over invalid frames. Differentiable.
     """
     x = fill_gaps(x, valid)
     # Filled gaps have a small weight, for gaps longer than the kernel.
-    base = valid.to(x.dtype) + 1e-4
+    base = valid.to(x.dtype)
+    unit = torch.ones_like(x)
+    if precision is not None:
+        base, unit = base * precision, precision.sqrt()
+    base = base + 1e-4
     smooth = local_linear(x, base, sigma)
     for _ in range(rounds):
-        residual = (x - smooth).abs()
+        residual = unit * (x - smooth).abs()
         spread = 6.0 * masked_median(residual, valid)
         bisquare = (1.0 - (residual / spread.clamp(min=1e-9)).clamp(max=1.0).square()).square()
         smooth = local_linear(x, base * (bisquare + 1e-4), sigma)

@@ -10,9 +10,15 @@ from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.types import Lifted
-from tensorsim.vision.lifting.floor import fused_range, lowest_ankle, range_on_floor, upright_share
+from tensorsim.vision.lifting.floor import (
+    fused_range,
+    lowest_ankle,
+    range_on_floor,
+    upright_share,
+    within_reach,
+)
 from tensorsim.vision.lifting.metric_pose import MetricPose
-from tests.vision.lifting.test_metric_pose import TALL, film, place
+from tests.vision.lifting.test_metric_pose import FPS, HEIGHT, TALL, WIDTH, film, place
 
 CAMERA = CameraConfig(position_m=(0.0, 0.0, 1.8), pitch_rad=-math.radians(10))
 
@@ -58,10 +64,12 @@ def test_lowest_joint_rests_on_the_floor() -> None:
 def test_size_counts_while_upright_and_the_floor_otherwise() -> None:
     size, floor = torch.tensor([4.0, 4.0, 4.0]), torch.tensor([3.0, 3.0, math.inf])
     upright, gain = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 2.0, math.inf])
-    y, share = fused_range(size, upright, floor, gain, torch.full((3,), 0.06))
+    y, share, precision = fused_range(size, upright, floor, gain, torch.full((3,), 0.06))
     # Variances 0.6^2 and 0.12^2.
     assert share.tolist() == pytest.approx([0.0, 0.36 / (0.36 + 0.0144), 0.0])
     assert y.tolist() == pytest.approx([4.0, 4.0 - 0.36 / 0.3744, 4.0])
+    # Of an upright body 0.12^2, of both together 0.36 * 0.0144 / 0.3744, of the size of a bent body alone 0.6^2.
+    assert precision.tolist() == pytest.approx([1.0, 1.0, 0.04])
 
 
 def test_upright_share_of_a_squat() -> None:
@@ -80,6 +88,30 @@ def test_a_wrong_size_of_somebody_who_squats_does_not_move_them(error: float) ->
     # The size alone would be wrong by 4 m / 0.7 - 4 m or 4 m - 4 m / 1.3, 0.9 m and more.
     assert float((mid_hips(placed) - mid_hips(world))[:, 1].abs().max()) < 0.2
     assert float(lowest_ankle(placed).abs().max()) < 0.1
+
+
+def test_the_range_of_a_squat_follows_that_of_the_stands_around_it() -> None:
+    """The size is wrong by a fifth in the deep part, with the feet out of sight; of 1 m a tenth remains."""
+    world = torch.cat([squat()[:52], squat()[:52].flip(0)])
+    deep = upright_share(world, torch.tensor(TALL, dtype=torch.float64)) < 0.5
+    image, lifted = film(world, CAMERA)
+    wrong = lifted._replace(scale=lifted.scale * torch.where(deep, 0.8, 1.0))
+    scores = torch.ones(image.shape[:-1], dtype=torch.float64)
+    scores[:, [10, 13]] = 0.0
+    fields = Lifted(*(field[None, None] for field in wrong))
+    there = torch.ones(1, 1, len(world), dtype=torch.bool)
+    placed, _ = MetricPose(CAMERA, (TALL,))(
+        image[None, None], scores[None, None], fields, there, HEIGHT, WIDTH, FPS
+    )
+    assert bool(deep.any())
+    assert float((mid_hips(placed[0, 0]) - mid_hips(world))[:, 1].abs().max()) < 0.15
+
+
+def test_somebody_who_is_not_upright_is_near_where_they_stood() -> None:
+    size, stood = torch.tensor([9.0, 9.0, 9.0, 1.0, 4.5]), torch.full((5,), 4.0)
+    upright = torch.tensor([0.0, 0.5, 1.0, 0.0, 0.0])
+    found = within_reach(size, stood, torch.full((5,), 1.8), upright)
+    assert found.tolist() == pytest.approx([5.8, 7.4, 9.0, 2.2, 4.5])
 
 
 def test_somebody_who_lies_is_on_the_floor() -> None:

@@ -221,8 +221,8 @@ def test_a_body_half_out_of_the_picture_keeps_the_pose_of_its_better_frames() ->
 
 
 def test_deviation_is_the_spread_of_the_poses_that_fit() -> None:
-    """A pose and its mirror image along depth look alike: half of each, depth zero, and the depth of one as deviation."""
-    poses = standardise_poses(sample_poses(8, seed=3))[:4]
+    """A pose and its mirror image along depth look alike: half of each, no depth, and that of one as deviation."""
+    poses = standardise_poses(sample_poses(20, seed=3))[:4]
     library = torch.cat([poses, poses * torch.tensor([1.0, -1.0, 1.0])])
     lifted = NearestPoseLifter(library, yaws=1, neighbours=2, temporal=0.0)(
         projected(poses), torch.ones(4, 14)

@@ -47,6 +47,23 @@ def test_outliers_do_not_bend_it() -> None:
     assert float((robust_smooth(noisy, everything, 6.0, rounds=0) - line).abs().max()) > 0.3
 
 
+def test_imprecise_values_count_little() -> None:
+    """A quarter of the frames are wrong alike, which no robust weight finds; their precision tells."""
+    line = 4.0 + 0.05 * torch.arange(60, dtype=torch.float64)
+    bad = (torch.arange(60) >= 22) & (torch.arange(60) < 37)
+    noisy = (
+        line
+        + 0.1 * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        + 0.6 * bad
+    )
+    everything = torch.ones(60, dtype=torch.bool)
+    precision = torch.where(bad, 0.04, 1.0).double()
+    assert float((robust_smooth(noisy, everything, 6.0, precision=precision) - line).abs().max()) < 0.15
+    assert float((robust_smooth(noisy, everything, 6.0) - line).abs().max()) > 0.4
+    same = robust_smooth(noisy, everything, 6.0, precision=torch.ones(60, dtype=torch.float64))
+    torch.testing.assert_close(same, robust_smooth(noisy, everything, 6.0))
+
+
 def test_single_frames_and_nothing_valid_are_finite() -> None:
     one = torch.tensor([[3.0]])
     torch.testing.assert_close(robust_smooth(one, torch.tensor([[True]]), 5.0), one)
