@@ -80,7 +80,8 @@ class NearestPoseLifter(nn.Module):
     Each frame takes the ``neighbours`` best matches of
     :class:`~tensorsim.vision.lifting.pose_search.PoseSearch`, weighted by how well they fit and, with
     ``temporal`` > 0, by how well they agree with those of the frames before and after (:func:`smooth_assignment`),
-    so that depths do not flip between similar frames. ``neighbours=1`` is the paper's nearest match.
+    so that depths do not flip between similar frames. Their spread says how uncertain depths are.
+    ``neighbours=1`` is the paper's nearest match.
 
     Args:
         library: (L, 14, 3) poses in any unit of length (x right, y away, z up); None is the shipped pool.

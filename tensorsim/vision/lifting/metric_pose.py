@@ -84,9 +84,9 @@ class MetricPose(nn.Module):
 
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
-    joints relative to the hips; y is smoothed along time, robustly, because 2 % at 4 m are 8 cm. The less upright a
-    body is, the more its range is that at which its lowest joint rests on the floor where the person stood
-    (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on
+    joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm.
+    The less upright a body is, the more its range is that at which its lowest joint rests on the floor where the person
+    stood, and never further from there than their height (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on
     its line of sight at its own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not
     know (people who lie), do not give a reliable size: they take that of the others, and one of few joints that would
     make a body of less than 0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The

@@ -185,7 +185,8 @@ class KalmanSmoother(nn.Module):
 
     - measurement noise, per joint and coordinate, from its sixth differences
       (:func:`~tensorsim.vision.smoothing.noise.jitter`, whose variance counts 1.5 times, as errors are rarely white),
-      but at least 0.5 mm and at least ``noise_std_m``. That is the place of slow errors, which look like motion;
+      but at least 0.5 mm and at least ``noise_std_m``. That is the place of slow errors, which look like motion, and of
+      depths, see :func:`~tensorsim.vision.smoothing.noise.noise_with_depth`;
     - process noise, per joint and frame, from its second differences over 0.13 s
       (:func:`~tensorsim.vision.smoothing.noise.acceleration_density`), at least 0.3 m^2/s^3: a body that stands
       still has about that, a wrist that punches a thousand times as much.
