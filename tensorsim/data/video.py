@@ -41,8 +41,9 @@ class VideoReader:
     """A film as chunks of frames; every pass over it starts anew, so it can be read several times.
 
     Frame k is at ``k / fps`` of the file unless the file gives it another time (see
-    :class:`~tensorsim.data.frame_times.FilmClock`); ``uneven_times_s`` says where frames really are. Frames are decoded one after the other from the first, also to reach ``start_s``: seeking is not exact in every
-    format. Frames are turned upright as the file says.
+    :class:`~tensorsim.data.frame_times.FilmClock`); ``uneven_times_s`` says where frames really are. Frames are
+    decoded one after the other from the first, also to reach ``start_s``: seeking is not exact in every format. Frames
+    are turned upright as the file says.
 
     Args:
         path: a file that OpenCV decodes (mp4, avi, gif, ...).

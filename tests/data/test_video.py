@@ -353,7 +353,7 @@ def test_cuts_of_uneven_films_are_in_seconds_of_the_film(
         TensorsimError, match=r"a start of 9\.0 s, expected less than its length of [23]\.\d+ s"
     ):
         VideoReader(path, start_s=9.0)
-    with pytest.raises(TensorsimError, match="no frame lies between 1.0 and 2.0 s"):
+    with pytest.raises(TensorsimError, match=r"no frame lies between 1\.0 and 2\.0 s"):
         VideoReader(path, start_s=1.0, end_s=2.0)
 
 
