@@ -11,7 +11,8 @@ from torch import Tensor
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
-from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
+from tensorsim.data.blazepose import load_keypoints
+from tensorsim.data.coco import Keypoints2D
 from tensorsim.data.motion_files import load_motion, place
 from tensorsim.data.skeletons import Motion
 from tensorsim.data.video import VideoReader
@@ -29,7 +30,7 @@ _GREY = 40
 NEAREST_M = 1.5
 
 #: What the simulation of a path starts from.
-KINDS = {"video": "a video", "keypoints": "COCO keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
+KINDS = {"video": "a video", "keypoints": "keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
 
 
 @dataclass(frozen=True)
@@ -114,10 +115,10 @@ def keypoint_source(
     size: tuple[int, int] | None = None,
     cut: Cut = Cut(),  # noqa: B008  # immutable
 ) -> Source:
-    """People whose COCO keypoints are known; only lifting, placing and smoothing of ``stage`` run.
+    """People whose COCO or BlazePose keypoints are known; only lifting, placing and smoothing of ``stage`` run.
 
     Args:
-        path: see :func:`~tensorsim.data.coco.load_coco_keypoints`.
+        path: see :func:`~tensorsim.data.blazepose.load_keypoints`.
         stage: its networks are not used.
         fps: frames per second; no such file tells them.
         size: (height, width) of the pictures; None where the file says it.
@@ -129,7 +130,7 @@ def keypoint_source(
     if fps is None:
         raise TensorsimError(f"{path}: got keypoints without a frame rate, expected --fps")
     check_positive(fps, "fps")
-    found = load_coco_keypoints(path)
+    found = load_keypoints(path, size)
     size = found.size if size is None else size
     if size is None:
         raise TensorsimError(

@@ -56,8 +56,8 @@ class Simulate(NetworkOptions, RadarOptions):
     """
 
     source: tyro.conf.Positional[Path]
-    """A video that OpenCV decodes; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or COCO
-    keypoints of a video as .json, or a folder with one per frame."""
+    """A video that OpenCV decodes; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or
+    keypoints of a video, COCO or BlazePose, as .json, or a folder with one per frame."""
     out: Path
     """Folder for the results; its files appear together, when all are complete."""
     person_height: tuple[float, ...] | None = None
