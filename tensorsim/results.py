@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
-from tensorsim.config import SimulationConfig
+from tensorsim.config import CameraConfig, SimulationConfig
 from tensorsim.data.array_files import save_arrays
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
@@ -22,8 +22,9 @@ from tensorsim.progress import picture, progress_bar
 from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.report.film import FilmStrip
-from tensorsim.streaming import maps_of_pose
+from tensorsim.streaming import Found, maps_of_pose
 from tensorsim.types import Pose, RadarMaps
+from tensorsim.vision.calibration.calibrator import camera_config, camera_row
 from tensorsim.vision.tracking.selection import select_people
 
 if TYPE_CHECKING:
@@ -242,9 +243,17 @@ def write_pose(
 
 
 def write_overlay(
-    folder: Path, chunks: Iterable[Tensor], fps: float, pose: Pose, threshold: float, quiet: bool = False
+    folder: Path,
+    chunks: Iterable[Tensor],
+    fps: float,
+    pose: Pose,
+    threshold: float,
+    quiet: bool = False,
+    camera: CameraConfig | None = None,
 ) -> FilmStrip:
     """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons.
+
+    With a ``camera`` the floor that it sees is drawn as well.
 
     Returns:
         The same film as a report has it.
@@ -253,12 +262,14 @@ def write_overlay(
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
 
     def drawn() -> Iterator[np.ndarray]:
-        index = 0
+        index, floor = 0, np.zeros((0, 2, 2))
         with progress_bar("overlay", valid.shape[1], quiet) as bar:
             for frames in chunks:
+                if index == 0 and camera is not None:
+                    floor = plot.floor_lines(camera, frames.shape[2], frames.shape[3])
                 for frame in frames.permute(0, 2, 3, 1).numpy():
                     yield plot.draw_people(
-                        frame,
+                        plot.draw_lines(frame, floor),
                         boxes[:, index],
                         keypoints[:, index],
                         scores[:, index],
@@ -282,9 +293,10 @@ def simulate(
     config: SimulationConfig,
     device: torch.device,
     quiet: bool = False,
-) -> tuple[Pose, RadarMaps, FilmStrip]:
+) -> tuple[Found, RadarMaps, FilmStrip]:
     """Find the people of a source, choose, and simulate their maps; writes the overlay film, and returns it as well."""
-    pose = select_people(source.pose(quiet), config.pose.people, source.fps)
+    found = source.find(quiet)
+    pose = select_people(found.pose, config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
     picture(
         "world",
@@ -294,8 +306,9 @@ def simulate(
     )
     torch.manual_seed(config.seed)
     maps = maps_of_pose(stage, pose, source.fps, device, quiet)
-    film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
-    return pose, maps, film
+    camera = None if found.camera is None else camera_config(found.camera)
+    film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet, camera)
+    return found._replace(pose=pose), maps, film
 
 
 def _figure_pixels(figure: Any) -> np.ndarray:
@@ -325,14 +338,16 @@ def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
     return rows
 
 
-def summary_of(source: "Source", config: SimulationConfig, pose: Pose, maps: RadarMaps) -> dict[str, Any]:
+def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: RadarMaps) -> dict[str, Any]:
     """What ``summary.json`` says of every simulation; ``config`` is read by :meth:`SimulationConfig.from_yaml`."""
     snr_db = float(maps.snr_db)
     document = config.to_document()
     return {
         "source": {"kind": source.kind, **source.about},
-        "people": people_of(pose, source.fps),
-        "frames": pose.valid.shape[2],
+        "people": people_of(found.pose, source.fps),
+        "camera": camera_row(found.camera),
+        "background_px_s": None if found.background_px_s is None else round(found.background_px_s, 1),
+        "frames": found.pose.valid.shape[2],
         "fps": source.fps,
         "seed": config.seed,
         "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,

@@ -19,7 +19,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.pipeline import VideoToPose
-from tensorsim.streaming import pose_of_film
+from tensorsim.streaming import Found, people_of_film
 from tensorsim.types import Pose, Tracks
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
@@ -41,7 +41,7 @@ class Source:
         kind: one of :data:`KINDS`.
         fps: frames per second.
         frame_count: expected number of frames, None if it is not known.
-        pose: finds the people, with or without progress bars (``quiet``); the Pose of one clip on the CPU.
+        find: finds the people, with or without progress bars (``quiet``).
         frames: the pictures, in chunks (n, 3, H, W) uint8 RGB.
         threshold: score from which a keypoint is drawn.
         about: what the summary says of the source beside its kind.
@@ -50,7 +50,7 @@ class Source:
     kind: str
     fps: float
     frame_count: int | None
-    pose: Callable[[bool], Pose]
+    find: Callable[[bool], Found]
     frames: Callable[[], Iterable[Tensor]]
     threshold: float
     about: dict[str, Any]
@@ -71,7 +71,7 @@ def film_source(
         "video",
         reader.fps,
         reader.frame_count,
-        lambda quiet: pose_of_film(stage, reader, device, quiet, calibrate),
+        lambda quiet: people_of_film(stage, reader, device, quiet, calibrate),
         lambda: reader.even_chunks(8),
         stage.keypoint_threshold,
         {},
@@ -143,7 +143,7 @@ def keypoint_source(
         "keypoints",
         fps / cut.stride,
         count,
-        lambda quiet: pose,
+        lambda quiet: Found(pose),
         lambda: blank_frames(count, size),
         stage.keypoint_threshold,
         {"image_size": list(size)},
@@ -217,7 +217,7 @@ def motion_source(
         "motion",
         motion.fps,
         count,
-        lambda quiet: pose,
+        lambda quiet: Found(pose),
         lambda: blank_frames(count, CANVAS),
         0.5,
         {"moved_in_front_of_the_radar": moved, **drawn_by(camera, CANVAS)},

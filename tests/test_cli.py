@@ -193,7 +193,7 @@ def test_the_seed_repeats_the_noise(walk: Path, tmp_path: Path, stand_ins: list[
 
 @pytest.mark.parametrize(
     "moment",
-    ["tensorsim.sources.pose_of_film", "tensorsim.results.maps_of_pose", "tensorsim.results.write_overlay"],
+    ["tensorsim.sources.people_of_film", "tensorsim.results.maps_of_pose", "tensorsim.results.write_overlay"],
 )
 def test_an_interrupt_leaves_nothing_half_written(
     walk: Path,

@@ -120,7 +120,8 @@ class Simulate(NetworkOptions, RadarOptions):
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
+                found, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
+                pose = found.pose
                 somebody = bool(pose.valid.any())
                 done = Run(
                     config,
@@ -135,7 +136,7 @@ class Simulate(NetworkOptions, RadarOptions):
                     film,
                 )
                 label = self.write_results(folder, done)
-                summary = label | results.summary_of(source, config, pose, maps)
+                summary = label | results.summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
                 self.write_report(folder, done, summary)
                 results.write_summary(folder, summary)

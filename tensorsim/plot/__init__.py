@@ -32,6 +32,7 @@ __all__ = [
     "draw_floor",
     "draw_lines",
     "draw_people",
+    "floor_lines",
     "map_figure",
     "person_peaks",
     "save_figure",

@@ -27,6 +27,10 @@ class BackgroundMotion:
     Args:
         fps: frames per second of the film.
 
+    Attributes:
+        width: of the pictures, in pixels.
+        shift_px_s: the largest shift within a second, in pixels of the film; None while no second is known.
+
     Raises:
         TensorsimError: a rate that is not positive.
     """
@@ -64,7 +68,7 @@ class BackgroundMotion:
         self._scale = min(1.0, _WIDTH / self.width)
         size = (round(frame.shape[2] * self._scale), round(frame.shape[1] * self._scale))
         # The green channel is most of the brightness.
-        picture = cv2.resize(frame[1].numpy(), size, interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(np.ascontiguousarray(frame[1].numpy()), size, interpolation=cv2.INTER_AREA)
         background = np.full(picture.shape, 255, np.uint8)
         for x1, y1, x2, y2 in boxes * self._scale:
             margin = 0.1 * max(x2 - x1, y2 - y1)
@@ -84,6 +88,16 @@ class BackgroundMotion:
     def moves(self) -> bool:
         """Whether the camera moves: the background shifts by more than :data:`MOVING_SHARE` in a second."""
         return self.shift_px_s is not None and self.shift_px_s > MOVING_SHARE * self.width
+
+    def warn(self) -> None:
+        """Say it in a TensorsimWarning if the camera moves."""
+        if self.moves():
+            warnings.warn(
+                f"the camera moves: the background shifts by up to {self.shift_px_s:.0f} pixels per second, in "
+                f"pictures {self.width} pixels wide; the motion of people and the estimated camera contain that",
+                TensorsimWarning,
+                stacklevel=2,
+            )
 
 
 def similarity_of(
@@ -124,13 +138,3 @@ def _mean_shift(steps: list[np.ndarray], shape: tuple[int, ...]) -> float:
     for step in steps:
         moved = step @ moved
     return float(np.sqrt(np.square(moved - points).sum(axis=0).mean()))
-
-
-def warn_of_moving_camera(shift_px_s: float, width: int) -> None:
-    """Say that the camera moves: everybody's places and speeds are then those against the picture."""
-    warnings.warn(
-        f"the camera moves: the background shifts by up to {shift_px_s:.0f} pixels per second (pictures are {width} "
-        "wide), and the people's motion contains that of the camera",
-        TensorsimWarning,
-        stacklevel=2,
-    )
