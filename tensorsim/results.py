@@ -28,6 +28,8 @@ from tensorsim.vision.calibration.calibrator import camera_config, camera_row
 from tensorsim.vision.tracking.selection import select_people
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tensorsim.sources import Source
 
 
@@ -139,22 +141,26 @@ def write_maps(
             ),
             folder / f"{name}.{pictures.suffix}",
         )
+    plot.save_figure(doppler_figure(maps, axes, pictures, truth), folder / f"doppler_time.{pictures.suffix}")
+
+
+def doppler_figure(
+    maps: RadarMaps, axes: Axes, pictures: Pictures, truth: RadarMaps | None = None
+) -> "Figure":
+    """The picture of a Doppler-time map with its ridges; that of the true motion beside it, if given."""
     both = [maps] if truth is None else [maps, truth]
-    plot.save_figure(
-        plot.map_figure(
-            maps.doppler_time.numpy(),
-            axes.time_s,
-            axes.doppler_hz,
-            "Doppler-time map",
-            "Doppler in Hz, positive = approaching",
-            ridges=strong_ridges(maps, axes),
-            speed_per_axis=axes.speed_per_hz,
-            half_span=max(doppler_span(one, axes) for one in both),
-            reference=None if truth is None else truth.doppler_time.numpy(),
-            reference_ridges=None if truth is None else strong_ridges(truth, axes),
-            **pictures.options("doppler_time"),
-        ),
-        folder / f"doppler_time.{pictures.suffix}",
+    return plot.map_figure(
+        maps.doppler_time.numpy(),
+        axes.time_s,
+        axes.doppler_hz,
+        "Doppler-time map",
+        "Doppler in Hz, positive = approaching",
+        ridges=strong_ridges(maps, axes),
+        speed_per_axis=axes.speed_per_hz,
+        half_span=max(doppler_span(one, axes) for one in both),
+        reference=None if truth is None else truth.doppler_time.numpy(),
+        reference_ridges=None if truth is None else strong_ridges(truth, axes),
+        **pictures.options("doppler_time"),
     )
 
 
@@ -185,28 +191,6 @@ def doppler_span(maps: RadarMaps, axes: Axes) -> float:
     level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB)
     shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB).any(1)]
     return 1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8))
-
-
-def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float | None]]:
-    """How like maps are to those of the true motion: PSNR of linear and dB maps, SSIM, each map over its peak.
-
-    None where a figure is not finite, as for two empty maps.
-    """
-    from tensorsim.radar.analysis import metrics
-
-    table = {}
-    for name in ("range_time", "range_time_mti", "doppler_time"):
-        pair = getattr(maps, name), getattr(truth, name)
-        figures = {
-            "psnr_linear_db": metrics.psnr(*pair, scale="linear"),
-            "psnr_of_db_map_db": metrics.psnr(*pair, scale="db"),
-            "ssim_linear": metrics.ssim(*pair, scale="linear"),
-            "ssim_of_db_map": metrics.ssim(*pair, scale="db"),
-        }
-        table[name] = {
-            key: round(float(value), 4) if bool(value.isfinite()) else None for key, value in figures.items()
-        }
-    return table
 
 
 def write_doppler_sound(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
 from tensorsim.errors import TensorsimError, collected_warnings
@@ -78,6 +79,9 @@ class Simulate(NetworkOptions, RadarOptions):
     Default: nearest."""
     library: Path | None = None
     """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
+    per_person: bool = False
+    """Where several people are in the scene, simulate and label each one alone as well: maps_person_N.npz and
+    doppler_time_person_N.png, N as in the overlay."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -138,7 +142,12 @@ class Simulate(NetworkOptions, RadarOptions):
                 label = self.write_results(folder, done)
                 summary = label | results.summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
-                self.write_report(folder, done, summary)
+                alone = write_each_person(folder, done, self) if self.per_person else []
+                for row, person in zip(
+                    summary["people"], alone, strict=False
+                ):  # nobody or everybody is in alone
+                    row |= person.label
+                self.write_report(folder, done, summary, further=[person.map for person in alone])
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)

@@ -13,7 +13,7 @@ _WIDTH, _STEP_S = 320, 0.1
 #: Fewer corners than this, or fewer than half of them in one motion, tell nothing.
 _LEAST_POINTS, _LEAST_SHARE = 12, 0.5
 #: A camera moves if the background shifts by more than this share of the picture's width within a second.
-MOVING_SHARE = 0.03
+MOVING_SHARE = 0.02
 
 
 class BackgroundMotion:
@@ -114,7 +114,7 @@ def similarity_of(
     corners: Any = cv2.goodFeaturesToTrack(before, 200, 0.01, 7, mask=background_before)
     if corners is None or len(corners) < _LEAST_POINTS:
         return None
-    how = {"winSize": (15, 15), "maxLevel": 4}
+    how: Any = {"winSize": (15, 15), "maxLevel": 4}
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, **how)
     returned, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, **how)
     good = (found[:, 0] == 1) & (found_back[:, 0] == 1)
