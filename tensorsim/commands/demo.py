@@ -182,7 +182,10 @@ def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":
 
 
 def likeness_to_truth(maps: "RadarMaps", truth: "RadarMaps") -> tuple[dict[str, Any], dict[str, Any]]:
-    """How like maps are to the true ones, and how like empty maps are; see :func:`tensorsim.evaluation.scores.similarity`."""
+    """How like maps are to the true ones, and how like empty maps are.
+
+    See :func:`tensorsim.evaluation.scores.similarity`.
+    """
     import torch
 
     from tensorsim.evaluation.scores import similarity

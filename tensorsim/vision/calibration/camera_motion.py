@@ -115,8 +115,9 @@ def similarity_of(
     if corners is None or len(corners) < _LEAST_POINTS:
         return None
     how: Any = {"winSize": (15, 15), "maxLevel": 4}
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, **how)
-    returned, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, **how)
+    no_guess: Any = None  # OpenCV's types know no flow without one
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, no_guess, **how)
+    returned, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, no_guess, **how)
     good = (found[:, 0] == 1) & (found_back[:, 0] == 1)
     good &= np.linalg.norm(returned - corners, axis=-1)[:, 0] < 0.5
     column, row = (moved[:, 0, k].round().astype(int).clip(0, after.shape[1 - k] - 1) for k in range(2))
