@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import COCO_KEYPOINTS
+from tensorsim.errors import TensorsimError, check_floating
 from tensorsim.vision.pose2d.onnx_file import OnnxFile, is_size, open_session
 from tensorsim.vision.pose2d.topdown import MIRRORED, TopDownPose
 
@@ -121,6 +122,9 @@ class SimccDecoder(nn.Module):
     Shape:
         (..., X + Y) -> points (..., 2), ``uv`` in pixels of the crop, and scores (...), the lower one of the two,
         at least 0. Only the scores are differentiable.
+
+    Raises:
+        TensorsimError: no floats, or no rows.
     """
 
     def __init__(self, bins_x: int, split: int = 2) -> None:
@@ -129,6 +133,12 @@ class SimccDecoder(nn.Module):
 
     def forward(self, scores: Tensor) -> tuple[Tensor, Tensor]:
         """(..., X + Y) -> points (..., 2) and scores (...)."""
+        check_floating(scores, "SimccDecoder scores")
+        if scores.shape[-1] <= self.bins_x:
+            raise TensorsimError(
+                f"SimccDecoder scores: got shape {list(scores.shape)}, expected more than {self.bins_x} columns and "
+                "rows"
+            )
         best_x, x = scores[..., : self.bins_x].max(dim=-1)
         best_y, y = scores[..., self.bins_x :].max(dim=-1)
         points = torch.stack([x, y], dim=-1).to(scores.dtype) / self.split

@@ -106,6 +106,46 @@ class TestRtmPose(StageTester):
         ]
 
 
+class TestOnnxSimcc(StageTester):
+    batch_shapes = ((3,),)
+    gradient_arguments = ()  # ONNX Runtime has none
+    scripts = False  # an edge
+    exports = False
+
+    @pytest.fixture(autouse=True)
+    def _file(self, tmp_path: Path) -> None:
+        self.path = write_network(tmp_path / "rtmpose.onnx")
+
+    def make(self) -> nn.Module:
+        return OnnxSimcc(self.path, flip_test=True)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        return (torch.rand(*batch, 3, *SIZE, dtype=dtype, generator=torch.Generator().manual_seed(0)),)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        return [
+            ((torch.zeros(3, *SIZE),), r"OnnxSimcc crops: .* expected \(N, 3, H, W\)"),
+            ((torch.zeros(1, 3, 32, 64),), r"expected \(N, 3, 64, 48\)"),
+        ]
+
+
+class TestSimccDecoder(StageTester):
+    def make(self) -> nn.Module:
+        return SimccDecoder(6, 2)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        return (torch.rand(*batch, 17, 14, dtype=dtype, generator=torch.Generator().manual_seed(0)),)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        return [
+            (
+                (torch.zeros(17, 6),),
+                r"SimccDecoder scores: got shape \[17, 6\], expected more than 6 columns",
+            ),
+            ((torch.zeros(17, 14, dtype=torch.long),), "SimccDecoder scores"),
+        ]
+
+
 @pytest.mark.parametrize("batch", [1, "n"])
 @pytest.mark.parametrize("flip_test", [False, True])
 def test_peaks_are_where_the_pixels_are(tmp_path: Path, batch: int | str, flip_test: bool) -> None:
