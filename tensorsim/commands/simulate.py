@@ -143,9 +143,7 @@ class Simulate(NetworkOptions, RadarOptions):
                 summary = label | results.summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
                 alone = write_each_person(folder, done, self) if self.per_person else []
-                for row, person in zip(
-                    summary["people"], alone, strict=False
-                ):  # nobody or everybody is in alone
+                for row, person in zip(summary["people"], alone, strict=len(alone) > 0):
                     row |= person.label
                 self.write_report(folder, done, summary, further=[person.map for person in alone])
                 results.write_summary(folder, summary)

@@ -1,6 +1,7 @@
 """BlazePose landmarks in the layouts of MediaPipe's interfaces become COCO key points in pixels."""
 
 import json
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.data import load_keypoints
 from tensorsim.errors import TensorsimError
+from tests.fuzz.files import mutated
 
 #: MediaPipe's names of its landmarks, in order.
 NAMES = [
@@ -119,3 +121,21 @@ def test_a_size_is_needed(tmp_path: Path) -> None:
         load_keypoints(path)
     with pytest.raises(TensorsimError, match="got 100000, expected image side"):
         load_keypoints(path, (100_000, 10))
+
+
+def test_damaged_files_are_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "people.json"
+    whole = json.dumps(
+        {"width": 64, "height": 48, "frames": [person(), [person(), person(0.1)], None]}
+    ).encode()
+    refused = 0
+    for seed in range(300):
+        path.write_bytes(mutated(random.Random(seed), whole))
+        try:
+            people = load_keypoints(path)
+        except TensorsimError:
+            refused += 1
+        else:
+            assert people.keypoints.isfinite().all()
+            assert people.scores.isfinite().all()
+    assert 50 < refused < 300

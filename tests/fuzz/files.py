@@ -28,7 +28,6 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "data_3d_h36m.npz": load_motion,
     "walk.bvh": load_motion,
     "coco.json": load_keypoints,
-    "blazepose.json": lambda path: load_keypoints(path, (48, 64)),
     "weights.pth": load_state_dict,
     "legacy.pth": load_state_dict,
     "weights.safetensors": load_state_dict,
@@ -52,9 +51,6 @@ def originals() -> dict[str, bytes]:
     people = [
         {"image_id": i, "track_id": 1, "keypoints": values.random(51).round(2).tolist()} for i in range(3)
     ]
-    landmarks = [
-        [{"x": round(x, 2), "y": 0.5, "visibility": 0.9} for x in values.random(33)] for _ in range(2)
-    ]
     state = {"a": torch.rand(3, 4), "b": torch.zeros(2)}
     with tempfile.TemporaryDirectory() as folder:
         write_video(Path(folder) / "film.mp4", values.integers(0, 255, (5, 32, 48, 3), np.uint8), 24.0)
@@ -66,7 +62,6 @@ def originals() -> dict[str, bytes]:
         "data_3d_h36m.npz": saved(lambda f: np.savez(f, positions_3d=np.array(clip, dtype=object))),
         "walk.bvh": bvh,
         "coco.json": json.dumps(people).encode(),
-        "blazepose.json": json.dumps({"width": 64, "height": 48, "frames": landmarks}).encode(),
         "weights.pth": saved(lambda f: torch.save(state, f)),
         "legacy.pth": saved(lambda f: torch.save(state, f, _use_new_zipfile_serialization=False)),
         "weights.safetensors": save(state),
