@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
-from tensorsim.config import SimulationConfig
+from tensorsim.config import CameraConfig, SimulationConfig
 from tensorsim.data.array_files import save_arrays
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
@@ -22,11 +22,14 @@ from tensorsim.progress import picture, progress_bar
 from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.report.film import FilmStrip
-from tensorsim.streaming import maps_of_pose
+from tensorsim.streaming import Found, maps_of_pose
 from tensorsim.types import Pose, RadarMaps
+from tensorsim.vision.calibration.calibrator import camera_config, camera_row
 from tensorsim.vision.tracking.selection import select_people
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tensorsim.sources import Source
 
 
@@ -138,22 +141,26 @@ def write_maps(
             ),
             folder / f"{name}.{pictures.suffix}",
         )
+    plot.save_figure(doppler_figure(maps, axes, pictures, truth), folder / f"doppler_time.{pictures.suffix}")
+
+
+def doppler_figure(
+    maps: RadarMaps, axes: Axes, pictures: Pictures, truth: RadarMaps | None = None
+) -> "Figure":
+    """The picture of a Doppler-time map with its ridges; that of the true motion beside it, if given."""
     both = [maps] if truth is None else [maps, truth]
-    plot.save_figure(
-        plot.map_figure(
-            maps.doppler_time.numpy(),
-            axes.time_s,
-            axes.doppler_hz,
-            "Doppler-time map",
-            "Doppler in Hz, positive = approaching",
-            ridges=strong_ridges(maps, axes),
-            speed_per_axis=axes.speed_per_hz,
-            half_span=max(doppler_span(one, axes) for one in both),
-            reference=None if truth is None else truth.doppler_time.numpy(),
-            reference_ridges=None if truth is None else strong_ridges(truth, axes),
-            **pictures.options("doppler_time"),
-        ),
-        folder / f"doppler_time.{pictures.suffix}",
+    return plot.map_figure(
+        maps.doppler_time.numpy(),
+        axes.time_s,
+        axes.doppler_hz,
+        "Doppler-time map",
+        "Doppler in Hz, positive = approaching",
+        ridges=strong_ridges(maps, axes),
+        speed_per_axis=axes.speed_per_hz,
+        half_span=max(doppler_span(one, axes) for one in both),
+        reference=None if truth is None else truth.doppler_time.numpy(),
+        reference_ridges=None if truth is None else strong_ridges(truth, axes),
+        **pictures.options("doppler_time"),
     )
 
 
@@ -184,28 +191,6 @@ def doppler_span(maps: RadarMaps, axes: Axes) -> float:
     level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB)
     shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB).any(1)]
     return 1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8))
-
-
-def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float | None]]:
-    """How like maps are to those of the true motion: PSNR of linear and dB maps, SSIM, each map over its peak.
-
-    None where a figure is not finite, as for two empty maps.
-    """
-    from tensorsim.radar.analysis import metrics
-
-    table = {}
-    for name in ("range_time", "range_time_mti", "doppler_time"):
-        pair = getattr(maps, name), getattr(truth, name)
-        figures = {
-            "psnr_linear_db": metrics.psnr(*pair, scale="linear"),
-            "psnr_of_db_map_db": metrics.psnr(*pair, scale="db"),
-            "ssim_linear": metrics.ssim(*pair, scale="linear"),
-            "ssim_of_db_map": metrics.ssim(*pair, scale="db"),
-        }
-        table[name] = {
-            key: round(float(value), 4) if bool(value.isfinite()) else None for key, value in figures.items()
-        }
-    return table
 
 
 def write_doppler_sound(
@@ -242,9 +227,17 @@ def write_pose(
 
 
 def write_overlay(
-    folder: Path, chunks: Iterable[Tensor], fps: float, pose: Pose, threshold: float, quiet: bool = False
+    folder: Path,
+    chunks: Iterable[Tensor],
+    fps: float,
+    pose: Pose,
+    threshold: float,
+    quiet: bool = False,
+    camera: CameraConfig | None = None,
 ) -> FilmStrip:
     """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons.
+
+    With a ``camera`` the floor that it sees is drawn as well.
 
     Returns:
         The same film as a report has it.
@@ -253,12 +246,14 @@ def write_overlay(
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
 
     def drawn() -> Iterator[np.ndarray]:
-        index = 0
+        index, floor = 0, np.zeros((0, 2, 2))
         with progress_bar("overlay", valid.shape[1], quiet) as bar:
             for frames in chunks:
+                if index == 0 and camera is not None:
+                    floor = plot.floor_lines(camera, frames.shape[2], frames.shape[3])
                 for frame in frames.permute(0, 2, 3, 1).numpy():
                     yield plot.draw_people(
-                        frame,
+                        plot.draw_lines(frame, floor),
                         boxes[:, index],
                         keypoints[:, index],
                         scores[:, index],
@@ -282,9 +277,10 @@ def simulate(
     config: SimulationConfig,
     device: torch.device,
     quiet: bool = False,
-) -> tuple[Pose, RadarMaps, FilmStrip]:
+) -> tuple[Found, RadarMaps, FilmStrip]:
     """Find the people of a source, choose, and simulate their maps; writes the overlay film, and returns it as well."""
-    pose = select_people(source.pose(quiet), config.pose.people, source.fps)
+    found = source.find(quiet)
+    pose = select_people(found.pose, config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
     picture(
         "world",
@@ -294,8 +290,9 @@ def simulate(
     )
     torch.manual_seed(config.seed)
     maps = maps_of_pose(stage, pose, source.fps, device, quiet)
-    film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet)
-    return pose, maps, film
+    camera = None if found.camera is None else camera_config(found.camera)
+    film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet, camera)
+    return found._replace(pose=pose), maps, film
 
 
 def _figure_pixels(figure: Any) -> np.ndarray:
@@ -325,14 +322,16 @@ def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
     return rows
 
 
-def summary_of(source: "Source", config: SimulationConfig, pose: Pose, maps: RadarMaps) -> dict[str, Any]:
+def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: RadarMaps) -> dict[str, Any]:
     """What ``summary.json`` says of every simulation; ``config`` is read by :meth:`SimulationConfig.from_yaml`."""
     snr_db = float(maps.snr_db)
     document = config.to_document()
     return {
         "source": {"kind": source.kind, **source.about},
-        "people": people_of(pose, source.fps),
-        "frames": pose.valid.shape[2],
+        "people": people_of(found.pose, source.fps),
+        "camera": camera_row(found.camera),
+        "background_px_s": None if found.background_px_s is None else round(found.background_px_s, 1),
+        "frames": found.pose.valid.shape[2],
         "fps": source.fps,
         "seed": config.seed,
         "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,

@@ -11,14 +11,15 @@ from torch import Tensor
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
-from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
+from tensorsim.data.blazepose import load_keypoints
+from tensorsim.data.coco import Keypoints2D
 from tensorsim.data.motion_files import load_motion, place
 from tensorsim.data.skeletons import Motion
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.pipeline import VideoToPose
-from tensorsim.streaming import pose_of_film
+from tensorsim.streaming import Found, people_of_film
 from tensorsim.types import Pose, Tracks
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
@@ -29,7 +30,7 @@ _GREY = 40
 NEAREST_M = 1.5
 
 #: What the simulation of a path starts from.
-KINDS = {"video": "a video", "keypoints": "COCO keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
+KINDS = {"video": "a video", "keypoints": "keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Source:
         kind: one of :data:`KINDS`.
         fps: frames per second.
         frame_count: expected number of frames, None if it is not known.
-        pose: finds the people, with or without progress bars (``quiet``); the Pose of one clip on the CPU.
+        find: finds the people, with or without progress bars (``quiet``).
         frames: the pictures, in chunks (n, 3, H, W) uint8 RGB.
         threshold: score from which a keypoint is drawn.
         about: what the summary says of the source beside its kind.
@@ -49,7 +50,7 @@ class Source:
     kind: str
     fps: float
     frame_count: int | None
-    pose: Callable[[bool], Pose]
+    find: Callable[[bool], Found]
     frames: Callable[[], Iterable[Tensor]]
     threshold: float
     about: dict[str, Any]
@@ -70,7 +71,7 @@ def film_source(
         "video",
         reader.fps,
         reader.frame_count,
-        lambda quiet: pose_of_film(stage, reader, device, quiet, calibrate),
+        lambda quiet: people_of_film(stage, reader, device, quiet, calibrate),
         lambda: reader.even_chunks(8),
         stage.keypoint_threshold,
         {},
@@ -114,10 +115,10 @@ def keypoint_source(
     size: tuple[int, int] | None = None,
     cut: Cut = Cut(),  # noqa: B008  # immutable
 ) -> Source:
-    """People whose COCO keypoints are known; only lifting, placing and smoothing of ``stage`` run.
+    """People whose COCO or BlazePose keypoints are known; only lifting, placing and smoothing of ``stage`` run.
 
     Args:
-        path: see :func:`~tensorsim.data.coco.load_coco_keypoints`.
+        path: see :func:`~tensorsim.data.blazepose.load_keypoints`.
         stage: its networks are not used.
         fps: frames per second; no such file tells them.
         size: (height, width) of the pictures; None where the file says it.
@@ -129,7 +130,7 @@ def keypoint_source(
     if fps is None:
         raise TensorsimError(f"{path}: got keypoints without a frame rate, expected --fps")
     check_positive(fps, "fps")
-    found = load_coco_keypoints(path)
+    found = load_keypoints(path, size)
     size = found.size if size is None else size
     if size is None:
         raise TensorsimError(
@@ -142,7 +143,7 @@ def keypoint_source(
         "keypoints",
         fps / cut.stride,
         count,
-        lambda quiet: pose,
+        lambda quiet: Found(pose),
         lambda: blank_frames(count, size),
         stage.keypoint_threshold,
         {"image_size": list(size)},
@@ -216,7 +217,7 @@ def motion_source(
         "motion",
         motion.fps,
         count,
-        lambda quiet: pose,
+        lambda quiet: Found(pose),
         lambda: blank_frames(count, CANVAS),
         0.5,
         {"moved_in_front_of_the_radar": moved, **drawn_by(camera, CANVAS)},

@@ -1,6 +1,7 @@
 """Long films, frame by frame, and long motion, pulse by pulse: memory does not grow with their length."""
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,23 @@ from tensorsim.vision.calibration.calibrator import (
     camera_config,
     with_reserve,
 )
+from tensorsim.vision.calibration.camera_motion import BackgroundMotion
 from tensorsim.vision.smoothing.even_time import to_even_time
+
+
+class Found(NamedTuple):
+    """Who was found, and what of the camera.
+
+    Attributes:
+        pose: of one clip (B = 1), on the CPU.
+        camera: as estimated from the people; None where it was not.
+        background_px_s: how far the background shifts within a second at most, in pixels of the film; None where
+            that is not known.
+    """
+
+    pose: Pose
+    camera: CameraEstimate | None = None
+    background_px_s: float | None = None
 
 
 def pose_of_film(
@@ -28,7 +45,20 @@ def pose_of_film(
     quiet: bool = False,
     calibrate: bool = False,
 ) -> Pose:
+    """The Pose that :func:`people_of_film` finds."""
+    return people_of_film(stage, reader, device, quiet, calibrate).pose
+
+
+def people_of_film(
+    stage: VideoToPose,
+    reader: VideoReader,
+    device: torch.device,
+    quiet: bool = False,
+    calibrate: bool = False,
+) -> Found:
     """Detect and track in a first pass over the film, estimate and lift poses in a second one.
+
+    A camera that moves is said in a TensorsimWarning.
 
     Args:
         stage: with the networks.
@@ -38,7 +68,7 @@ def pose_of_film(
         calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
 
     Returns:
-        The Pose of one clip (B = 1) on the CPU, at ``reader.fps`` frames per second; equal to ``stage(video, fps)`` of
+        The people and the camera; the Pose is at ``reader.fps`` frames per second and equal to ``stage(video, fps)`` of
         the whole film, or ``stage(video, fps, times_s=...)`` where its frames are at uneven times.
 
     Raises:
@@ -46,15 +76,18 @@ def pose_of_film(
     """
     detections, observed = detections_of_film(stage, reader, device, quiet)
     tracks = stage.follow(detections, observed)
-    keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet)
+    background = BackgroundMotion(reader.fps)
+    keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet, background)
+    background.warn()
     size = reader.height, reader.width
     if reader.uneven_times_s is not None:
         times_s = reader.uneven_times_s[None]
         tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, reader.fps)
+    camera = None
     if calibrate:
-        stage, _ = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
+        stage, camera = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
     pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
-    return Pose(*(field.cpu() for field in pose))
+    return Found(Pose(*(field.cpu() for field in pose)), camera, background.shift_px_s)
 
 
 def calibrated(
@@ -109,9 +142,17 @@ def detections_of_film(
 
 
 def keypoints_of_film(
-    stage: VideoToPose, reader: VideoReader, tracks: Tracks, device: torch.device, quiet: bool = False
+    stage: VideoToPose,
+    reader: VideoReader,
+    tracks: Tracks,
+    device: torch.device,
+    quiet: bool = False,
+    background: BackgroundMotion | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """COCO keypoints (1, P, T, 17, 2) of tracked people of a film and their scores (1, P, T, 17)."""
+    """COCO keypoints (1, P, T, 17, 2) of tracked people of a film and their scores (1, P, T, 17).
+
+    ``background`` is given the frames as well.
+    """
     boxes, valid = tracks.boxes[0].transpose(0, 1), tracks.valid[0].transpose(0, 1)
     keypoints: list[Tensor] = []
     scores: list[Tensor] = []
@@ -122,6 +163,8 @@ def keypoints_of_film(
             k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
             keypoints.append(k)
             scores.append(s)
+            if background is not None:
+                background.add(frames, boxes[done:stop], valid[done:stop])
             picture(
                 "film",
                 partial(_drawn, frames, boxes[done:stop], k, s, valid[done:stop], stage.keypoint_threshold),

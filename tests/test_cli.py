@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 import os
 import re
 import subprocess
@@ -19,7 +20,9 @@ from tensorsim import cli, streaming
 from tensorsim.commands import simulate
 from tensorsim.commands.options import RadarOptions, load_recognizer
 from tensorsim.data.video import VideoReader
+from tensorsim.data.video_writer import write_video
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.plot import draw_floor
 from tensorsim.radar.presets import PRESETS
 from tensorsim.weights import save_weights
 from tests.film import RectangleDetector, StandingPose, film, walker
@@ -127,6 +130,91 @@ def test_the_camera_is_estimated_unless_it_is_known(walk: Path, tmp_path: Path, 
         assert config.pose.calibrate is False
 
 
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film of one person who walks away and one who comes."""
+    path = tmp_path_factory.mktemp("film") / "two.avi"
+    away, comes = walker(25, FPS, 3.0, 1.0, -0.7), walker(25, FPS, 6.0, -0.8, 0.9)
+    frames = film(*(torch.cat(both) for both in zip(away, comes, strict=True))).permute(0, 2, 3, 1).numpy()
+    write_video(path, frames, FPS)
+    return path
+
+
+def test_each_person_alone(two: Path, tmp_path: Path, stand_ins: list[str]) -> None:
+    """The maps of a person are those of a run with this person only; one pass of the networks gives all."""
+    shared = [str(two), "--no-calibrate", *stand_ins, "--out"]
+    cli.main(["simulate", *shared, str(tmp_path / "all"), "--per-person"])
+    summary = json.loads((tmp_path / "all" / "summary.json").read_text())
+    further = {
+        f"{name}_person_{n}{end}"
+        for n in (1, 2)
+        for name, end in (("maps", ".npz"), ("doppler_time", ".png"))
+    }
+    assert {p.name for p in (tmp_path / "all").iterdir()} == FILES | further
+    assert set(summary["files"]) == FILES | further
+    for number in (1, 2):
+        out = tmp_path / str(number)
+        cli.main(["simulate", *shared, str(out), "--people", str(number), "--per-person"])
+        assert {p.name for p in out.iterdir()} == FILES, "nobody else is there"
+        with (
+            np.load(out / "maps.npz") as alone,
+            np.load(tmp_path / "all" / f"maps_person_{number}.npz") as one,
+        ):
+            assert set(alone) == set(one)
+            for name in alone:
+                np.testing.assert_array_equal(alone[name], one[name])
+        row = summary["people"][number - 1]
+        expected = json.loads((out / "summary.json").read_text())
+        assert {name: row[name] for name in ("label", "probabilities", "timeline")} == {
+            name: expected[name] for name in ("label", "probabilities", "timeline")
+        }
+        assert f"Doppler-time map of person {number}" in (tmp_path / "all" / "report.html").read_text()
+    assert summary["people"][0]["mean_approach_m_s"] < 0 < summary["people"][1]["mean_approach_m_s"]
+
+
+def test_the_camera_is_in_summary_and_overlay(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
+    cli.main(["simulate", str(walk), "--out", str(tmp_path / "out"), *stand_ins])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    camera = summary["camera"]
+    assert camera["frames"] > 10
+    for name in ("pitch_deg", "roll_deg", "horizontal_fov_deg", "height_m"):
+        value, deviation = camera[name]
+        assert abs(value) < 90
+        assert deviation > 0
+    assert summary["background_px_s"] is None, "black all over"
+    estimated = ts.CameraConfig(
+        horizontal_fov_rad=math.radians(camera["horizontal_fov_deg"][0]),
+        position_m=(0.0, 0.0, camera["height_m"][0]),
+        pitch_rad=math.radians(camera["pitch_deg"][0]),
+        roll_rad=math.radians(camera["roll_deg"][0]),
+    )
+    grid = draw_floor(np.zeros((240, 320, 3), np.uint8), estimated)[..., 2] > 150
+    cli.main(["simulate", str(walk), "--out", str(tmp_path / "level"), "--no-calibrate", *stand_ins])
+    assert json.loads((tmp_path / "level" / "summary.json").read_text())["camera"] is None
+    drawn, bare = (
+        next(VideoReader(tmp_path / name / "overlay.mp4").chunks(1))[0, 2].numpy()
+        for name in ("out", "level")
+    )
+    assert drawn[grid].mean() > 100 + bare[grid].mean()
+
+
+def test_a_camera_that_moves_is_said(
+    tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A walker before a blue pattern that passes at 60 pixels per second."""
+    frames = film(*walker(25, FPS, 4.0, 1.2, 0.3))
+    pattern = np.random.default_rng(0).integers(0, 110, (12, 40), np.uint8)
+    pattern = cv2.resize(pattern, (800, 240), interpolation=cv2.INTER_CUBIC)
+    for k, frame in enumerate(frames):
+        frame[:] = torch.maximum(frame, torch.from_numpy(pattern[:, 6 * k : 6 * k + 320].copy()))
+    write_video(tmp_path / "pan.avi", frames.permute(0, 2, 3, 1).numpy(), FPS)
+    cli.main(["simulate", str(tmp_path / "pan.avi"), "--out", str(tmp_path / "out"), *stand_ins])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["background_px_s"] == pytest.approx(60, rel=0.1)
+    assert sum("the camera moves: the background shifts" in message for message in summary["warnings"]) == 1
+    assert "the camera moves" in capsys.readouterr().err
+
+
 def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:
     """The file's radar replaces the scene's, its wall too; the scene's wall stays where the file has none."""
     scene = RadarOptions(scene="through-wall", radar="cw-24ghz").configuration().scene
@@ -193,7 +281,7 @@ def test_the_seed_repeats_the_noise(walk: Path, tmp_path: Path, stand_ins: list[
 
 @pytest.mark.parametrize(
     "moment",
-    ["tensorsim.sources.pose_of_film", "tensorsim.results.maps_of_pose", "tensorsim.results.write_overlay"],
+    ["tensorsim.sources.people_of_film", "tensorsim.results.maps_of_pose", "tensorsim.results.write_overlay"],
 )
 def test_an_interrupt_leaves_nothing_half_written(
     walk: Path,

@@ -89,7 +89,7 @@ def test_bvh_of_generated_motion_comes_back(walk: np.ndarray, tmp_path: Path) ->
     source = motion_source(tmp_path / "walk.bvh")
     assert source.fps == pytest.approx(FPS)
     assert source.frame_count == 45
-    pose = source.pose(True)
+    pose = source.find(True).pose
     assert pose.valid.all()
     # Placing puts the lowest ankle at its height over the floor, where the generator had it within 2 cm.
     shift = pose.joints[0, 0].numpy() - walk
@@ -102,12 +102,12 @@ def test_who_comes_too_near_is_moved_away_unless_placed(walk: np.ndarray, tmp_pa
     path = tmp_path / "walk.npz"
     np.savez(path, joints=walk - [3.0, 5.0, 0.0], fps=FPS)
     source = motion_source(path)
-    joints = source.pose(True).joints[0, 0]
+    joints = source.find(True).pose.joints[0, 0]
     assert float(joints[..., 1].min()) == pytest.approx(NEAREST_M, abs=1e-5)
     hips = mid_hips(joints)[:, 0]
     assert float(hips.min() + hips.max()) == pytest.approx(0, abs=1e-5)
     assert source.about["moved_in_front_of_the_radar"] is True
-    placed = motion_source(path, start_range_m=4.0, heading_rad=math.pi).pose(True).joints[0, 0]
+    placed = motion_source(path, start_range_m=4.0, heading_rad=math.pi).find(True).pose.joints[0, 0]
     assert float(mid_hips(placed)[0, 1]) == pytest.approx(4.0, abs=1e-5)
     turned = (mid_hips(placed)[-1] - mid_hips(placed)[0])[:2]
     original = walk[-1, (8, 11), :2].mean(0) - walk[0, (8, 11), :2].mean(0)
@@ -122,7 +122,7 @@ def test_cut_clip_and_people_who_are_never_there(walk: np.ndarray, tmp_path: Pat
     valid[2] = False
     np.savez(path, joints=people, joints_fps=FPS, valid=valid, other=walk)
     source = motion_source(path, "joints", cut=Cut(0.5, None, 3))
-    pose = source.pose(True)
+    pose = source.find(True).pose
     assert source.fps == pytest.approx(10.0)
     assert pose.valid.tolist() == valid[None, :2, 15::3].tolist()
     assert pose.joints.isfinite().all()
@@ -146,7 +146,7 @@ def test_drawn_people_are_where_the_summary_says_the_camera_sees_them(
 ) -> None:
     np.savez(tmp_path / "walk.npz", joints=walk, fps=FPS)
     source = motion_source(tmp_path / "walk.npz")
-    pose, about = source.pose(True), source.about["camera"]
+    pose, about = source.find(True).pose, source.about["camera"]
     camera = ts.CameraConfig(
         horizontal_fov_rad=math.radians(about["horizontal_fov_deg"]),
         pitch_rad=math.radians(about["pitch_deg"]),
@@ -178,7 +178,7 @@ def test_true_keypoints_lead_back_to_the_motion(
     path.write_text(json.dumps(coco_json(keypoints, scores, CANVAS)))
     people = ts.motion.ActivityGenerator().generate("walking", seed=3, rate_hz=FPS).people
     source = keypoint_source(path, lifter(camera, float(people.height_m[0])), FPS)
-    joints = source.pose(True).joints[0, 0].numpy()
+    joints = source.find(True).pose.joints[0, 0].numpy()
     assert source.frame_count == 45
     assert torch.cat(list(source.frames())).shape == (45, 3, *CANVAS)
     error = np.linalg.norm(joints - walk, axis=-1)
@@ -198,7 +198,7 @@ def test_gaps_of_a_track_are_bridged_and_frames_are_cut(
     path = tmp_path / "walk.json"
     path.write_text(json.dumps(coco_json(keypoints, scores)))
     source = keypoint_source(path, lifter(camera, 1.75), 60.0, CANVAS, Cut(0.0, None, 2))
-    pose = source.pose(True)
+    pose = source.find(True).pose
     assert source.fps == 30.0
     assert pose.valid[0, 0].tolist() == [False] * 2 + [True] * 21
     assert pose.keypoint_scores[0, 0, 10:12].max() == 0

@@ -82,7 +82,8 @@ class Demo(NetworkOptions, RadarOptions):
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people, device)
-                pose, maps, strip = results.simulate(source, maps_stage, folder, config, device, self.quiet)
+                seen, maps, strip = results.simulate(source, maps_stage, folder, config, device, self.quiet)
+                pose = seen.pose
                 torch.manual_seed(config.seed)
                 rate_hz = FILM_FPS * MOMENTS_PER_FRAME
                 joints = true_pose(truth.joints, truth.valid)
@@ -104,7 +105,7 @@ class Demo(NetworkOptions, RadarOptions):
                     "options": self.described(),
                     "warnings": messages,
                 }
-                summary = label | results.summary_of(source, config, pose, maps) | about
+                summary = label | results.summary_of(source, config, seen, maps) | about
                 self.write_report(folder, done, summary, true_maps)
                 results.write_summary(folder, summary)
         for message in messages:
@@ -181,10 +182,13 @@ def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":
 
 
 def likeness_to_truth(maps: "RadarMaps", truth: "RadarMaps") -> tuple[dict[str, Any], dict[str, Any]]:
-    """How like maps are to the true ones, and how like empty maps are; see :func:`tensorsim.results.similarity`."""
+    """How like maps are to the true ones, and how like empty maps are.
+
+    See :func:`tensorsim.evaluation.scores.similarity`.
+    """
     import torch
 
-    from tensorsim.results import similarity
+    from tensorsim.evaluation.scores import similarity
 
     likeness = similarity(maps, truth)
     empty = maps._replace(**{name: torch.zeros_like(getattr(maps, name)) for name in likeness})

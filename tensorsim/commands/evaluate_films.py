@@ -95,16 +95,17 @@ class EvaluateFilms(NetworkOptions):
         from tensorsim.evaluation.labelled_films import film_row, followed, judged
 
         video = reader.open(film)
-        pose, camera = reader.people(film, device, self.quiet)
+        found = reader.people(film, video, device, self.quiet)
+        pose = found.pose
         shown = []
         for name, how in scenes.items():
             verdict, maps = judged(film, pose, video.fps, name, how, self.seed, device, self.quiet)
             axes = None if maps is None else results.axes_of(how.stage, maps)
             shown.append((verdict, maps, axes))
-        figure = contact_sheet(film, video, pose, camera, reader.stage.keypoint_threshold, shown)
+        figure = contact_sheet(film, video, pose, found.camera, reader.stage.keypoint_threshold, shown)
         plot.save_figure(figure, self.out / f"{film.path.stem}.png")
         verdicts = [verdict for verdict, _, _ in shown]
-        return film_row(film, camera, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
+        return film_row(film, found, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

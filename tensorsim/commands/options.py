@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -193,14 +194,21 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         return label
 
     def write_report(
-        self, folder: Path, run: "Run", summary: dict[str, Any], truth: "RadarMaps | None" = None
+        self,
+        folder: Path,
+        run: "Run",
+        summary: dict[str, Any],
+        truth: "RadarMaps | None" = None,
+        further: Sequence[dict[str, Any]] = (),
     ) -> None:
-        """Write ``report.html`` of a run with this summary."""
+        """Write ``report.html`` of a run with this summary, and further maps below the others."""
         from tensorsim import report, results
 
         axes = results.axes_of(run.stage, run.maps)
         pictures = self.pictures(run.stage, summary["label"], run.film, run.somebody)
-        report.write_report(folder, summary, run.pose, run.fps, run.maps, axes, run.strip, pictures, truth)
+        report.write_report(
+            folder, summary, run.pose, run.fps, run.maps, axes, run.strip, pictures, truth, further
+        )
 
     def configuration(self) -> "SimulationConfig":
         """The configuration of the run: that of ``--config``, with the other options in place of its fields.

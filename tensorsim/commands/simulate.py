@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
 from tensorsim.errors import TensorsimError, collected_warnings
@@ -56,8 +57,8 @@ class Simulate(NetworkOptions, RadarOptions):
     """
 
     source: tyro.conf.Positional[Path]
-    """A video that OpenCV decodes; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or COCO
-    keypoints of a video as .json, or a folder with one per frame."""
+    """A video that OpenCV decodes; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or
+    keypoints of a video, COCO or BlazePose, as .json, or a folder with one per frame."""
     out: Path
     """Folder for the results; its files appear together, when all are complete."""
     person_height: tuple[float, ...] | None = None
@@ -78,6 +79,9 @@ class Simulate(NetworkOptions, RadarOptions):
     Default: nearest."""
     library: Path | None = None
     """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
+    per_person: bool = False
+    """Where several people are in the scene, simulate and label each one alone as well: maps_person_N.npz and
+    doppler_time_person_N.png, N as in the overlay."""
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -120,7 +124,8 @@ class Simulate(NetworkOptions, RadarOptions):
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                pose, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
+                found, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
+                pose = found.pose
                 somebody = bool(pose.valid.any())
                 done = Run(
                     config,
@@ -135,9 +140,12 @@ class Simulate(NetworkOptions, RadarOptions):
                     film,
                 )
                 label = self.write_results(folder, done)
-                summary = label | results.summary_of(source, config, pose, maps)
+                summary = label | results.summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
-                self.write_report(folder, done, summary)
+                alone = write_each_person(folder, done, self) if self.per_person else []
+                for row, person in zip(summary["people"], alone, strict=len(alone) > 0):
+                    row |= person.label
+                self.write_report(folder, done, summary, further=[person.map for person in alone])
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)

@@ -1,5 +1,6 @@
 """Reading of films, keypoints and motion capture; writing of films and sound; rendered people; labelled data sets."""
 
+from tensorsim.data.blazepose import load_keypoints
 from tensorsim.data.clip import Clip, read_video
 from tensorsim.data.coco import Keypoints2D, load_coco_keypoints
 from tensorsim.data.motion_files import load_motion, place
@@ -44,6 +45,7 @@ __all__ = [
     "collate_maps",
     "doppler_sound",
     "load_coco_keypoints",
+    "load_keypoints",
     "load_motion",
     "place",
     "read_video",

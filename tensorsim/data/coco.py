@@ -41,15 +41,36 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
             ``track_id`` for some people only.
     """
     path = Path(path)
+    return coco_of(path, json_files(path))
+
+
+def json_files(path: Path) -> list[tuple[Path, Any]]:
+    """The JSON of a file, or of all files of a folder in the order of their names, each with its path.
+
+    Raises:
+        TensorsimError: no such file, or one that is no JSON.
+    """
     if not path.exists():
-        raise TensorsimError(f"{path}: no such file, expected COCO keypoints (.json)")
-    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+        raise TensorsimError(f"{path}: no such file, expected keypoints (.json)")
+    contents = []
+    for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
+        with reading(file, "JSON of keypoints"):
+            check_range(file.stat().st_size, "size of a file", str(file))
+            contents.append((file, json.loads(file.read_text(encoding="utf-8"))))
+    return contents
+
+
+def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
+    """:func:`load_coco_keypoints` of files that were read already.
+
+    Args:
+        path: of the file or folder.
+        contents: see :func:`json_files`.
+    """
     people: dict[Any, list[dict[str, Any]]] = {}
     size = None
-    for number, file in enumerate(files):
+    for number, (file, content) in enumerate(contents):
         with reading(file, "JSON of COCO keypoints"):
-            check_range(file.stat().st_size, "size of a file", str(file))
-            content = json.loads(file.read_text(encoding="utf-8"))
             whole = isinstance(content, dict)
             for image in content.get("images", []) if whole else []:
                 people.setdefault(number if path.is_dir() else image["id"], [])

@@ -7,6 +7,43 @@ from torch import Tensor
 _UNEVEN_S, _UNEVEN_FRAMES = 0.05, 1.5
 
 
+class FilmClock:
+    """Times of the frames of a film as they are read one after the other.
+
+    A frame is where the file has it, counted from the first one; at ``k / fps`` where that is within a quarter of a
+    frame (files round times), and in files whose times do not increase.
+
+    Args:
+        fps: frames per second that the file announces.
+        own_times: whether the file's times count; otherwise frames are evenly spaced.
+
+    Attributes:
+        last_s: time of the last frame that was asked for.
+
+    Example:
+        >>> clock = FilmClock(10.0)
+        >>> [clock.time_s(k, own_s) for k, own_s in enumerate((0.0, 0.11, 2.1))]
+        [0.0, 0.1, 2.1]
+    """
+
+    def __init__(self, fps: float, own_times: bool = True) -> None:
+        self.last_s = 0.0
+        self._fps, self._own_times = fps, own_times
+        self._first_own_s, self._last_own_s = 0.0, 0.0
+
+    def time_s(self, index: int, own_s: float) -> float:
+        """Seconds from the start of the film of frame ``index``, the next one, to which the file gives ``own_s``."""
+        if index == 0:
+            self._first_own_s = own_s
+        elif own_s <= self._last_own_s:
+            self._own_times = False
+        self._last_own_s = own_s
+        even_s, since_s = index / self._fps, own_s - self._first_own_s
+        far = abs(since_s - even_s) > 0.25 / self._fps
+        self.last_s = since_s if self._own_times and far else even_s
+        return self.last_s
+
+
 def unevenness_s(times_s: Tensor, fps: float) -> float:
     """How far the times (T,) of frames are from ``fps`` frames per second at most, in seconds; 0 where that is little.
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tensorsim.data.frame_times import nearest_frames, unevenness_s
+from tensorsim.data.frame_times import FilmClock, nearest_frames, unevenness_s
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.limits import RANGES, check_range
 
@@ -40,14 +40,15 @@ _CONTAINERS = (
 class VideoReader:
     """A film as chunks of frames; every pass over it starts anew, so it can be read several times.
 
-    Frames are counted as if frame k were at ``k / fps`` of the file; ``uneven_times_s`` says where they really are.
-    Frames are decoded one after the other from the first, also to reach ``start_s``: seeking is not exact in every
-    format. Frames are turned upright as the file says.
+    Frame k is at ``k / fps`` of the file unless the file gives it another time (see
+    :class:`~tensorsim.data.frame_times.FilmClock`); ``uneven_times_s`` says where frames really are. Frames are
+    decoded one after the other from the first, also to reach ``start_s``: seeking is not exact in every format. Frames
+    are turned upright as the file says.
 
     Args:
         path: a file that OpenCV decodes (mp4, avi, gif, ...).
         fps: frames per second of the film, instead of those that the file announces.
-        start_s, end_s: keep the frames at ``start_s <= k / fps < end_s``.
+        start_s, end_s: keep the frames from ``start_s`` on that are before ``end_s``, in seconds of the film.
         stride: keep every stride-th of them.
 
     Attributes:
@@ -93,19 +94,19 @@ class VideoReader:
                 )
             film_fps = float(file_fps if fps is None else fps)
             self._stride = stride
-            self._first = _frame_at(start_s, film_fps)
-            self._end = None if end_s is None or end_s > RANGES["time"].high else _frame_at(end_s, film_fps)
-            self._fps_of_file = None if fps is not None else film_fps
-            skipped = _skip(capture, self._first)
-            found, frame = capture.read() if skipped == self._first else (False, np.empty((0, 0)))
-        if not found and skipped:
+            self._film_fps, self._own_times = film_fps, fps is None
+            self._end_s = math.inf if end_s is None or end_s > RANGES["time"].high else end_s
+            clock = self._clock()
+            self._first, at_s = _first_from(capture, clock, start_s - 1e-6 / film_fps)
+            found, frame = (False, np.empty((0, 0))) if at_s is None else capture.retrieve()
+        if not found and self._first:
             raise TensorsimError(
                 f"{self.path}: got a start of {start_s} s, expected less than its length of "
-                f"{skipped / film_fps:.3f} s ({skipped} frames at {film_fps:g} fps)"
+                f"{clock.last_s + 1 / film_fps:.3f} s ({self._first} frames at {film_fps:g} fps)"
             )
-        if not found:
+        if not found or at_s is None:
             raise TensorsimError(f"{self.path}: got no frame that OpenCV can decode, expected a video")
-        if self._end is not None and self._end <= self._first:
+        if self._is_after(at_s):
             raise TensorsimError(
                 f"{self.path}: no frame lies between {start_s} and {end_s} s at {film_fps:g} fps"
             )
@@ -154,12 +155,16 @@ class VideoReader:
         import cv2
 
         with self._opened() as capture:
-            index = _skip(capture, self._first)
+            clock, index, ended = self._clock(), 0, False
             buffer = np.empty((size, self.height, self.width, 3), np.uint8)
             filled = 0
             times_s: list[float] = []
-            while (self._end is None or index < self._end) and capture.grab():
-                if (index - self._first) % self._stride == 0:
+            while capture.grab():
+                own_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                ended = self._is_after(clock.time_s(index, own_s)) and index >= self._first
+                if ended:
+                    break
+                if index >= self._first and (index - self._first) % self._stride == 0:
                     found, frame = capture.retrieve()
                     if not found:
                         break
@@ -168,7 +173,7 @@ class VideoReader:
                             f"{self.path}: frame {index} has shape {frame.shape}, "
                             f"expected {buffer.shape[1:]} as the first"
                         )
-                    times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+                    times_s.append(own_s)
                     cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled])
                     filled += 1
                 index += 1
@@ -178,7 +183,7 @@ class VideoReader:
             if filled:
                 yield _planes(buffer[:filled])
         self._keep_times(torch.tensor(times_s, dtype=torch.float64))
-        if self._announced is not None:
+        if self._announced is not None and not ended:
             expected = self._stop(self._announced)
             # Containers count by duration and are often a frame or two off.
             if expected - index > max(2, 0.02 * expected):
@@ -191,7 +196,7 @@ class VideoReader:
 
     def _keep_times(self, times_s: Tensor) -> None:
         """Keep the times of frames that are not evenly spaced, and warn."""
-        late_s = 0.0 if self._fps_of_file is None else unevenness_s(times_s, self.fps)
+        late_s = unevenness_s(times_s, self.fps) if self._own_times else 0.0
         self.uneven_times_s = times_s if late_s else None
         if late_s:
             steps_s = times_s.diff()
@@ -205,7 +210,17 @@ class VideoReader:
             )
 
     def _stop(self, announced: int) -> int:
-        return announced if self._end is None else min(announced, self._end)
+        """The frame after the last one of the cut, if frames are evenly spaced."""
+        if self._end_s == math.inf:
+            return announced
+        return min(announced, math.ceil(self._end_s * self._film_fps - 1e-6))
+
+    def _clock(self) -> FilmClock:
+        """A new clock; it counts frames where a frame rate was given in place of the file's."""
+        return FilmClock(self._film_fps, self._own_times)
+
+    def _is_after(self, time_s: float) -> bool:
+        return time_s >= self._end_s - 1e-6 / self._film_fps
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
@@ -266,17 +281,20 @@ def properties(capture: Any) -> tuple[float, int | None]:
     return capture.get(cv2.CAP_PROP_FPS), int(count) if 0 < count < 1e9 else None
 
 
-def _frame_at(seconds: float, fps: float) -> int:
-    """The first frame k with ``k / fps >= seconds``, up to rounding."""
-    return math.ceil(seconds * fps - 1e-6)
+def _first_from(capture: Any, clock: FilmClock, start_s: float) -> tuple[int, float | None]:
+    """Decode up to the first frame from ``start_s`` on: its number and time; the number of frames and None if none is.
 
+    The frame is grabbed, not retrieved.
+    """
+    import cv2
 
-def _skip(capture: Any, count: int) -> int:
-    """Decode and drop up to ``count`` frames; returns how many there were."""
-    for index in range(count):
-        if not capture.grab():
-            return index
-    return count
+    index = 0
+    while capture.grab():
+        at_s = clock.time_s(index, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+        if at_s >= start_s:
+            return index, at_s
+        index += 1
+    return index, None
 
 
 @contextmanager

@@ -90,7 +90,7 @@ def _pictures(
     )
     drawn = []
     index = 0
-    for frames in reader.chunks(16):
+    for frames in reader.even_chunks(16):
         for frame in frames:
             if index in chosen:
                 picture = _small(frame)

@@ -23,9 +23,11 @@ from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.results import label_of, people_of
-from tensorsim.streaming import calibrated, detections_of_film, keypoints_of_film, maps_of_pose
+from tensorsim.streaming import Found, calibrated, detections_of_film, keypoints_of_film, maps_of_pose
 from tensorsim.types import Detections, Pose, RadarMaps
-from tensorsim.vision.calibration.calibrator import CameraEstimate
+from tensorsim.vision.calibration.calibrator import camera_row
+from tensorsim.vision.calibration.camera_motion import BackgroundMotion
+from tensorsim.vision.smoothing.even_time import to_even_time
 
 
 @dataclass(frozen=True)
@@ -133,32 +135,49 @@ class FilmReader:
         return VideoReader(film.path, start_s=film.start_s, end_s=film.end_s, stride=self.stride)
 
     def people(
-        self, film: LabelledFilm, device: torch.device, quiet: bool = False
-    ) -> tuple[Pose, CameraEstimate | None]:
-        """The Pose of a film (B = 1) on the CPU, and its camera if that is estimated."""
-        stage, reader = self.stage, self.open(film)
-        cut = f"{film.start_s} {film.end_s} {self.stride} {stage.detection_interval}"
+        self, film: LabelledFilm, reader: VideoReader, device: torch.device, quiet: bool = False
+    ) -> Found:
+        """The people of a film and its camera, if that is estimated.
+
+        Args:
+            film: of which.
+            reader: of :meth:`open`; it knows the times of the frames afterwards.
+            device: to compute on.
+            quiet: no progress bars.
+        """
+        stage = self.stage
+        cut = f"{film.start_s} {film.end_s} {self.stride} {stage.detection_interval} with times"
         key = _digest(film.path.read_bytes(), cut.encode(), self.detector.encode())
 
         def detect() -> tuple[Tensor, ...]:
             found, looked = detections_of_film(stage, reader, device, quiet)
-            return *found, looked
+            times_s = torch.zeros(0) if reader.uneven_times_s is None else reader.uneven_times_s
+            return *found, looked, times_s
 
-        *detections, observed = self._kept(f"detections-{key}", detect)
+        *detections, observed, times_s = self._kept(f"detections-{key}", detect)
+        reader.uneven_times_s = times_s if times_s.numel() else None
         tracks = stage.follow(Detections(*(part.to(device) for part in detections)), observed.to(device))
-        flip = str(getattr(stage.pose, "flip_test", None))
         boxes = tracks.boxes.cpu().numpy().tobytes()
-        key = _digest(key.encode(), self.pose.encode(), flip.encode(), boxes)
-        keypoints, scores = self._kept(
-            f"keypoints-{key}", lambda: keypoints_of_film(stage, reader, tracks, device, quiet)
-        )
+        # The names of its parts say whether the pose network sees mirror images.
+        key = _digest(key.encode(), self.pose.encode(), repr(stage.pose).encode(), boxes)
+
+        def estimate() -> tuple[Tensor, ...]:
+            background = BackgroundMotion(reader.fps)
+            found = keypoints_of_film(stage, reader, tracks, device, quiet, background)
+            shift_px_s = math.nan if background.shift_px_s is None else background.shift_px_s
+            return *found, torch.tensor(shift_px_s)
+
+        keypoints, scores, shift_px_s = self._kept(f"keypoints-{key}", estimate)
         keypoints, scores, size = keypoints.to(device), scores.to(device), (reader.height, reader.width)
+        if reader.uneven_times_s is not None:
+            tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s[None], reader.fps)
         camera = None
         if self.calibrate:
             stage, camera = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
         pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
         warn_of_empty_clips(pose.valid)
-        return Pose(*(field.cpu() for field in pose)), camera
+        shift = None if bool(shift_px_s.isnan()) else float(shift_px_s)
+        return Found(Pose(*(field.cpu() for field in pose)), camera, shift)
 
     def _kept(self, name: str, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Tensors of a file of the cache, made and written first if it is not there."""
@@ -209,24 +228,9 @@ def followed(pose: Pose, fps: float) -> list[dict[str, Any]]:
     return rows
 
 
-def camera_row(camera: CameraEstimate | None) -> dict[str, Any] | None:
-    """What ``films.json`` says of a camera: degrees and metres, each with its standard deviation."""
-    if camera is None:
-        return None
-    row: dict[str, Any] = {"frames": int(camera.frames)}
-    for name, value, sd in (
-        ("pitch_deg", camera.pitch_rad, camera.pitch_sd_rad),
-        ("roll_deg", camera.roll_rad, camera.roll_sd_rad),
-        ("horizontal_fov_deg", camera.horizontal_fov_rad, camera.horizontal_fov_sd_rad),
-    ):
-        row[name] = [round(math.degrees(float(angle)), 1) for angle in (value, sd)]
-    row["height_m"] = [round(float(length), 2) for length in (camera.height_m, camera.height_sd_m)]
-    return row
-
-
 def film_row(
     film: LabelledFilm,
-    camera: CameraEstimate | None,
+    found: Found,
     people: list[dict[str, Any]],
     frames: int,
     fps: float,
@@ -237,7 +241,8 @@ def film_row(
         "file": film.path.name,
         "seconds": round(frames / fps, 2),
         "accept": list(film.accept),
-        "camera": camera_row(camera),
+        "camera": camera_row(found.camera),
+        "background_px_s": None if found.background_px_s is None else round(found.background_px_s, 1),
         "people": people,
         "scenes": {verdict.scene: asdict(verdict) for verdict in verdicts},
     }

@@ -74,3 +74,23 @@ def compare(guess: Maps, truth: Maps, speed_m_s: Tensor) -> dict[str, dict[str, 
     outlines = [metrics.percentile_envelope(m.doppler_time, speed_m_s) for m in (guess, truth)]
     rows["doppler_time"]["envelope_m_s"] = float(metrics.envelope_rmse(*outlines))
     return rows
+
+
+def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float | None]]:
+    """How like maps are to those of the true motion: PSNR of linear and dB maps, SSIM, each map over its peak.
+
+    None where a figure is not finite, as for two empty maps.
+    """
+    table = {}
+    for name in ("range_time", "range_time_mti", "doppler_time"):
+        pair = getattr(maps, name), getattr(truth, name)
+        figures = {
+            "psnr_linear_db": metrics.psnr(*pair, scale="linear"),
+            "psnr_of_db_map_db": metrics.psnr(*pair, scale="db"),
+            "ssim_linear": metrics.ssim(*pair, scale="linear"),
+            "ssim_of_db_map": metrics.ssim(*pair, scale="db"),
+        }
+        table[name] = {
+            key: round(float(value), 4) if bool(value.isfinite()) else None for key, value in figures.items()
+        }
+    return table

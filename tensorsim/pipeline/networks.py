@@ -15,6 +15,7 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.rtmpose import RtmPose, has_simcc
 from tensorsim.vision.pose2d.topdown import TopDownPose
 
 
@@ -44,7 +45,8 @@ def pretrained_detector(source: str | os.PathLike[str] | None = None) -> RTMDet 
 
 
 def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: bool = True) -> TopDownPose:
-    """Pose estimation with the network of a file or name: ``.onnx`` in ONNX Runtime; others are CPM or HRNet.
+    """Pose estimation with the network of a file or name: ``.onnx`` (heat maps, or RTMPose) in ONNX Runtime; others are
+    CPM or HRNet.
 
     Args:
         source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
@@ -54,6 +56,8 @@ def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: boo
         TensorsimError: no such file or name, or weights of another network.
     """
     if source is not None and Path(source).suffix == ".onnx":
+        if has_simcc(source):
+            return RtmPose(source, flip_test)
         network: nn.Module = OnnxHeatmaps(source)
     elif source is not None and "cpm" in Path(source).name:
         network = CPM.from_pretrained(source)

@@ -1,7 +1,7 @@
 """Pictures of maps, skeletons and people. Needs matplotlib and OpenCV, imported on use."""
 
 from tensorsim.plot.figure import FIGURE_FORMATS, save_figure
-from tensorsim.plot.floor import draw_floor
+from tensorsim.plot.floor import draw_floor, draw_lines, floor_lines
 from tensorsim.plot.maps import (
     DYNAMIC_RANGE_DB,
     RIDGE_COLOURS,
@@ -30,7 +30,9 @@ __all__ = [
     "confusion_figure",
     "decibels",
     "draw_floor",
+    "draw_lines",
     "draw_people",
+    "floor_lines",
     "map_figure",
     "person_peaks",
     "save_figure",

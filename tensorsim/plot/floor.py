@@ -10,10 +10,53 @@ if TYPE_CHECKING:
     from tensorsim.config import CameraConfig
 
 _COLOUR = (90, 200, 250)
+#: The grid reaches from the radar this far ahead, and half as far to both sides, in metres.
+FLOOR_M = 8
+
+
+def floor_lines(camera: CameraConfig, height: int, width: int) -> np.ndarray:
+    """Lines 1 m apart on the floor, y from 0 to 8 m and x from -4 to 4 m, in the picture of a camera.
+
+    Args:
+        camera: a focal length in pixels is one of this picture.
+        height, width: of the picture in pixels.
+
+    Returns:
+        (n, 2, 2) float64 ``uv`` pixels of both ends of the parts of lines that are before the camera; they may lie
+        outside the picture.
+    """
+    import torch
+
+    from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
+
+    half = FLOOR_M / 2
+    ahead = [((x, 0.0, 0.0), (x, FLOOR_M, 0.0)) for x in np.arange(-half, half + 1)]
+    across = [((-half, y, 0.0), (half, y, 0.0)) for y in range(FLOOR_M + 1)]
+    ends = torch.tensor(ahead + across, dtype=torch.float64)
+    focal, center, pose = (
+        focal_length(camera, width), principal_point(camera, height, width), camera_to_world(camera),
+    )  # fmt: skip
+    depth = project(ends, focal, center, pose)[1]
+    ends, depth = ends[(depth > NEAR_M).any(dim=1)], depth[(depth > NEAR_M).any(dim=1)]
+    # What is behind the camera is cut off where the line passes it.
+    hidden = depth < NEAR_M
+    share = ((NEAR_M - depth) / (depth.flip(1) - depth)).where(hidden, torch.zeros(()).double())
+    ends = ends + share[..., None] * (ends.flip(1) - ends)
+    return project(ends, focal, center, pose)[0].numpy()
+
+
+def draw_lines(image: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Draw lines of :func:`floor_lines` on a copy of an image (H, W, 3) uint8 RGB."""
+    import cv2
+
+    image = np.ascontiguousarray(image).copy()
+    for start, stop in lines.round().astype(int).tolist():
+        cv2.line(image, start, stop, _COLOUR, 1, cv2.LINE_AA)
+    return image
 
 
 def draw_floor(image: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """Draw a grid of 1 m on the floor, 5 m to both sides of the camera and from 0.5 to 10 m ahead of it in y.
+    """Draw the floor that a camera sees on an image, see :func:`floor_lines`.
 
     Args:
         image: (H, W, 3) uint8 RGB; not changed.
@@ -22,25 +65,4 @@ def draw_floor(image: np.ndarray, camera: CameraConfig) -> np.ndarray:
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    import cv2
-    import torch
-
-    from tensorsim.geometry.camera import camera_to_world, focal_length, principal_point, project
-
-    height, width = image.shape[:2]
-    focal, center, pose = (
-        focal_length(camera, width), principal_point(camera, height, width), camera_to_world(camera),
-    )  # fmt: skip
-    x, y = camera.position_m[:2]
-    ends = [((x + k, y + 0.5), (x + k, y + 10.0)) for k in range(-5, 6)]
-    ends += [((x - 5.0, y + k), (x + 5.0, y + k)) for k in range(1, 11)]
-    image = np.ascontiguousarray(image).copy()
-    for start, stop in ends:
-        line = np.zeros((40, 3))
-        line[:, :2] = np.linspace(start, stop, 40)
-        pixels, depth = project(torch.from_numpy(line), focal, center, pose)
-        drawable = ((pixels.abs() < 1e4).all(dim=-1) & (depth > 0.2)).numpy()
-        points = pixels.round().int().tolist()
-        for k in np.flatnonzero(drawable[1:] & drawable[:-1]):
-            cv2.line(image, points[k], points[k + 1], _COLOUR, 1, cv2.LINE_AA)
-    return image
+    return draw_lines(image, floor_lines(camera, *image.shape[:2]))

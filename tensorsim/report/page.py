@@ -2,6 +2,7 @@
 
 import base64
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import resources
 from itertools import pairwise
@@ -35,6 +36,7 @@ def write_report(
     film: FilmStrip,
     pictures: "Pictures",
     truth: RadarMaps | None = None,
+    further: Sequence[dict[str, Any]] = (),
 ) -> None:
     """Write ``report.html``, which needs no other file and no network (a long film is beside it).
 
@@ -48,6 +50,7 @@ def write_report(
         film: with all frames added.
         pictures: how the maps are drawn.
         truth: maps of the true motion, shown below those of the film.
+        further: maps as :func:`map_contents` gives them, shown below all others.
     """
     frames = pose.valid.shape[2]
     content = {
@@ -59,7 +62,8 @@ def write_report(
         "people": people_content(pose),
         "scene": scene_content(summary),
         "maps": map_contents(maps, axes, pictures)
-        + ([] if truth is None else map_contents(truth, axes, pictures, " of the true motion")),
+        + ([] if truth is None else map_contents(truth, axes, pictures, " of the true motion"))
+        + list(further),
         "style": asdict(pictures.style),
         "colourmaps": {name: colour_table(name) for name in _COLOURMAPS},
         "timeline": timeline_content(summary.get("timeline") or [], frames / fps),

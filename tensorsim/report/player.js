@@ -60,15 +60,17 @@ function describe(content) {
   for (const warning of summary.warnings || []) {
     element("warnings").appendChild(document.createElement("li")).textContent = warning;
   }
+  const labelled = summary.people.some((row) => row.label);
   tableOf(
     element("people"),
-    ["person", "from", "to", "mean range", "mean approach"],
+    ["person", "from", "to", "mean range", "mean approach", ...(labelled ? ["label alone"] : [])],
     summary.people.map((row) => [
       row.id,
       `${(row.first_frame / content.fps).toFixed(2)} s`,
       `${(row.last_frame / content.fps).toFixed(2)} s`,
       `${row.mean_range_m.toFixed(2)} m`,
       `${row.mean_approach_m_s.toFixed(2)} m/s`,
+      ...(labelled ? [row.label || ""] : []),
     ]),
   );
   const ranked = Object.entries(summary.probabilities || {}).sort((a, b) => b[1] - a[1]);

@@ -12,6 +12,7 @@ from tensorsim.vision.lifting.videopose3d import VideoPose3D
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.rtmpose import RtmPose
 from tensorsim.vision.pose2d.topdown import TopDownPose
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.tracking.mosse import MosseTracker
@@ -31,6 +32,7 @@ __all__ = [
     "NearestPoseLifter",
     "OnnxHeatmaps",
     "RTMDet",
+    "RtmPose",
     "TemporalLifter",
     "TopDownPose",
     "VideoPose3D",

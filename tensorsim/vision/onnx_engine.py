@@ -17,7 +17,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
-from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
+from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 
@@ -100,7 +100,7 @@ def in_onnxruntime(detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.
         detector = OnnxDetector(detector).eval()
     if isinstance(pose, TopDownPose):
         holder = pose.network if isinstance(pose.network, FlipTest) else pose
-        if not isinstance(holder.network, OnnxHeatmaps | OnnxPose):
+        if not isinstance(holder.network, OnnxFile | OnnxPose):
             holder.network = OnnxPose(holder.network).eval()
     return detector, pose
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import tensorsim as ts
-from tensorsim import results
 from tensorsim.commands import demo
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.scores import similarity
 from tensorsim.render.renderer import RenderedVideo
 from tensorsim.types import Pose, RadarMaps
 from tests.film import RectangleDetector, StandingPose
@@ -102,13 +102,13 @@ def maps_of(level: torch.Tensor) -> RadarMaps:
 def test_similarity_by_hand() -> None:
     truth = torch.zeros(20, 30)
     truth[5, :] = 2.0
-    table = results.similarity(maps_of(truth * 3), maps_of(truth))
+    table = similarity(maps_of(truth * 3), maps_of(truth))
     assert table["doppler_time"]["ssim_linear"] == pytest.approx(1)
     assert table["doppler_time"]["psnr_linear_db"] is None, "equal maps, whatever their gain"
     moved = torch.zeros(20, 30)
     moved[9, :] = 2.0
     # Two rows of 20 differ by the peak.
-    table = results.similarity(maps_of(moved), maps_of(truth))
+    table = similarity(maps_of(moved), maps_of(truth))
     assert table["doppler_time"]["psnr_linear_db"] == pytest.approx(10.0, abs=1e-3)
 
 

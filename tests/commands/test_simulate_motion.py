@@ -122,9 +122,13 @@ def test_keypoints_give_what_a_video_gives(
     ("name", "options", "message"),
     [
         ("walk.npz", ["--detector", "x.onnx"], r"--detector: got it for motion capture .* for a video only"),
-        ("walk.npz", ["--camera-fov", "50"], r"--camera-fov: got it for motion capture .* a video or COCO"),
+        (
+            "walk.npz",
+            ["--camera-fov", "50"],
+            r"--camera-fov: got it for motion capture .* a video or keypoints",
+        ),
         ("walk.npz", ["--image-size", "9", "9"], "--image-size: got it for motion capture"),
-        ("walk.json", ["--heading", "9"], "--heading: got it for COCO keypoints"),
+        ("walk.json", ["--heading", "9"], "--heading: got it for keypoints"),
         ("walk.mp4", ["--clip", "a"], "--clip: got it for a video"),
         ("walk.json", ["--image-size", "0", "9"], "--image-size: got 0, expected image side"),
         ("walk.npz", ["--heading", "nan"], "--heading: got nan"),

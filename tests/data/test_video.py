@@ -326,6 +326,37 @@ def test_frames_at_even_times(tmp_path: Path) -> None:
     assert given.uneven_times_s is None
 
 
+@pytest.mark.filterwarnings("ignore:.* its frames are up to")
+@pytest.mark.parametrize(
+    ("cut", "kept"),
+    [
+        ({"start_s": 0.3}, range(3, 10)),
+        ({"start_s": 1.0}, range(6, 10)),  # in the pause: the next frame is after it
+        ({"start_s": 2.55}, range(7, 10)),
+        ({"end_s": 2.4}, range(6)),
+        ({"start_s": 0.2, "end_s": 2.65, "stride": 2}, (2, 4, 6)),
+        ({"fps": 10.0, "start_s": 0.6}, range(6, 10)),  # evenly spaced, as was said
+    ],
+)
+def test_cuts_of_uneven_films_are_in_seconds_of_the_film(
+    tmp_path: Path, cut: dict[str, float], kept: range | tuple[int, ...]
+) -> None:
+    """Frames at 0, 0.1, ... 0.5, and after a pause at 2.5, 2.6, 2.7 and 2.8 s."""
+    image = pytest.importorskip("PIL.Image")
+    path = tmp_path / "pause.gif"
+    pictures = [image.fromarray(picture(i)) for i in range(10)]
+    durations = [100] * 5 + [2000] + [100] * 4
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations)
+    whole = read(path, fps=10.0)
+    assert torch.equal(read(path, **cut), whole[list(kept)])
+    with pytest.raises(
+        TensorsimError, match=r"a start of 9\.0 s, expected less than its length of [23]\.\d+ s"
+    ):
+        VideoReader(path, start_s=9.0)
+    with pytest.raises(TensorsimError, match=r"no frame lies between 1\.0 and 2\.0 s"):
+        VideoReader(path, start_s=1.0, end_s=2.0)
+
+
 def test_playlists_are_not_opened(clip: Path) -> None:
     for name, text in (
         ("list.m3u8", f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{clip}\n#EXT-X-ENDLIST\n"),

@@ -15,8 +15,16 @@ from tensorsim import cli
 from tensorsim.commands import evaluate_films
 from tensorsim.config import ACTIVITIES, RadarConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.evaluation.labelled_films import LabelledFilm, Scene, followed, judged, markdown, read_labels
-from tensorsim.pipeline import PoseToDoppler
+from tensorsim.evaluation.labelled_films import (
+    FilmReader,
+    LabelledFilm,
+    Scene,
+    followed,
+    judged,
+    markdown,
+    read_labels,
+)
+from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import Detections, Pose, RadarMaps
 from tests.film import RectangleDetector, StandingPose, film, walker
@@ -90,6 +98,40 @@ def test_the_command_labels_films_and_runs_the_networks_once(
     cli.main([*arguments, "--only", "walk"])
     assert CountingDetector.frames == seen, "kept in cache/"
     assert json.loads((out / "films.json").read_text()) == [walk]
+
+
+@pytest.mark.filterwarnings("ignore:.* its frames are up to")
+def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -> None:
+    """Somebody walks away for 2 s; the film pauses 1 s after 1 s, and its last frames come late."""
+    image = pytest.importorskip("PIL.Image")
+    pictures = [
+        image.fromarray(frame) for frame in film(*walker(20, FPS, 4.0, 1.2, 0.3)).permute(0, 2, 3, 1).numpy()
+    ]
+    path = tmp_path / "walk.gif"
+    durations = [100] * 9 + [1100] + [100] * 10
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations)
+    known = LabelledFilm(path, 0.25, 2.65, (ACTIVITIES[7],))
+    (tmp_path / "w.onnx").write_text("")
+    stage = VideoToPose(CountingDetector(), StandingPose()).eval()
+    reader = FilmReader(
+        stage, (tmp_path / "w.onnx", tmp_path / "w.onnx"), tmp_path / "cache", calibrate=False
+    )
+    found = []
+    with torch.inference_mode():
+        for _ in range(2):
+            video = reader.open(known)
+            CountingDetector.frames = 0
+            found.append(reader.people(known, video, torch.device("cpu"), quiet=True))
+            # Frames from 0.3 to 0.9 s and from 2.0 to 2.6 s, shown at even times from the first one on.
+            assert video.uneven_times_s is not None
+            np.testing.assert_allclose(
+                video.uneven_times_s, np.r_[np.arange(3, 10), np.arange(20, 27)] / 10, atol=1e-6
+            )
+            assert found[-1].pose.valid.shape[2] == int(2.3 * video.fps + 1e-3) + 1
+            assert sum(len(chunk) for chunk in video.even_chunks(4)) == found[-1].pose.valid.shape[2]
+    assert CountingDetector.frames == 0, "kept in the cache"
+    for first, second in zip(found[0].pose, found[1].pose, strict=True):
+        assert torch.equal(first, second)
 
 
 @pytest.mark.parametrize(

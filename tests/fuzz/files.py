@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tensorsim.data import VideoReader, load_coco_keypoints, load_motion, write_video
+from tensorsim.data import VideoReader, load_keypoints, load_motion, write_video
 from tensorsim.weights import load_state_dict
 from tests.bvh import write_bvh
 
@@ -27,7 +27,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "own.npz": load_motion,
     "data_3d_h36m.npz": load_motion,
     "walk.bvh": load_motion,
-    "coco.json": load_coco_keypoints,
+    "coco.json": load_keypoints,
     "weights.pth": load_state_dict,
     "legacy.pth": load_state_dict,
     "weights.safetensors": load_state_dict,

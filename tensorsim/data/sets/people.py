@@ -76,7 +76,7 @@ class PeopleFinder:
 
         stage = VideoToPose.from_config(SimulationConfig(), nn.Identity(), nn.Identity())
         found = keypoint_source(file, stage, self.source.fps, self.source.image_size)
-        pose = found.pose(True)
+        pose = found.find(True).pose
         return Motion(pose.joints[0], pose.valid[0], found.fps)
 
     def _of_film(self, file: Path) -> Motion:

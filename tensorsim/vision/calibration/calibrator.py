@@ -1,7 +1,7 @@
 """The camera of a film, from the people who stand and walk in it."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -74,6 +74,21 @@ def camera_config(found: CameraEstimate) -> CameraConfig:
         pitch_rad=float(found.pitch_rad),
         roll_rad=float(found.roll_rad),
     )
+
+
+def camera_row(found: CameraEstimate | None) -> dict[str, Any] | None:
+    """What files of results say of the camera of one clip: degrees and metres, each with its standard deviation."""
+    if found is None:
+        return None
+    row: dict[str, Any] = {"frames": int(found.frames)}
+    for name, value, sd in (
+        ("pitch_deg", found.pitch_rad, found.pitch_sd_rad),
+        ("roll_deg", found.roll_rad, found.roll_sd_rad),
+        ("horizontal_fov_deg", found.horizontal_fov_rad, found.horizontal_fov_sd_rad),
+    ):
+        row[name] = [round(math.degrees(float(angle)), 1) for angle in (value, sd)]
+    row["height_m"] = [round(float(length), 2) for length in (found.height_m, found.height_sd_m)]
+    return row
 
 
 class CameraCalibrator(nn.Module):

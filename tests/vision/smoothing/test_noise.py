@@ -69,7 +69,7 @@ def test_keypoint_noise_by_hand() -> None:
 def test_noise_of_depth_by_hand() -> None:
     noise = torch.full((1, 2, 1), 0.03)
     joints = torch.tensor([[[1.0, 4.0, 1.0], [4.0, 5.0, 1.0]]])  # straight ahead, and to the side by 3 and 4
-    found = noise_with_depth(noise, torch.tensor([[0.04, 0.1]]), joints, torch.tensor([1.0, 1.0, 1.0]), 1.0)
+    found = noise_with_depth(noise, torch.tensor([[0.16, 0.4]]), joints, torch.tensor([1.0, 1.0, 1.0]), 1.0)
     aside, ahead = math.hypot(0.03, 0.06), math.hypot(0.03, 0.08)
     torch.testing.assert_close(found, torch.tensor([[[0.03, 0.05, 0.03], [aside, ahead, 0.03]]]))
 
@@ -92,6 +92,6 @@ def test_uncertain_depths_are_smoothed_and_what_the_picture_shows_is_not() -> No
         speed = found[:, 1].diff().abs().max() * FPS
         return float(found[:, 0].square().mean() / swing[inside].square().mean()) ** 0.5, float(speed)
 
-    (gain, speed), (_, before) = smooth(0.05), smooth(0.0)
+    (gain, speed), (_, before) = smooth(0.2), smooth(0.0)
     assert gain > 0.9
     assert speed < 0.5 * before

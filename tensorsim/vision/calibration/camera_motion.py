@@ -1,0 +1,141 @@
+"""Whether the camera of a film moves: how the background shifts from picture to picture."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from tensorsim.errors import TensorsimWarning, check_positive
+
+#: Pictures are compared at this width at most, in pixels, and this many seconds apart.
+_WIDTH, _STEP_S = 320, 0.1
+#: Fewer corners than this, or fewer than half of them in one motion, tell nothing.
+_LEAST_POINTS, _LEAST_SHARE = 12, 0.5
+#: A camera moves if the background shifts by more than this share of the picture's width within a second.
+MOVING_SHARE = 0.02
+
+
+class BackgroundMotion:
+    """How far the background of a film shifts within a second, from pictures that are given one after the other.
+
+    Corners outside people's boxes are followed from picture to picture (pyramidal Lucas-Kanade, forth and back), and
+    one similarity (shift, turn, zoom) is fitted to them by RANSAC: things that move on their own are outliers. The
+    similarities of a second make one; its shift is the root mean square over the picture, so that turns and zooms
+    count as well. Pictures in which too few corners agree (a cut, a bare wall) are passed over.
+
+    Args:
+        fps: frames per second of the film.
+
+    Attributes:
+        width: of the pictures, in pixels.
+        shift_px_s: the largest shift within a second, in pixels of the film; None while no second is known.
+
+    Raises:
+        TensorsimError: a rate that is not positive.
+    """
+
+    def __init__(self, fps: float) -> None:
+        check_positive(fps, "fps")
+        self._every = max(1, round(_STEP_S * fps))
+        self._second = max(1, round(fps / self._every))  # steps
+        self._per_s = fps / (self._every * self._second)
+        self._index = 0
+        self._last: tuple[np.ndarray, np.ndarray] | None = None  # picture and where background is
+        self._steps: list[np.ndarray] = []  # (3, 3) of the steps of the last second, without gaps
+        self._scale = 1.0
+        self.width = 0
+        self.shift_px_s: float | None = None
+
+    def add(self, frames: Tensor, boxes: Tensor, valid: Tensor) -> None:
+        """Look at further frames.
+
+        Args:
+            frames: (n, 3, H, W) uint8 RGB on the CPU.
+            boxes: (n, P, 4) ``xyxy`` pixels of the people in them.
+            valid: (n, P) bool.
+        """
+        for frame, people, there in zip(frames, boxes.cpu(), valid.cpu(), strict=True):
+            if self._index % self._every == 0:
+                self._look(frame, people[there].double().numpy())
+            self._index += 1
+
+    def _look(self, frame: Tensor, boxes: np.ndarray) -> None:
+        """Follow the background from the last picture to this one."""
+        import cv2
+
+        self.width = frame.shape[2]
+        self._scale = min(1.0, _WIDTH / self.width)
+        size = (round(frame.shape[2] * self._scale), round(frame.shape[1] * self._scale))
+        # The green channel is most of the brightness.
+        picture = cv2.resize(np.ascontiguousarray(frame[1].numpy()), size, interpolation=cv2.INTER_AREA)
+        background = np.full(picture.shape, 255, np.uint8)
+        for x1, y1, x2, y2 in boxes * self._scale:
+            margin = 0.1 * max(x2 - x1, y2 - y1)
+            left, top, right, bottom = (
+                max(0, int(v)) for v in (x1 - margin, y1 - margin, x2 + margin + 1, y2 + margin + 1)
+            )
+            background[top:bottom, left:right] = 0
+        last, self._last = self._last, (picture, background)
+        if last is None:
+            return
+        step = similarity_of(*last, picture, background)
+        self._steps = [] if step is None else [*self._steps, step][-self._second :]
+        if len(self._steps) == self._second:
+            shift = _mean_shift(self._steps, picture.shape) / self._scale * self._per_s
+            self.shift_px_s = max(shift, self.shift_px_s or 0.0)
+
+    def moves(self) -> bool:
+        """Whether the camera moves: the background shifts by more than :data:`MOVING_SHARE` in a second."""
+        return self.shift_px_s is not None and self.shift_px_s > MOVING_SHARE * self.width
+
+    def warn(self) -> None:
+        """Say it in a TensorsimWarning if the camera moves."""
+        if self.moves():
+            warnings.warn(
+                f"the camera moves: the background shifts by up to {self.shift_px_s:.0f} pixels per second, in "
+                f"pictures {self.width} pixels wide; the motion of people and the estimated camera contain that",
+                TensorsimWarning,
+                stacklevel=2,
+            )
+
+
+def similarity_of(
+    before: np.ndarray, background_before: np.ndarray, after: np.ndarray, background_after: np.ndarray
+) -> np.ndarray | None:
+    """The similarity (3, 3) that takes the background of one picture to that of the next; None if it is not clear.
+
+    Args:
+        before, after: (h, w) uint8 brightness.
+        background_before, background_after: (h, w) uint8, 255 where no person is.
+    """
+    import cv2
+
+    corners: Any = cv2.goodFeaturesToTrack(before, 200, 0.01, 7, mask=background_before)
+    if corners is None or len(corners) < _LEAST_POINTS:
+        return None
+    how: Any = {"winSize": (15, 15), "maxLevel": 4}
+    no_guess: Any = None  # OpenCV's types know no flow without one
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, no_guess, **how)
+    returned, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, no_guess, **how)
+    good = (found[:, 0] == 1) & (found_back[:, 0] == 1)
+    good &= np.linalg.norm(returned - corners, axis=-1)[:, 0] < 0.5
+    column, row = (moved[:, 0, k].round().astype(int).clip(0, after.shape[1 - k] - 1) for k in range(2))
+    good &= background_after[row, column] > 0
+    if good.sum() < _LEAST_POINTS:
+        return None
+    affine, agree = cv2.estimateAffinePartial2D(
+        corners[good], moved[good], method=cv2.RANSAC, ransacReprojThreshold=1.0
+    )
+    if affine is None or agree.mean() < _LEAST_SHARE:
+        return None
+    return np.vstack([affine, [0.0, 0.0, 1.0]])
+
+
+def _mean_shift(steps: list[np.ndarray], shape: tuple[int, ...]) -> float:
+    """Root mean square of how far four points inside a picture (h, w) are taken, in its pixels."""
+    points = np.array([(x * shape[1], y * shape[0], 1.0) for x in (0.2, 0.8) for y in (0.2, 0.8)]).T
+    moved = points
+    for step in steps:
+        moved = step @ moved
+    return float(np.sqrt(np.square(moved - points).sum(axis=0).mean()))
