@@ -91,7 +91,8 @@ def main() -> None:
     together = rate(Plan(recipe(*VIEWS)), arguments.samples, clock)
     runs = sum(1 / one for one in single)
     print(
-        f"3 radars: {1 / together:.3f} s for a sample with all, {runs:.3f} s for three with one: {runs * together:.2f} times as fast"
+        f"3 radars: {1 / together:.3f} s for a sample with all, {runs:.3f} s for three with one: "
+        f"{runs * together:.2f} times as fast"
     )
     with tempfile.TemporaryDirectory() as folder:
         memory = []
