@@ -1,4 +1,7 @@
-"""Which device to run on."""
+"""Which device to run on, and how many threads."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -23,3 +26,17 @@ def usable_device(name: str) -> torch.device:
     if not usable:
         raise TensorsimError(f"--device: {name!r} is not usable here: it computes a wrong sum")
     return device
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """In the block torch computes on one thread.
+
+    Sums over several threads are not the same to the last bit, and many small operations are slower on them.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

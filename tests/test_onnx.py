@@ -1,5 +1,6 @@
 """What is exported to ONNX gives the same in ONNX Runtime, also for other batch sizes."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 import tensorsim as ts
 from tensorsim.recognition import SPGNet, SPNet
 from tensorsim.recognition.map_image import MapToImage
+from tensorsim.vision.lifting.temporal_lifter import TemporalPose
 
 #: Stages and inputs; the first dimension of the first input may have another size.
 STAGES: dict[str, tuple[nn.Module, Tensor, Tensor]] = {
@@ -31,9 +33,67 @@ STAGES: dict[str, tuple[nn.Module, Tensor, Tensor]] = {
 }
 
 
-def run(path: Path, x: Tensor) -> list[np.ndarray]:
+class Dense(nn.Module):
+    """The network of a detector, whose boxes are selected outside of it."""
+
+    def __init__(self, detector: ts.vision.RTMDet) -> None:
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        logits, distances = self.detector.dense(x)
+        return (*logits, *distances)
+
+
+class Lifting(nn.Module):
+    """A lifter for pictures of 360x640 at 30 frames per second."""
+
+    def __init__(self, lifter: ts.vision.TemporalLifter) -> None:
+        super().__init__()
+        self.lifter = lifter
+
+    def forward(self, keypoints: Tensor, scores: Tensor, boxes: Tensor, valid: Tensor) -> TemporalPose:
+        return self.lifter(keypoints, scores, boxes, valid, 360, 640, 30.0)  # type: ignore[no-any-return]
+
+
+def tracks(clips: int) -> tuple[Tensor, ...]:
+    """Key points, scores, boxes and validity of a person in 20 frames of each clip."""
+    generator = torch.Generator().manual_seed(clips)
+    keypoints = 100 + 100 * torch.rand(clips, 1, 20, 17, 2, generator=generator)
+    boxes = torch.cat([keypoints.amin(-2), keypoints.amax(-2)], -1)
+    valid = torch.rand(clips, 1, 20, generator=generator) > 0.2
+    return keypoints, torch.rand(clips, 1, 20, 17, generator=generator), boxes, valid
+
+
+#: Shipped networks of the vision part: what makes them, inputs for any number of pictures or clips.
+VISION: dict[str, tuple[Callable[[], nn.Module], Callable[[int], tuple[Tensor, ...]]]] = {
+    "detector": (lambda: Dense(ts.vision.RTMDet.from_pretrained()), lambda n: (torch.rand(n, 3, 320, 320),)),
+    "pose": (ts.vision.HRNet.from_pretrained, lambda n: (torch.rand(n, 3, 256, 192),)),
+    "lifter": (lambda: Lifting(ts.vision.TemporalLifter.from_pretrained()), tracks),
+    "VideoPose3D": (ts.vision.VideoPose3D, lambda n: (torch.rand(n, 50, 17, 2),)),
+}
+
+
+def run(path: Path, *inputs: Tensor) -> list[np.ndarray]:
     session = onnxruntime.InferenceSession(path)
-    return session.run(None, {session.get_inputs()[0].name: x.numpy()})  # type: ignore[no-any-return]
+    names = [there.name for there in session.get_inputs()]
+    fed = {name: x.numpy() for name, x in zip(names, inputs, strict=True)}
+    return session.run(None, fed)  # type: ignore[no-any-return]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VISION)
+def test_networks_of_the_vision_part(name: str, tmp_path: Path) -> None:
+    make, inputs_for = VISION[name]
+    torch.manual_seed(0)
+    stage, example = make().eval(), inputs_for(2)
+    ts.export.to_onnx(stage, tmp_path / "m.onnx", example, {k: {0: "batch"} for k in range(len(example))})
+    for inputs in (example, inputs_for(3)):
+        with torch.no_grad():
+            expected = stage(*inputs)
+        expected = (expected,) if isinstance(expected, Tensor) else expected
+        for one, truth in zip(run(tmp_path / "m.onnx", *inputs), expected, strict=True):
+            assert np.abs(one - truth.numpy()).max() < 1e-5 * max(1.0, float(truth.abs().max()))
 
 
 @pytest.mark.slow

@@ -108,6 +108,10 @@ def test_python_runs_as_one_session(tmp_path: Path, shared_data: Path) -> None:
     film = ts.data.read_video(shared_data / "video" / "juggle_kick_1person_24fps.mp4", end_s=0.5)
     small = torch.nn.functional.interpolate(film.video[0], (180, 320)).permute(0, 2, 3, 1)
     ts.data.write_video(tmp_path / "clip.mp4", small.numpy(), film.fps)
+    for label in ("juggling", "kicking"):
+        (tmp_path / "films" / label).mkdir(parents=True)
+        for name in ("a", "b", "c"):
+            shutil.copy(tmp_path / "clip.mp4", tmp_path / "films" / label / f"{name}.mp4")
     session = "\n".join(blocks("python"))
     session += "\nassert out.doppler_time.shape[0] == 1\nassert label(video, fps).logits.shape == (1, 12)\n"
     done = subprocess.run([sys.executable, "-c", session], stdout=subprocess.PIPE, text=True, cwd=tmp_path)

@@ -52,10 +52,10 @@ def rotation(axis: int, angle: Tensor) -> Tensor:
     c, s = torch.cos(angle), torch.sin(angle)
     one, zero = torch.ones_like(c), torch.zeros_like(c)
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    rows = [[zero] * 3 for _ in range(3)]
-    rows[axis][axis] = one
-    rows[i][i], rows[i][j], rows[j][i], rows[j][j] = c, -s, s, c
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    entries = [zero] * 9
+    entries[4 * axis] = one
+    entries[4 * i], entries[3 * i + j], entries[3 * j + i], entries[4 * j] = c, -s, s, c
+    return torch.stack(entries, dim=-1).unflatten(-1, [3, 3])
 
 
 def forward_kinematics(

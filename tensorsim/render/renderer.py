@@ -4,8 +4,6 @@ Ray-cast bodies of round volumes stand in a lit room and cast shadows; lens blur
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -13,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tensorsim.config import CameraConfig
+from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_not_empty
 from tensorsim.render.body import REFERENCE_HEIGHT_M, Body, build_body
 from tensorsim.render.cast import View, Volumes, cast
@@ -128,7 +127,7 @@ class PersonRenderer:
         keypoints, depth = view.project(keypoints_m)
 
         frames, masks, visible = [], [], []
-        with _one_thread():
+        with one_thread():  # the many small operations of a frame are slower on several
             for t in range(times):
                 who = present[:, t].nonzero()[:, 0].tolist()
                 linear, owner, front = self._frame(t, who, bodies, looks, view, light, scene)
@@ -313,17 +312,6 @@ def _boxes(masks: Tensor) -> Tensor:
     top, bottom = extent(masks.any(dim=-1))
     boxes = torch.stack([left, top, right, bottom], dim=-1).float()
     return boxes * masks.flatten(-2).any(dim=-1)[..., None]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread: the many small operations of a frame are slower on several."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _checked(joints: Tensor) -> Tensor:

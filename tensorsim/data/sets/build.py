@@ -159,7 +159,8 @@ def _films(plan: Plan) -> list[int]:
     first: dict[str, int] = {}
     for number, source in enumerate(plan.sources):
         for index in range(len(source) if source.finds_people else 0):
-            first.setdefault(source.clip(index).path, int(plan.starts[number]) + index)
+            clip = source.clip(index)
+            first.setdefault(clip.path or clip.name, int(plan.starts[number]) + index)
     return list(first.values())
 
 

@@ -73,8 +73,8 @@ def _scale(recipe: DatasetRecipe) -> str:
 
 def _source(recipe: DatasetRecipe, number: int) -> str:
     source = recipe.sources[number]
-    if source.kind == "generated":
-        return f"- {source.people} generated people, each in {len(source.classes)} activities"
+    if source.people is not None:
+        return f"- {source.people} {source.kind} people, each in {len(source.classes)} activities"
     return f"- {source.kind}: `{source.path}`"
 
 

@@ -129,6 +129,7 @@ class RayCluster:
                 logging_level=logging.ERROR,
             )
         try:
+            logging.getLogger("ray.data").setLevel(logging.ERROR)
             ray.data.DataContext.get_current().enable_progress_bars = False
             rows = ray.data.from_items(
                 [{"job": json.dumps(job)} for job in waiting], override_num_blocks=len(waiting)

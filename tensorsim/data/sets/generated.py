@@ -29,7 +29,7 @@ class GeneratedPeople:
     def __init__(self, recipe: DatasetRecipe, source: SourceConfig, number: int) -> None:
         self.recipe, self.labels = recipe, source.classes
         self.people = source.people or 0
-        self.prefix = f"generated{number}"
+        self.prefix = f"{source.kind}{number}"
 
     def __len__(self) -> int:
         return self.people * len(self.labels)

@@ -4,6 +4,7 @@ from tensorsim.data.sets.clips import ClipSource
 from tensorsim.data.sets.files import FileClips
 from tensorsim.data.sets.generated import GeneratedPeople
 from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig
+from tensorsim.data.sets.rendered import RenderedPeople
 
 
 def open_source(recipe: DatasetRecipe, source: SourceConfig, number: int, cache: str | None) -> ClipSource:
@@ -20,4 +21,6 @@ def open_source(recipe: DatasetRecipe, source: SourceConfig, number: int, cache:
     """
     if source.kind == "generated":
         return GeneratedPeople(recipe, source, number)
+    if source.kind == "rendered":
+        return RenderedPeople(recipe, source, number, cache)
     return FileClips(recipe, source, number, cache)

@@ -1,6 +1,7 @@
 """The people of a file: read from motion and key points, found by networks in films, and kept."""
 
 import hashlib
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from tensorsim.data.layouts.ntu import read_ntu
 from tensorsim.data.motion_files import load_motion
 from tensorsim.data.sets.recipe import SourceConfig
 from tensorsim.data.skeletons import Motion
+from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.pipeline import VideoToPose
@@ -26,6 +28,22 @@ _MOTION = (".bvh", ".npz", ".skeleton", ".mat")
 def is_film(file: Path) -> bool:
     """Whether networks have to find the people of a file."""
     return file.suffix.lower() not in (*_MOTION, ".json") and not file.is_dir()
+
+
+def finite_everywhere(motion: Motion, name: str) -> Motion:
+    """Those people of a motion who are in it, with joints in every frame: where they are not seen, as nearest to it.
+
+    Splines run through these places.
+
+    Raises:
+        TensorsimError: nobody in it.
+    """
+    if not bool(motion.valid.any()):
+        raise TensorsimError(f"{name}: got nobody in it, expected at least one person")
+    somebody = motion.valid.any(dim=1)
+    joints, valid = motion.joints[somebody], motion.valid[somebody]
+    nearest = nearest_valid(valid)[..., None, None].expand(-1, -1, 14, 3)
+    return Motion(joints.gather(1, nearest), valid, motion.fps)
 
 
 class PeopleFinder:
@@ -55,13 +73,7 @@ class PeopleFinder:
             motion = self._captured(file, key)
         else:
             motion = self._of_keypoints(file)
-        if not bool(motion.valid.any()):
-            raise TensorsimError(f"{path}: got nobody in it, expected at least one person")
-        somebody = motion.valid.any(dim=1)
-        motion = Motion(motion.joints[somebody], motion.valid[somebody], motion.fps)
-        # A person who is not there stays where they were seen last: splines run through these places.
-        nearest = nearest_valid(motion.valid)[..., None, None].expand(-1, -1, 14, 3)
-        return motion._replace(joints=motion.joints.gather(1, nearest))
+        return finite_everywhere(motion, path)
 
     def _captured(self, file: Path, key: str) -> Motion:
         suffix = file.suffix.lower()
@@ -80,16 +92,28 @@ class PeopleFinder:
         return Motion(pose.joints[0], pose.valid[0], found.fps)
 
     def _of_film(self, file: Path) -> Motion:
-        """The people of a film, kept for the next time; so is the reason if there are none."""
+        return self.kept(file, "" if self.cache is None else self._digest(file), self._found)
+
+    def kept(self, file: Path, digest: str, find: Callable[[Path], Motion]) -> Motion:
+        """What ``find`` finds in a film, kept in ``cache`` for the next time; so is the reason if there is nobody.
+
+        Args:
+            file: the film, or the name of one.
+            digest: of all that the people depend on.
+            find: takes ``file``.
+
+        Raises:
+            TensorsimError: what ``find`` raises, or raised before.
+        """
         if self.cache is None:
-            return self._found(file)
-        kept = self.cache / f"{self._digest(file)}.npz"
+            return find(file)
+        kept = self.cache / f"{digest}.npz"
         failed = kept.with_suffix(".txt")
         if failed.is_file():
             raise TensorsimError(f"{file}: {failed.read_text(encoding='utf-8')}")
         if not kept.is_file():
             try:
-                motion = self._found(file)
+                motion = find(file)
             except TensorsimError as error:
                 with complete_file(failed) as scratch:
                     scratch.write_text(str(error).removeprefix(f"{file}: "), encoding="utf-8")
@@ -104,7 +128,8 @@ class PeopleFinder:
         from tensorsim.data.video import VideoReader
         from tensorsim.streaming import pose_of_film
 
-        pose = pose_of_film(self.networks, VideoReader(file), torch.device("cpu"), quiet=True)
+        with one_thread():  # for the same bits everywhere
+            pose = pose_of_film(self.networks, VideoReader(file), torch.device("cpu"), quiet=True)
         return Motion(pose.joints[0], pose.valid[0], VideoReader(file).fps)
 
     @cached_property
@@ -113,14 +138,15 @@ class PeopleFinder:
         return VideoToPose.from_config(SimulationConfig())
 
     @cached_property
-    def _of_networks(self) -> bytes:
+    def of_networks(self) -> bytes:
+        """Hash of the networks."""
         from tensorsim.registry import locate
 
         files = [locate(None, "RTMDet"), locate(None, "HRNet", "CPM")]
         return b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
 
     def _digest(self, file: Path) -> str:
-        content = hashlib.sha256(self._of_networks)
+        content = hashlib.sha256(self.of_networks)
         with file.open("rb") as source:
             for block in iter(lambda: source.read(1 << 20), b""):
                 content.update(block)

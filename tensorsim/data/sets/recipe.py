@@ -19,7 +19,17 @@ from tensorsim.motion.activities import activity_index
 from tensorsim.radar.presets import radar_scene
 
 SourceKind = Literal[
-    "generated", "films", "table", "keypoints", "motion", "ntu", "kinetics", "charades", "movi", "h36m"
+    "generated",
+    "rendered",
+    "films",
+    "table",
+    "keypoints",
+    "motion",
+    "ntu",
+    "kinetics",
+    "charades",
+    "movi",
+    "h36m",
 ]
 SplitBy = Literal["person", "source", "table"]
 Format = Literal["webdataset", "hdf5", "mat", "png"]
@@ -33,15 +43,18 @@ class SourceConfig:
     """Where people and their labels come from.
 
     Attributes:
-        kind: ``"generated"``: tensorsim's own generator; ``"films"``, ``"keypoints"`` and ``"motion"``: a folder with a
-            folder per class, of films, COCO key points (.json) or captured motion (.bvh, .npz); ``"table"``: a CSV or
-            Parquet table of such files; the others: the layouts of public sets, see ``tensorsim.data.layouts``.
+        kind: ``"generated"``: tensorsim's own generator; ``"rendered"``: the same people, filmed by
+            :class:`~tensorsim.data.PersonRenderer` and found again by the networks, with their errors; ``"films"``,
+            ``"keypoints"`` and ``"motion"``: a folder with a folder per class, of films, COCO key points (.json) or
+            captured motion (.bvh, .npz); ``"table"``: a CSV or Parquet table of such files; the others: the layouts of
+            public sets, see ``tensorsim.data.layouts``.
         path: folder or file; relative paths are relative to the working directory.
         table: CSV or Parquet file that the layouts ``kinetics``, ``charades`` and ``movi`` need beside the folder.
         classes: classes to use, in the order of their numbers; empty: all. For generated people these are activities.
-        people: number of generated people.
-        fps: frames per second of key points, and of motion files that do not tell it.
-        image_size: (height, width) of the pictures of key points, where the file does not tell it.
+        people: number of generated or rendered people.
+        fps: frames per second of key points, of motion files that do not tell it, and of rendered films (30).
+        image_size: (height, width) of the pictures of key points, where the file does not tell it, and of rendered
+            films (360, 640).
 
     Raises:
         TensorsimError: a field that the kind needs and does not have, or has and does not use.
@@ -57,9 +70,11 @@ class SourceConfig:
 
     def __post_init__(self) -> None:
         require_choices(self, kind=SourceKind)
-        used = {"generated": {"people"}, "keypoints": {"path", "fps", "image_size"}}.get(
-            self.kind, {"path", "fps"}
-        )
+        used = {
+            "generated": {"people"},
+            "rendered": {"people", "fps", "image_size"},
+            "keypoints": {"path", "fps", "image_size"},
+        }.get(self.kind, {"path", "fps"})
         with_table = ("kinetics", "charades", "movi")
         used = used | {"table"} if self.kind in with_table else used
         used = used | {"image_size"} if self.kind == "table" else used
@@ -76,7 +91,7 @@ class SourceConfig:
                 )
         if len(set(self.classes)) < len(self.classes):
             raise TensorsimError(f"SourceConfig.classes: got {list(self.classes)}, expected each class once")
-        if self.kind == "generated":
+        if self.people is not None:
             require_counts(self, "people")
             names = tuple(ACTIVITIES[activity_index(name)] for name in self.classes) or ACTIVITIES
             object.__setattr__(self, "classes", names)

@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.synthesis import peak_db, synthesize
 from tensorsim.data.sets.variations import Variation
+from tensorsim.device import one_thread
 
 
 class Sample(NamedTuple):
@@ -82,13 +82,9 @@ def sample_of_row(plan: Plan, row: dict[str, Any]) -> Sample:
 
 def _sample(plan: Plan, named: dict[str, Any], variation: Variation) -> Sample:
     there = plan.clip(named["clip_index"])[1]
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums over several threads are not the same to the last bit
-    try:
+    with one_thread():  # for the same bits everywhere
         scene = plan.scene(named["clip_index"], named["part"], variation)
         made = synthesize(plan.recipe, scene, variation)
-    finally:
-        torch.set_num_threads(threads)
     label = plan.labels.index(there.label)
     row = named | variation.row() | {
         "class_index": label,

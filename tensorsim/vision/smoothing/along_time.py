@@ -4,6 +4,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tensorsim.errors import is_exporting
+
+
+def running_max(x: Tensor) -> Tensor:
+    """The largest value so far along the last dimension: (..., T) -> (..., T)."""
+    if is_exporting():  # ONNX has no such operation
+        so_far = torch.ones(x.shape[-1], x.shape[-1], dtype=torch.bool, device=x.device).tril()
+        return torch.where(so_far, x[..., None, :], x.amin(dim=-1)[..., None, None]).amax(dim=-1)
+    return x.cummax(dim=-1)[0]
+
 
 def nearest_valid(valid: Tensor) -> Tensor:
     """For every frame the index of the nearest valid one, itself if valid: (..., T) bool -> (..., T) int64.
@@ -12,8 +22,10 @@ def nearest_valid(valid: Tensor) -> Tensor:
     """
     frames = valid.shape[-1]
     time = torch.arange(frames, device=valid.device).expand(valid.shape)
-    before = torch.where(valid, time, torch.full_like(time, -frames)).cummax(dim=-1)[0]
-    after = torch.where(valid, time, torch.full_like(time, 2 * frames)).flip(-1).cummin(dim=-1)[0].flip(-1)
+    before = torch.where(valid, time, torch.full_like(time, -frames))
+    before = running_max(before)
+    after = torch.where(valid, time, torch.full_like(time, 2 * frames))
+    after = -running_max(-after.flip(-1)).flip(-1)
     nearest = torch.where(time - before <= after - time, before, after)
     return torch.where(valid.any(dim=-1, keepdim=True), nearest, time)
 
@@ -28,8 +40,8 @@ def brief_gaps(seen: Tensor, longest: int) -> Tensor:
     frames = seen.shape[-1]
     time = torch.arange(frames, device=seen.device).expand(seen.shape)
     never = torch.full_like(time, -frames)
-    before = torch.where(seen, time, never).cummax(dim=-1)[0]
-    after = torch.where(seen, time, -2 * never).flip(-1).cummin(dim=-1)[0].flip(-1)
+    before = running_max(torch.where(seen, time, never))
+    after = -running_max(-torch.where(seen, time, -2 * never).flip(-1)).flip(-1)
     return ~seen & (after - before - 1 <= longest) & (before >= 0) & (after < frames)
 
 

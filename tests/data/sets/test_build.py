@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -257,3 +257,41 @@ def test_ray_makes_the_same_bytes(built: Path, recipe: DatasetRecipe, tmp_path: 
     pytest.importorskip("ray")
     build_dataset(recipe, tmp_path / "set", RayCluster(workers=1), quiet=True)
     assert contents(tmp_path / "set") == contents(built)
+
+
+class Named(NamedTuple):
+    """A job with one field, as an engine sends it."""
+
+    path: str
+
+
+def named_node(job: Named) -> int:
+    """Leave a file with the name of the node, and give the other one time to take the next job."""
+    import ray
+
+    time.sleep(0.5)
+    (Path(job.path).parent / ray.get_runtime_context().get_node_id()).touch()
+    return 1
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Ray
+def test_two_nodes_of_a_cluster_make_the_same_bytes(
+    built: Path, recipe: DatasetRecipe, tmp_path: Path
+) -> None:
+    pytest.importorskip("ray", reason="the extra scale is not installed")
+    from ray.cluster_utils import Cluster
+
+    node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+    cluster = Cluster(initialize_head=True, head_node_args=node | {"include_dashboard": False})
+    try:
+        cluster.add_node(**node)
+        engine = RayCluster(cluster.address)
+        build_dataset(recipe, tmp_path / "set", engine, quiet=True)
+        (tmp_path / "nodes").mkdir()
+        jobs = [Named(str(tmp_path / "nodes" / str(k))) for k in range(8)]
+        assert sum(engine.run(named_node, jobs)) == 8
+    finally:
+        cluster.shutdown()
+    assert contents(tmp_path / "set") == contents(built)
+    assert len(list((tmp_path / "nodes").iterdir())) == 2

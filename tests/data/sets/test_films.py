@@ -13,9 +13,12 @@ from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.manifest import rows_of
 from tensorsim.data.sets.people import PeopleFinder
 from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig, SplitConfig
+from tensorsim.data.sets.rendered import CAMERA
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
+from tensorsim.motion import ActivityGenerator, PeopleConfig
 from tensorsim.pipeline import VideoToPose
+from tensorsim.render.renderer import PersonRenderer
 from tests.data.sets.recipes import small_recipe
 from tests.film import RectangleDetector, StandingPose, film, walker
 
@@ -32,6 +35,26 @@ def write_film(path: Path, frames: np.ndarray) -> None:
     writer.release()
 
 
+def damage(folder: Path, good: Path, name: str = "") -> list[Path]:
+    """Write ten films that cannot be used, each for another reason."""
+    whole = good.read_bytes()
+    contents = {
+        "empty.avi": b"",
+        "cut.avi": whole[:600],
+        "header.avi": whole[:40],
+        "text.mp4": b"no film at all\n",
+        "zeros.mp4": bytes(5000),
+        "noise.mkv": np.random.default_rng(0).bytes(5000),
+        "picture.mp4": cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes(),
+        "html.webm": b"<html>404 Not Found</html>",
+    }
+    for suffix, content in contents.items():
+        (folder / f"{name}{suffix}").write_bytes(content)
+    write_film(folder / f"{name}one_frame.avi", good_film(1.0)[:1])
+    write_film(folder / f"{name}nobody.avi", np.zeros((5, 120, 160, 3), np.uint8))
+    return [folder / f"{name}{suffix}" for suffix in (*contents, "one_frame.avi", "nobody.avi")]
+
+
 def good_film(speed: float) -> np.ndarray:
     return film(*walker(11, FPS, 4.0, speed, 0.3)).permute(0, 2, 3, 1).numpy()
 
@@ -42,21 +65,7 @@ def films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "films"
     for label, speed in (("leave", 1.2), ("come", -1.0)):
         write_film(folder / label / "good.avi", good_film(speed))
-    whole = (folder / "leave" / "good.avi").read_bytes()
-    damaged = {
-        "empty.avi": b"",
-        "cut.avi": whole[:600],
-        "header.avi": whole[:40],
-        "text.mp4": b"no film at all\n",
-        "zeros.mp4": bytes(5000),
-        "noise.mkv": np.random.default_rng(0).bytes(5000),
-        "picture.mp4": cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes(),
-        "html.webm": b"<html>404 Not Found</html>",
-    }
-    for name, content in damaged.items():
-        (folder / "leave" / name).write_bytes(content)
-    write_film(folder / "leave" / "one_frame.avi", good_film(1.0)[:1])
-    write_film(folder / "leave" / "nobody.avi", np.zeros((5, 120, 160, 3), np.uint8))
+    damage(folder / "leave", folder / "leave" / "good.avi")
     stage = VideoToPose.from_config(SimulationConfig(), RectangleDetector(), StandingPose())
     monkeypatch.setattr(PeopleFinder, "networks", stage)
     return folder
@@ -116,3 +125,23 @@ def test_joints_are_those_of_the_pipeline(films: Path) -> None:
     assert motion.fps == FPS
     assert torch.allclose(motion.joints[there], pose.joints[0][there], atol=1e-5)
     assert bool(torch.isfinite(motion.joints).all())
+
+
+@pytest.mark.slow
+def test_of_two_hundred_films_all_good_ones_arrive_and_all_bad_ones_are_listed(tmp_path: Path) -> None:
+    """Very short films, so that the shipped networks, reader and files are those of every day."""
+    folder = tmp_path / "films"
+    generator = ActivityGenerator(PeopleConfig(start_range_m=(2.5, 2.5)))
+    for number, label in enumerate(("walking", "sitting down")):
+        joints = generator.generate(label, seed=number, duration_s=0.4, rate_hz=FPS).joints.float()
+        frames = PersonRenderer(CAMERA)(joints, seed=number).frames.permute(0, 2, 3, 1).numpy()
+        for k in range(90):
+            frames[:, :4, :4] = k  # a film of its own
+            write_film(folder / label / f"{k:03d}.avi", frames)
+        damage(folder / label, folder / label / "000.avi")
+    bad = {str(path.relative_to(folder)) for path in folder.rglob("*.*") if not path.stem.isdigit()}
+    assert (len(list(folder.rglob("*.*"))), len(bad)) == (200, 20)
+    assert build_dataset(films_recipe(folder), tmp_path / "set", quiet=True) == (180, 20, 200)
+    with (tmp_path / "set" / "failures.csv").open(newline="") as file:
+        assert {row["clip"] for row in csv.DictReader(file)} == bad
+    assert len({row["sha256"] for row in rows_of(tmp_path / "set")}) == 180

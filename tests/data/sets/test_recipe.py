@@ -49,6 +49,10 @@ def test_yaml_and_back(tmp_path: Path) -> None:
     [
         ("sorces: []", "got the key 'sorces'.*perhaps 'sources'"),
         ("sources: [{kind: generated}]", "SourceConfig.people: got none"),
+        (
+            "sources: [{kind: rendered, people: 2, path: a}]",
+            "SourceConfig.path: got one for the kind 'rendered'",
+        ),
         ("sources: [{kind: films, path: a, people: 3}]", "SourceConfig.people: got one for the kind 'films'"),
         ("sources: [{people: 1, classes: [flying]}]", "activity: got 'flying'"),
         ("radars: [{preset: nothing}]", "got 'nothing', which is no file"),

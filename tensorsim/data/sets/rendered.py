@@ -1,0 +1,85 @@
+"""People who are rendered into films and found again by the networks, as a source of labelled clips."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from tensorsim.config import CameraConfig
+from tensorsim.data.sets.clips import Clip
+from tensorsim.data.sets.generated import GeneratedPeople
+from tensorsim.data.sets.people import PeopleFinder, finite_everywhere
+from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig
+from tensorsim.data.sets.scene import Scene, part_of, varied
+from tensorsim.data.sets.variations import Variation, VariationConfig, draw, seed_of
+from tensorsim.data.skeletons import Motion
+from tensorsim.device import one_thread
+from tensorsim.render.renderer import PersonRenderer
+
+#: Two metres behind the radar, so that a whole body is in view from 1.5 m on.
+CAMERA = CameraConfig(position_m=(0.0, -2.0, 1.0))
+_FPS, _IMAGE_SIZE = 30.0, (360, 640)
+#: What is drawn for a film: only where it takes place. Everything else is varied once people are found.
+_FILM = VariationConfig(heading_deg=(0.0, 0.0), mirror=0.0)
+
+
+class RenderedPeople:
+    """Generated people in front of a camera, one film for each activity of everybody.
+
+    Args:
+        recipe: gives seed, length of the films, heights and ranges.
+        source: the activities, the number of people, frames per second and size of the films.
+        number: of the source in the recipe.
+        cache: folder for the people that were found; None finds them every time.
+    """
+
+    finds_people = True
+
+    def __init__(
+        self, recipe: DatasetRecipe, source: SourceConfig, number: int, cache: str | None = None
+    ) -> None:
+        self.recipe = recipe
+        self.fps = _FPS if source.fps is None else source.fps
+        self.size = _IMAGE_SIZE if source.image_size is None else source.image_size
+        self.people = GeneratedPeople(replace(recipe, motion_hz=self.fps), source, number)
+        self.labels, self.person, self.clip = self.people.labels, self.people.person, self.people.clip
+        self.finder = PeopleFinder(source, None if cache is None else Path(cache))
+
+    def __len__(self) -> int:
+        return len(self.people)
+
+    def adapted(self, clip: Clip, variation: Variation) -> Variation:
+        """As it is."""
+        return variation
+
+    def scene(self, clip: Clip, variation: Variation) -> Scene:
+        """See :class:`~tensorsim.data.sets.clips.ClipSource`."""
+        moved = varied(self._motion(clip), variation)
+        return part_of(moved, self.recipe.duration_s, self.recipe.motion_hz, variation.start)
+
+    def prepare(self, clip: Clip) -> None:
+        """Render the film and find the people in it."""
+        self._motion(clip)
+
+    @torch.no_grad()
+    def _motion(self, clip: Clip) -> Motion:
+        film, seed = self._filmed(clip), seed_of(self.recipe.seed, clip.name, "look")
+        content = hashlib.sha256(self.finder.of_networks)
+        content.update(repr((CAMERA, self.size, self.fps, seed)).encode())
+        content.update(film.joints.numpy().tobytes())
+        found = self.finder.kept(Path(clip.name), content.hexdigest(), lambda _: self._watched(film, seed))
+        return finite_everywhere(found, clip.name)
+
+    def _filmed(self, clip: Clip) -> Scene:
+        """The person of a clip as the film shows them."""
+        drawn = draw(_FILM, seed_of(self.recipe.seed, clip.name, "film"))
+        return self.people.scene(clip, self.people.adapted(clip, drawn))
+
+    def _watched(self, film: Scene, seed: int) -> Motion:
+        """Who the networks find in a film, whose room and clothes are those of the seed."""
+        render = PersonRenderer(CAMERA, *self.size)
+        with one_thread():  # for the same bits everywhere
+            frames = render(film.joints, seed, valid=film.valid).frames
+            pose = self.finder.networks.seen_by(CAMERA)(frames[None], self.fps)
+        return Motion(pose.joints[0], pose.valid[0], self.fps)
