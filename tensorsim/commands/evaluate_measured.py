@@ -34,7 +34,7 @@ class EvaluateMeasured:
     repeats: int = 1
     """Trainings of each simulation in an ablation, with the seeds from --seed on."""
     steps: int = 600
-    """Batches of 64 of each training."""
+    """Batches of 64 of the training on simulation; half as many on a few measured clips, twice as many on all."""
     seed: int = 0
     """Of simulation and training."""
     quiet: bool = False
