@@ -1,5 +1,6 @@
 """What each effect of a simulation is worth: trainings without it, on simulation alone, tested on measured clips."""
 
+from functools import partial
 from typing import Any
 
 from tensorsim.evaluation.measured.report import accuracy, subset_accuracy
@@ -32,9 +33,8 @@ def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
         rows[effect] = []
         for seed in range(experiment.seed, experiment.seed + repeats):
             settings = [effect, seed, experiment.clips, experiment.steps, experiment.tested, len(labels)]
-            kept = work.kept(
-                f"{measured.name}-{effect or 'whole'}", settings, lambda e=effect, s=seed: accuracies(e, s)
-            )
+            make = partial(accuracies, effect, seed)
+            kept = work.kept(f"{measured.name}-{effect or 'whole'}", settings, make)
             rows[effect].append(kept["accuracies"])
     return rows
 
@@ -42,7 +42,13 @@ def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
 def ablation_table(experiment: Experiment, rows: dict[str, Accuracies]) -> str:
     """Markdown: mean accuracy, the lowest and the highest in brackets, and what the mean loses without an effect."""
     measured = experiment.measured
-    head = (f"{measured.name}: simulation without", "all classes", "lost, points", ", ".join(measured.subset), "lost")
+    head = (
+        f"{measured.name}: simulation without",
+        "all classes",
+        "lost, points",
+        ", ".join(measured.subset),
+        "lost",
+    )
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     whole = [sum(values) / len(values) for values in zip(*rows[""], strict=True)]
     for effect, pairs in rows.items():
