@@ -18,10 +18,11 @@ class EvaluateMeasured:
 
     train: Path
     """Folder of measured sets to learn from: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
-    test: Path
-    """Folder of measured sets to test on, the same layout."""
     out: Path
     """Folder of the results."""
+    test: Path | None = None
+    """Folder of measured sets to test on, the same layout; default the last 30 % of each class of --train, in the
+    order of the files, which is then trained on the others only."""
     quick: bool = False
     """Take the shipped weights, trained on simulation alone, and train nothing."""
     ablation: bool = False
@@ -30,8 +31,10 @@ class EvaluateMeasured:
     """Which sets; default all that both folders have."""
     clips: int = 300
     """Simulated clips of each class."""
+    repeats: int = 1
+    """Trainings of each simulation in an ablation, with the seeds from --seed on."""
     steps: int = 600
-    """Batches of 64 of each training."""
+    """Batches of 64 of the training on simulation; half as many on a few measured clips, twice as many on all."""
     seed: int = 0
     """Of simulation and training."""
     quiet: bool = False
@@ -40,34 +43,38 @@ class EvaluateMeasured:
     def run(self) -> None:
         """Do it."""
         check_seed(self.seed)
-        for name, count in (("--clips", self.clips), ("--steps", self.steps)):
+        for name, count in (("--clips", self.clips), ("--steps", self.steps), ("--repeats", self.repeats)):
             if count < 1:
                 raise TensorsimError(f"{name}: got {count}, expected at least 1")
         if self.out.exists() and not self.out.is_dir():
             raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
-        for folder in (self.train, self.test):
+        folders = [self.train] if self.test is None else [self.train, self.test]
+        for folder in folders:
             if not folder.is_dir():
                 raise TensorsimError(f"{folder}: no such folder, expected measured sets")
 
         if self.quick and self.ablation:
             raise TensorsimError("--quick, --ablation: got both, expected one: an ablation trains")
+        if self.repeats > 1 and not self.ablation:
+            raise TensorsimError(f"--repeats: got {self.repeats} without --ablation, expected 1")
 
-        from tensorsim.evaluation.measured.report import ablation_table, figures, table, write, write_json
+        from tensorsim.evaluation.measured.ablation import ablation, ablation_table
+        from tensorsim.evaluation.measured.report import figures, table, write, write_json
         from tensorsim.evaluation.measured.run import Experiment
         from tensorsim.evaluation.measured.sets import SETS
 
-        there = [s for s in SETS if (self.train / s.name).is_dir() and (self.test / s.name).is_dir()]
+        there = [s for s in SETS if all((folder / s.name).is_dir() for folder in folders)]
         chosen = [s for s in SETS if s.name in self.sets] if self.sets else there
         if not chosen:
             names = ", ".join(s.name for s in SETS)
-            raise TensorsimError(f"{self.train}, {self.test}: no set in both, expected some of {names}")
+            raise TensorsimError(f"{', '.join(map(str, folders))}: no set in all, expected some of {names}")
         results, errors = {}, {}
         for measured in chosen:
             experiment = Experiment(
                 measured, self.train, self.test, self.out, self.clips, self.steps, self.seed, self.quiet
             )
             if self.ablation:
-                rows = ablation_table(measured, experiment.ablation(), experiment.test_labels)
+                rows = ablation_table(experiment, ablation(experiment, self.repeats))
                 with complete_file(self.out / f"ablation_{measured.name}.md") as path:
                     path.write_text(rows + "\n", encoding="utf-8")
                 print(rows, flush=True)

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tensorsim.config import JOINTS
 from tensorsim.evaluation.measured.motions import (
     Draw,
     Unrest,
@@ -23,6 +24,7 @@ from tensorsim.evaluation.measured.motions import (
     knots,
     linear,
     place,
+    smooth_as_paper,
     stage_people,
     walk_to_and_fro,
 )
@@ -30,7 +32,8 @@ from tensorsim.evaluation.measured.training import drop_cells, shift, warp
 from tensorsim.motion.exercises import drink, fall_down, pick_up
 from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import PeopleConfig
-from tensorsim.motion.scripts import sit_down, stand_up
+from tensorsim.motion.scatterers import JointScatterers
+from tensorsim.motion.scripts import sit_down, stand_up, walk_to_fall
 from tensorsim.motion.timing import segment
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.radar.processing.cfar import CfarDetector
@@ -46,6 +49,8 @@ CLASSES = ("walking", "sitting_down", "standing_up", "pick_up", "drinking", "fal
 RADAR = replace(MEASURED_SENSORS["glasgow-ancortek"].radar, prf_hz=500.0)
 #: Rows of the measured masks (3.9 Hz each) within +-250 Hz.
 ROWS = slice(64, 192)
+#: Over the median of a map, where an ablation does without CFAR.
+FIXED_THRESHOLD_DB = 10.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,10 @@ class Effects:
 
     Attributes:
         to_and_fro: walkers turn round; else they go straight on.
+        falls_from_standing: else people fall out of a walk.
+        random_start: everything begins at a time drawn for each clip; else always at the same.
+        quick_limbs: joints move as they do; else as a Kalman smoother of the paper's noises leaves them.
+        ellipsoids: segments whose cross section follows the aspect; else joints as points, all alike.
         unrest: sway of the body and small movements of the limbs.
         residue: noise next to zero Doppler, in every frame.
         lines: tones of the hardware at fixed Doppler.
@@ -61,9 +70,14 @@ class Effects:
         levels: signal and floor drawn for each clip; else always the same.
         image: a weak mirror image in Doppler.
         shuffling: people end farther back after sitting down, farther ahead after rising.
+        cfar: a threshold by the surroundings of a cell; else one for the whole map, 10 dB above its median.
     """
 
     to_and_fro: bool = True
+    falls_from_standing: bool = True
+    random_start: bool = True
+    quick_limbs: bool = True
+    ellipsoids: bool = True
     unrest: bool = True
     residue: bool = True
     lines: bool = True
@@ -71,6 +85,7 @@ class Effects:
     levels: bool = True
     image: bool = True
     shuffling: bool = True
+    cfar: bool = True
 
 
 class Glasgow:
@@ -82,6 +97,7 @@ class Glasgow:
         self.bins = profile.last_bin - profile.first_bin + 1
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
         self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=3)
+        self.points = JointScatterers([1.0] * len(JOINTS))
         self.mti = MovingTargetIndicator("high-pass", RADAR, cutoff_m_s=3.75 * RADAR.doppler_wavelength_m / 2)
         self.maps = DopplerTimeMap(RADAR, window_s=0.2, overlap=0.9)
         self.cfar = CfarDetector(
@@ -111,7 +127,12 @@ class Glasgow:
                 4: (drink, 0.0, (-0.2, 1.8), (0.8, 1.9)),
                 5: (fall_down, 0.0, (-0.1, 2.6), (0.6, 1.3)),
             }[label]
+            if label == 5 and not self.effects.falls_from_standing:
+                script, first_s = walk_to_fall, 1.0  # the fall begins at 1.55 s
+                range_m = range_m + 1.5  # they come nearer before
             began, tempo = draw(*start), draw(*rate)
+            if not self.effects.random_start:
+                began = torch.full_like(began, sum(start) / 2)
             joints = act_out(script, (time - began) * tempo + first_s, people)
             if label in (1, 2) and self.effects.shuffling:
                 # Those who sit down end farther back than their feet, those who rise farther ahead.
@@ -120,15 +141,16 @@ class Glasgow:
             joints = place(joints, draw(-0.3, 0.3), range_m)
         if self.effects.unrest:
             joints = add_unrest(joints, draw, Unrest((0.003, 0.02), (0.0, 0.05)))
-        return joints, duration
+        return joints if self.effects.quick_limbs else smooth_as_paper(joints), duration
 
     def masks(self, joints: Tensor, duration: float, generator: torch.Generator) -> Tensor:
         """Masks (N, 128, 256) bool of people (N, K, 14, 3)."""
         draw = Draw(joints.shape[0], generator)
         pulses = round(duration * RADAR.prf_hz)
         at = torch.arange(pulses, dtype=torch.float64) / RADAR.prf_hz
-        positions, rcs = self.scatterers(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
-        if self.effects.dim_limbs:
+        body = self.scatterers if self.effects.ellipsoids else self.points
+        positions, rcs = body(joints.unsqueeze(1), torch.ones(joints.shape[:2]).unsqueeze(1))
+        if self.effects.dim_limbs and self.effects.ellipsoids:
             rcs = dim_limbs(rcs, draw, -9.0, 3.0, self.scatterers.per_segment)
         positions, rcs = at_instants(positions, at), linear(rcs, at)
         echo = self.echo(positions, rcs)
@@ -175,6 +197,8 @@ class Glasgow:
         db = F.interpolate(db.flip(-2).roll(1, -2)[:, None], (128, 256), mode="bilinear", antialias=True)[
             :, 0
         ]
+        if not self.effects.cfar:
+            return db > level_db.float().unsqueeze(-1) + FIXED_THRESHOLD_DB
         return self.cfar(db.clamp(min=0.0))
 
     def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:

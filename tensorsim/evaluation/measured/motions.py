@@ -15,6 +15,12 @@ from tensorsim.motion.limb_scatterers import SEGMENTS
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature
 from tensorsim.motion.scripts import walk
+from tensorsim.vision.smoothing.kalman import (
+    PANEL_MEASUREMENT_NOISE,
+    PANEL_PROCESS_NOISE,
+    REFERENCE_FPS,
+    KalmanSmoother,
+)
 
 #: Joints are worked out at this rate and interpolated by a C2 spline.
 KNOT_HZ = 120.0
@@ -90,6 +96,13 @@ def act_out(script: Script, time: Tensor, people: People) -> Tensor:
     joints = perform(script, time, people)
     joints = torch.where(people.left_handed[:, None, None, None], mirror(joints), joints)
     return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
+
+
+def smooth_as_paper(joints: Tensor) -> Tensor:
+    """Joints (N, K, 14, 3) as the smoother of the paper leaves them at 30 fps: limbs lose what is above 2 Hz."""
+    # Four times as many measurements in a second, each of four times the variance, weigh the same.
+    noise = PANEL_MEASUREMENT_NOISE * KNOT_HZ / REFERENCE_FPS
+    return KalmanSmoother(PANEL_PROCESS_NOISE, noise)(joints, None, KNOT_HZ)
 
 
 def place(joints: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:

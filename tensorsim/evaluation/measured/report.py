@@ -109,18 +109,3 @@ def write_json(path: Path, results: dict[str, dict[str, Any]]) -> None:
     """``measured.json``."""
     with complete_file(path) as scratch:
         scratch.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-
-
-def ablation_table(measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> str:
-    """Markdown: accuracy of all classes and of the part, whole and without each effect."""
-    subset = [measured.classes.index(name) for name in measured.subset]
-    lines = [
-        f"| {measured.name}: simulation without | all classes | {', '.join(measured.subset)} |",
-        "|---|---|---|",
-    ]
-    for effect, values in logits.items():
-        figures = accuracy(values, labels), subset_accuracy(values, labels, subset)
-        lines.append(
-            f"| {effect or '(nothing left out)'} | " + " | ".join(f"{100 * x:.1f} %" for x in figures) + " |"
-        )
-    return "\n".join(lines)

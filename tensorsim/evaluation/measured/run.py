@@ -16,6 +16,8 @@ from tensorsim.weights import save_weights
 SETTINGS = ("simulation_only", "ten_shot", "ten_shot_alone", "all", "lda")
 #: Measured clips of each class in ``ten_shot``.
 SHOTS = 10
+#: Share of each class to learn from where no other folder is given to test on.
+LEARNED = 0.7
 
 
 def few(labels: Tensor, shots: int) -> Tensor:
@@ -26,6 +28,25 @@ def few(labels: Tensor, shots: int) -> Tensor:
         steps = torch.linspace(0, len(places) - 1, min(shots, len(places)))
         chosen.append(places[steps.round().long()])
     return torch.cat(chosen)
+
+
+def split(labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices of the first 70 % of each class, in the order of the files, and of the others.
+
+    Raises:
+        TensorsimError: a class with fewer than two clips.
+    """
+    early, late = [], []
+    for label in labels.unique():
+        places = torch.nonzero(labels == label)[:, 0]
+        if len(places) < 2:
+            raise TensorsimError(
+                f"class {int(label)}: got one clip, expected at least two to keep some for the test"
+            )
+        count = min(max(round(LEARNED * len(places)), 1), len(places) - 1)
+        early.append(places[:count])
+        late.append(places[count:])
+    return torch.cat(early), torch.cat(late)
 
 
 def lda_logits(train: Tensor, labels: Tensor, test: Tensor, classes: int) -> Tensor:
@@ -50,10 +71,11 @@ class Experiment:
 
     Args:
         measured: the set.
-        train, test: folders of measured sets.
+        train: folder of measured sets.
+        test: another one; None keeps the last 30 % of each class of ``train``, in the order of the files, for the test.
         out: where the weights trained on simulation alone go.
         clips: simulated clips of each class.
-        steps: batches of 64 of the training on simulation; the others are shorter or as long.
+        steps: batches of 64 of the training on simulation; half as many on a few measured clips, twice as many on all.
         seed: of simulation and training.
         quiet: no progress bar.
     """
@@ -62,7 +84,7 @@ class Experiment:
         self,
         measured: MeasuredSet,
         train: Path,
-        test: Path,
+        test: Path | None,
         out: Path,
         clips: int = 300,
         steps: int = 600,
@@ -70,9 +92,15 @@ class Experiment:
         quiet: bool = False,
     ) -> None:
         self.measured, self.out = measured, out
+        self.tested = str(train if test is None else test)
         self.clips, self.steps, self.seed, self.quiet = clips, steps, seed, quiet
         self.train, self.train_labels = measured.load(train)
-        self.test, self.test_labels = measured.load(test)
+        if test is None:
+            early, late = split(self.train_labels)
+            self.test, self.test_labels = self.train[late], self.train_labels[late]
+            self.train, self.train_labels = self.train[early], self.train_labels[early]
+        else:
+            self.test, self.test_labels = measured.load(test)
 
     def quick(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips by the shipped weights."""
@@ -82,7 +110,7 @@ class Experiment:
     def full(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips in each of ``SETTINGS``."""
         simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet)
-        net = self._fit(self._new(), simulated, labels, self.steps)
+        net = self._fit(self._new(self.seed), simulated, labels, self.steps, self.seed)
         path = self.out / f"{self.measured.weights.replace('-', '_')}.safetensors"
         save_weights(
             net, path, {"trained_on": "simulation alone", "classes": ",".join(self.measured.classes)}
@@ -91,25 +119,22 @@ class Experiment:
         everything = torch.arange(len(self.train_labels))
         logits = {"simulation_only": predict(net, self.test)}
         logits["ten_shot"] = self._measured_logits(net, chosen, self.steps // 2, 1e-3)
-        logits["ten_shot_alone"] = self._measured_logits(self._new(), chosen, self.steps // 2, 3e-3)
-        logits["all"] = self._measured_logits(net, everything, self.steps, 2e-3)
+        logits["ten_shot_alone"] = self._measured_logits(self._new(self.seed), chosen, self.steps // 2, 3e-3)
+        logits["all"] = self._measured_logits(net, everything, 2 * self.steps, 2e-3)
         logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
         return logits
 
-    def ablation(self) -> dict[str, Tensor]:
-        """Logits (N, classes) of the test clips by simulation alone, whole and without each effect in turn."""
-        logits = {}
-        for effect in ("", *self.measured.effect_names):
-            simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet, effect or None)
-            logits[effect] = predict(self._fit(self._new(), simulated, labels, self.steps), self.test)
-        return logits
+    def simulation_alone(self, seed: int, without: str | None = None) -> Tensor:
+        """Logits (N, classes) of the test clips by a network trained on simulation alone, perhaps without an effect."""
+        simulated, labels = self.measured.simulate(self.clips, seed, self.quiet, without)
+        return predict(self._fit(self._new(seed), simulated, labels, self.steps, seed), self.test)
 
-    def _new(self) -> PictureNet:
-        torch.manual_seed(self.seed)
+    def _new(self, seed: int) -> PictureNet:
+        torch.manual_seed(seed)
         return PictureNet(len(self.measured.classes), self.train.shape[-2])
 
-    def _fit(self, net: PictureNet, shown: Tensor, labels: Tensor, steps: int) -> PictureNet:
-        fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=self.seed)
+    def _fit(self, net: PictureNet, shown: Tensor, labels: Tensor, steps: int, seed: int) -> PictureNet:
+        fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=seed)
         return net
 
     def _measured_logits(self, net: PictureNet, chosen: Tensor, steps: int, learning_rate: float) -> Tensor:
