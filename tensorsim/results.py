@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
+from tensorsim.array_files import save_arrays
 from tensorsim.config import CameraConfig, SimulationConfig
-from tensorsim.data.array_files import save_arrays
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
 from tensorsim.files import write_json
@@ -115,7 +115,7 @@ def write_maps(
         truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
             every picture.
         pictures: how they are drawn.
-        formats: of the arrays, see :func:`~tensorsim.data.array_files.save_arrays`.
+        formats: of the arrays, see :func:`~tensorsim.array_files.save_arrays`.
     """
     save_maps(folder / "maps", maps, axes, formats)
     if truth is not None:
