@@ -2,12 +2,12 @@
 
     python -m tests.benchmarks.bench_video [--film FILE] [--runs 5] [--peer]
 
-Without a film, a generated person is rendered at half the size and enlarged. Times are those of the processor, which a
-busy machine changes little; set OMP_NUM_THREADS=1, because threads of libraries count for no stage. Wall time is printed
-beside them. A stage does not count what another stage in it takes. Other options go to ``simulate``.
+Without a film, a generated person is rendered at half the size and enlarged. Times are those of the processor, which
+a busy machine changes little; set OMP_NUM_THREADS=1, because threads of libraries count for no stage. Wall time is
+printed beside them. A stage does not count what another stage in it takes. Other options go to ``simulate``.
 
-The peer is ONNX Runtime running the same networks on every frame, one by one: detection, then key points with the mirror
-test in the boxes that were tracked.
+The peer is ONNX Runtime running the same networks on every frame, one by one: detection, then key points with the
+mirror test in the boxes that were tracked.
 """
 
 import argparse
