@@ -12,7 +12,7 @@ from tensorsim.vision.pose2d.crops import BoxCrop
 _HEIGHT, _WIDTH, _FPS = 360, 640, 1.0
 
 
-def rendered_crops(size: tuple[int, int], people: int = 8, poses: int = 4, seed: int = 0) -> Tensor:
+def rendered_crops(size: tuple[int, int], people: int = 12, poses: int = 2, seed: int = 0) -> Tensor:
     """Crops (N, 3, H, W) RGB in [0, 1] of this size of people in rooms, N up to ``people * poses``.
 
     Args:
