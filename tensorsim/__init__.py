@@ -8,7 +8,7 @@ Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where they ar
 """
 
 # isort: off
-from tensorsim import process  # noqa: F401  # first: the command settles its threads before torch is loaded
+from tensorsim import process  # first: the command settles its threads before torch is loaded
 
 # isort: on
 from importlib import import_module
@@ -92,7 +92,7 @@ _HOMES = ("exceptions", "config", "types", "pipeline", "live")
 if not TYPE_CHECKING:  # type checkers take the imports above
 
     def __getattr__(name: str) -> Any:
-        """Names are imported when they are first used: ``tensorsim --help`` does without torch."""
+        """Import what is not here yet."""
         if find_spec(f"{__name__}.{name}") is not None:
             return import_module(f"{__name__}.{name}")
         homes = (import_module(f"{__name__}.{home}") for home in _HOMES if name in __all__)
@@ -102,5 +102,7 @@ if not TYPE_CHECKING:  # type checkers take the imports above
                 return globals()[name]
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
-    def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+    # The command prints its help, and what is wrong with its options, without the seconds that torch takes.
+    if not process.is_command():
+        for _name in __all__:
+            __getattr__(_name)
