@@ -60,6 +60,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--scene", choices=sorted(PRESETS), default="free-space")
     arguments = parser.parse_args()
+    if arguments.minutes <= 1:
+        parser.error(f"--minutes: got {arguments.minutes}, expected more than the first one, to compare with")
     with tempfile.TemporaryDirectory() as folder:
         film = arguments.film or Path(folder) / "film.mp4"
         if arguments.film is None:
