@@ -31,7 +31,7 @@ class OnnxEngine(nn.Module):
         network: with static shapes but for N; it is put into evaluation mode.
         size: (H, W).
         int8: in 8-bit integers: pictures are crops of people in [0, 1], and answers are those of the network to about
-            1 % of the largest.
+            5 % of the largest.
 
     Raises:
         TensorsimError: no ONNX Runtime.
