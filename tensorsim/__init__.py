@@ -8,34 +8,40 @@ Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where they ar
 """
 
 # isort: off
-from tensorsim import process  # noqa: F401  # first: the command settles its threads before torch is loaded
+from tensorsim import process  # first: the command settles its threads before torch is loaded
 
 # isort: on
-from tensorsim import data, enhance, export, motion, radar, recognition, vision
-from tensorsim.config import (
-    ACTIVITIES,
-    COCO_KEYPOINTS,
-    JOINT_RCS_M2,
-    JOINTS,
-    CameraConfig,
-    ClutterConfig,
-    FloorConfig,
-    InterferenceConfig,
-    PoseConfig,
-    ProcessingConfig,
-    RadarConfig,
-    ReceiverConfig,
-    SceneConfig,
-    SimulationConfig,
-    SmoothingConfig,
-    TrackerConfig,
-    WallConfig,
-)
-from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.live import LiveSimulator
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
 from tensorsim.paper import table as _paper_table
-from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
-from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
+
+if TYPE_CHECKING:
+    from tensorsim import data, enhance, export, motion, radar, recognition, vision
+    from tensorsim.config import (
+        ACTIVITIES,
+        COCO_KEYPOINTS,
+        JOINT_RCS_M2,
+        JOINTS,
+        CameraConfig,
+        ClutterConfig,
+        FloorConfig,
+        InterferenceConfig,
+        PoseConfig,
+        ProcessingConfig,
+        RadarConfig,
+        ReceiverConfig,
+        SceneConfig,
+        SimulationConfig,
+        SmoothingConfig,
+        TrackerConfig,
+        WallConfig,
+    )
+    from tensorsim.exceptions import TensorsimError, TensorsimWarning
+    from tensorsim.live import LiveSimulator
+    from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
+    from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
 
 __version__ = "0.1.0"
 __doc__ = f"{__doc__}{_paper_table()}\n"
@@ -79,3 +85,24 @@ __all__ = [
     "recognition",
     "vision",
 ]
+
+#: Modules whose public names are here as well.
+_HOMES = ("exceptions", "config", "types", "pipeline", "live")
+
+if not TYPE_CHECKING:  # type checkers take the imports above
+
+    def __getattr__(name: str) -> Any:
+        """Import what is not here yet."""
+        if find_spec(f"{__name__}.{name}") is not None:
+            return import_module(f"{__name__}.{name}")
+        homes = (import_module(f"{__name__}.{home}") for home in _HOMES if name in __all__)
+        for home in homes:
+            if hasattr(home, name):
+                globals()[name] = getattr(home, name)
+                return globals()[name]
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    # The command prints its help, and what is wrong with its options, without the seconds that torch takes.
+    if not process.is_command():
+        for _name in __all__:
+            __getattr__(_name)

@@ -34,7 +34,7 @@ from tensorsim.commands.train_detector import TrainDetector
 from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 EXAMPLES = """
 examples:
@@ -180,7 +180,9 @@ def main(arguments: list[str] | None = None) -> None:
     130 interrupted, 141 output pipe closed.
     """
     with process.ending_cleanly(), _one_line_errors():
-        parse(arguments).run()
+        command = parse(arguments)
+        process.load_torch()
+        command.run()
 
 
 if __name__ == "__main__":

@@ -3,21 +3,16 @@
 The checks compile under TorchScript, so a scripted graph refuses the same inputs with the same words.
 """
 
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
-
-class TensorsimError(ValueError):
-    """Input that tensorsim refuses; the message says what came and what was expected."""
-
-
-class TensorsimWarning(UserWarning):
-    """A result is returned, but it may not be what the caller expects."""
+from tensorsim.exceptions import TensorsimError as TensorsimError
+from tensorsim.exceptions import TensorsimWarning as TensorsimWarning
+from tensorsim.exceptions import check_positive as check_positive
+from tensorsim.exceptions import collected_warnings as collected_warnings
 
 
 def check_is_tensor(x: Any, name: str) -> None:
@@ -216,27 +211,3 @@ def check_count(value: int, least: int, most: int, name: str) -> None:
     """Refuse what is no integer from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         raise TensorsimError(f"{name}: got {value}, expected an integer from {least} to {most}")
-
-
-def check_positive(value: float, name: str) -> None:
-    """Refuse a number that is not finite and above zero."""
-    if not (value > 0.0 and value < float("inf")):
-        raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
-
-
-@contextmanager
-def collected_warnings() -> Iterator[list[str]]:
-    """The messages of tensorsim's own warnings in the block, each once; other warnings pass through."""
-    messages: list[str] = []
-    show = warnings.showwarning
-
-    def collect(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-        if not issubclass(category, TensorsimWarning):
-            show(message, category, *rest, **more)
-        elif str(message) not in messages:
-            messages.append(str(message))
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", TensorsimWarning)
-        warnings.showwarning = collect
-        yield messages

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 #: The file that identifies the run that a results folder is from.
 SUMMARY = "summary.json"

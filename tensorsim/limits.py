@@ -7,7 +7,7 @@ radars or people.
 import math
 from typing import NamedTuple
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 class Range(NamedTuple):

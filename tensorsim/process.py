@@ -69,6 +69,15 @@ def ending_cleanly() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def load_torch() -> None:
+    """Import torch, which takes a second; an interrupt ends the process at once."""
+    before = signal.signal(signal.SIGINT, _quit)
+    try:
+        import torch  # noqa: F401
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     signal.signal(number, signal.SIG_IGN)  # once: what follows is the cleaning up
     sys.exit(128 + number)

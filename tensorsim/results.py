@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
+from tensorsim.array_files import save_arrays
 from tensorsim.config import CameraConfig, SimulationConfig
-from tensorsim.data.array_files import save_arrays
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
 from tensorsim.files import write_json
@@ -23,6 +23,7 @@ from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.report.film import FilmStrip
 from tensorsim.streaming import Found, maps_of_pose
+from tensorsim.threads import beside
 from tensorsim.types import Pose, RadarMaps
 from tensorsim.vision.calibration.calibrator import camera_config, camera_row
 from tensorsim.vision.tracking.selection import select_people
@@ -115,7 +116,7 @@ def write_maps(
         truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
             every picture.
         pictures: how they are drawn.
-        formats: of the arrays, see :func:`~tensorsim.data.array_files.save_arrays`.
+        formats: of the arrays, see :func:`~tensorsim.array_files.save_arrays`.
     """
     save_maps(folder / "maps", maps, axes, formats)
     if truth is not None:
@@ -289,10 +290,14 @@ def simulate(
         ),
     )
     torch.manual_seed(config.seed)
-    maps = maps_of_pose(stage, pose, source.fps, device, quiet)
     camera = None if found.camera is None else camera_config(found.camera)
-    film = write_overlay(folder, source.frames(), source.fps, pose, source.threshold, quiet, camera)
-    return found._replace(pose=pose), maps, film
+
+    def overlay(chunks: Iterable[Tensor]) -> FilmStrip:
+        return write_overlay(folder, chunks, source.fps, pose, source.threshold, quiet, camera)
+
+    with beside(overlay, source.frames()) as film:
+        maps = maps_of_pose(stage, pose, source.fps, device, quiet)
+    return found._replace(pose=pose), maps, film.result()
 
 
 def _figure_pixels(figure: Any) -> np.ndarray:

@@ -30,7 +30,8 @@ class Watch:
             {action}
 sys.meta_path.insert(0, Watch())
 sys.argv = {argv}
-import tensorsim.cli
+from tensorsim.cli import main
+main()
 """
 
 
@@ -42,7 +43,7 @@ def test_an_interrupt_while_torch_is_imported_is_one_line() -> None:
 
 def test_threads_are_settled_before_torch_is_imported_and_for_the_command_only() -> None:
     show = "print(os.environ.get('GOMP_SPINCOUNT')); os._exit(0)"
-    for argv, expected in ((["/usr/bin/tensorsim"], "1000"), (["my_program.py"], "None")):
+    for argv, expected in ((["/usr/bin/tensorsim", "check"], "1000"), (["my_program.py", "check"], "None")):
         done = run_python(AT_IMPORT.format(action=show, argv=argv))
         assert done.stdout.strip() == expected, done.stderr
 
@@ -103,3 +104,35 @@ def test_threads_of_a_container(tmp_path: Path) -> None:
     ):
         (tmp_path / "cpu.max").write_text(text)
         assert process.cpu_quota(tmp_path / "cpu.max") == expected
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["simulate", "film.mp4"]])
+def test_help_and_bad_options_load_no_torch(arguments: list[str]) -> None:
+    heavy = "print(sorted({'torch', 'cv2', 'scipy', 'matplotlib', 'onnxruntime'} & set(sys.modules)))"
+    code = f"""
+import atexit, sys
+sys.argv = ["tensorsim"]
+from tensorsim import cli
+atexit.register(lambda: {heavy})
+cli.main({arguments})
+"""
+    done = run_python(code)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
+def test_public_names_come_when_the_command_uses_them_and_at_once_elsewhere() -> None:
+    code = """
+import sys
+sys.argv = [{program!r}]
+import tensorsim as ts
+print("torch" in sys.modules, "VideoToDoppler" in vars(ts))
+assert all(getattr(ts, name) is not None for name in ts.__all__)
+try:
+    ts.nothing
+except AttributeError as error:
+    print(error)
+"""
+    nothing = "module 'tensorsim' has no attribute 'nothing'\n"
+    for program, loaded in (("tensorsim", "False False\n"), ("my_program.py", "True True\n")):
+        done = run_python(code.format(program=program))
+        assert done.stdout == loaded + nothing, done.stderr

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 if TYPE_CHECKING:
     from tensorsim.data.sets.engines import Engine

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
-from tensorsim.errors import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tensorsim.commands.options import check_seed
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 if TYPE_CHECKING:
     from tensorsim.evaluation.camera import CameraErrors

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tensorsim.commands.options import check_seed
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 if TYPE_CHECKING:
     from tensorsim.training.film_maps import LabelledPose

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tensorsim.commands.options import check_seed
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from tensorsim.commands.networks import default_networks
 from tensorsim.commands.options import check_seed
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

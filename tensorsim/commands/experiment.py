@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

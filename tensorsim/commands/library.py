@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from tensorsim.commands.options import check_seed
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 #: What motion files are called.
 SUFFIXES = (".bvh", ".npz")

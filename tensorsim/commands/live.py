@@ -10,7 +10,7 @@ import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, load_recognizer
-from tensorsim.errors import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings
 from tensorsim.limits import check_range
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

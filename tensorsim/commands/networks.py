@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +20,9 @@ class NetworkOptions:
     else the shipped one."""
     flip_test: bool = True
     """Show the pose network every person mirrored as well: better, at twice the cost."""
-    engine: Literal["onnxruntime", "torch"] = "onnxruntime"
+    engine: Literal["onnxruntime", "int8", "torch"] = "onnxruntime"
     """What runs the networks on the processor: ONNX Runtime takes half the time, with networks that it exports once to
-    the user's cache. On a GPU it is always torch."""
+    the user's cache; "int8" is the same with the pose network in 8-bit integers. On a GPU it is always torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:
@@ -63,4 +63,4 @@ def load_networks(detector: Path, pose: Path, flip_test: bool, engine: str = "to
         return networks
     from tensorsim.vision.onnx_engine import in_onnxruntime
 
-    return in_onnxruntime(*networks)
+    return in_onnxruntime(*networks, int8=engine == "int8")

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
+from tensorsim.array_files import array_formats
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
-from tensorsim.data.array_files import array_formats
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.exceptions import TensorsimError, TensorsimWarning
 
 if TYPE_CHECKING:
     import torch

@@ -11,7 +11,7 @@ import tyro
 from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
-from tensorsim.errors import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings
 from tensorsim.limits import check_range
 
 if TYPE_CHECKING:

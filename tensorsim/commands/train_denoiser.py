@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

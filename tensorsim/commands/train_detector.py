@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tensorsim.commands.training import PeopleOptions
-from tensorsim.errors import check_positive
+from tensorsim.exceptions import check_positive
 
 
 @dataclass(frozen=True)

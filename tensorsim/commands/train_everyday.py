@@ -6,7 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tensorsim.commands.training import PeopleOptions
-from tensorsim.errors import check_positive
+from tensorsim.exceptions import check_positive
 
 if TYPE_CHECKING:
     from tensorsim.training.pose_data import Person

@@ -3,7 +3,7 @@
 import math
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from torch import Tensor
 from tensorsim.data.frame_times import FilmClock, nearest_frames, unevenness_s
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.limits import RANGES, check_range
+from tensorsim.threads import ahead
 
 #: A file that announces so many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
@@ -122,7 +123,9 @@ class VideoReader:
         )
 
     def chunks(self, size: int) -> Iterator[Tensor]:
-        """The frames in order, at most ``size`` at a time: (n, 3, H, W) uint8 RGB on the CPU, n >= 1.
+        """The frames in order, at most ``size`` at a time: (n, 3, H, W) uint8 RGB on the CPU, n >= 1, channels last.
+
+        They are decoded in a thread of their own, two chunks ahead.
 
         A film that ends before the frames that its file announces (a cut-off download) gives what is there,
         with a TensorsimWarning. Frames at uneven times are given as they come, with a TensorsimWarning, and
@@ -133,7 +136,7 @@ class VideoReader:
         """
         if size < 1:
             raise TensorsimError(f"chunks: got a size of {size} frames, expected 1 or more")
-        return self._chunks(size)
+        return ahead(self._chunks(size))
 
     def even_chunks(self, size: int) -> Iterator[Tensor]:
         """As :meth:`chunks`; of a film whose ``uneven_times_s`` are known, the frames nearest to even times.
@@ -151,13 +154,13 @@ class VideoReader:
                 yield frames[part]
             done += frames.shape[0]
 
-    def _chunks(self, size: int) -> Iterator[Tensor]:
+    def _chunks(self, size: int) -> Generator[Tensor, None, None]:
         import cv2
 
         with self._opened() as capture:
             clock, index, ended = self._clock(), 0, False
-            buffer = np.empty((size, self.height, self.width, 3), np.uint8)
-            filled = 0
+            shape = size, self.height, self.width, 3
+            buffer, filled = np.empty(shape, np.uint8), 0
             times_s: list[float] = []
             while capture.grab():
                 own_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -168,20 +171,19 @@ class VideoReader:
                     found, frame = capture.retrieve()
                     if not found:
                         break
-                    if frame.shape != buffer.shape[1:]:
+                    if frame.shape != shape[1:]:
                         raise TensorsimError(
-                            f"{self.path}: frame {index} has shape {frame.shape}, "
-                            f"expected {buffer.shape[1:]} as the first"
+                            f"{self.path}: frame {index} has shape {frame.shape}, expected {shape[1:]} as the first"
                         )
                     times_s.append(own_s)
                     cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled])
                     filled += 1
                 index += 1
                 if filled == size:
-                    yield _planes(buffer)
-                    filled = 0
+                    yield torch.from_numpy(buffer).permute(0, 3, 1, 2)
+                    buffer, filled = np.empty(shape, np.uint8), 0
             if filled:
-                yield _planes(buffer[:filled])
+                yield torch.from_numpy(buffer[:filled]).permute(0, 3, 1, 2)
         self._keep_times(torch.tensor(times_s, dtype=torch.float64))
         if self._announced is not None and not ended:
             expected = self._stop(self._announced)
@@ -266,11 +268,6 @@ def _begins_like_a_film(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(16)
     return any(head[at : at + len(kind)] == kind for at, kind in _CONTAINERS)
-
-
-def _planes(frames: np.ndarray) -> Tensor:
-    """(n, H, W, 3) of a buffer that is used again -> (n, 3, H, W) of its own."""
-    return torch.from_numpy(frames).permute(0, 3, 1, 2).clone(memory_format=torch.contiguous_format)
 
 
 def properties(capture: Any) -> tuple[float, int | None]:

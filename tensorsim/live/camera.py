@@ -7,7 +7,6 @@ from pathlib import Path
 from threading import Condition, Thread
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -127,13 +126,9 @@ class Camera:
                     yield last + 1, None
                     return
                 last = max(last + 1, round((time.monotonic() - start) * self.fps))
-                yield last, _planes(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+                yield last, torch.from_numpy(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
         finally:
             self.capture.release()
-
-
-def _planes(image: np.ndarray) -> Tensor:
-    return torch.from_numpy(image).permute(2, 0, 1).contiguous()
 
 
 def _opened(source: str, fps: float | None) -> tuple[Any, float]:

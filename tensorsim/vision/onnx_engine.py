@@ -1,6 +1,7 @@
 """Networks of this package in ONNX Runtime, which joins convolutions with what follows them: twice as fast on a CPU.
 
-A network is exported once and kept in the user's cache, by its class, its weights and torch's version.
+A network is exported once and kept in the user's cache, by its class, its weights and torch's version. The pose network
+also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), in ranges that crops of rendered people have.
 """
 
 import hashlib
@@ -29,15 +30,17 @@ class OnnxEngine(nn.Module):
     Args:
         network: with static shapes but for N; it is put into evaluation mode.
         size: (H, W).
+        int8: in 8-bit integers: pictures are crops of people in [0, 1], and answers are those of the network to about
+            5 % of the largest.
 
     Raises:
         TensorsimError: no ONNX Runtime.
     """
 
-    def __init__(self, network: nn.Module, size: tuple[int, int]) -> None:
+    def __init__(self, network: nn.Module, size: tuple[int, int], int8: bool = False) -> None:
         super().__init__()
         # The exporter leaves a network in the mode that it says it is in, parts included.
-        self.network, self.size = network.eval(), size
+        self.network, self.size, self.int8 = network.eval(), size, int8
         self._session: Any = None
 
     def forward(self, images: Tensor) -> list[Tensor]:
@@ -45,7 +48,7 @@ class OnnxEngine(nn.Module):
         if images.device.type != "cpu" or images.dtype != torch.float32 or images.shape[0] == 0:
             return _flat(self.network(images))
         if self._session is None:
-            self._session = _session(self.network, self.size)
+            self._session = _session(self.network, self.size, self.int8)
         found = self._session.run(None, {"images": images.contiguous().numpy()})
         return [torch.from_numpy(output) for output in found]
 
@@ -56,11 +59,11 @@ class OnnxEngine(nn.Module):
 class OnnxPose(nn.Module):
     """A heat-map network of this package behind its own interface, run by an :class:`OnnxEngine`."""
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, int8: bool = False) -> None:
         super().__init__()
         self.input_size: tuple[int, int] = getattr(network, "input_size", (256, 192))
         self.stride = getattr(network, "stride", 4)
-        self.engine = OnnxEngine(network, self.input_size)
+        self.engine = OnnxEngine(network, self.input_size, int8)
 
     def forward(self, crops: Tensor) -> Tensor:
         """Crops (N, 3, H, W) to heat maps (N, 17, h, w)."""
@@ -94,14 +97,17 @@ class _Dense(nn.Module):
         return logits + distances
 
 
-def in_onnxruntime(detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.Module]:
-    """The same two stages with their networks in ONNX Runtime, as far as they are of this package."""
+def in_onnxruntime(detector: nn.Module, pose: nn.Module, int8: bool = False) -> tuple[nn.Module, nn.Module]:
+    """The same two stages with their networks in ONNX Runtime, as far as they are of this package.
+
+    With ``int8`` the pose network is in 8-bit integers. The detector is not: its boxes would move.
+    """
     if isinstance(detector, RTMDet):
         detector = OnnxDetector(detector).eval()
     if isinstance(pose, TopDownPose):
         holder = pose.network if isinstance(pose.network, FlipTest) else pose
         if not isinstance(holder.network, OnnxFile | OnnxPose):
-            holder.network = OnnxPose(holder.network).eval()
+            holder.network = OnnxPose(holder.network, int8).eval()
     return detector, pose
 
 
@@ -109,25 +115,30 @@ def _flat(outputs: Any) -> list[Tensor]:
     return [outputs] if isinstance(outputs, Tensor) else list(outputs)
 
 
-def _session(network: nn.Module, size: tuple[int, int]) -> Any:
+def _session(network: nn.Module, size: tuple[int, int], int8: bool) -> Any:
     """The session of a network, from the user's cache or exported now."""
-    path = _cached(network, size)
+    path = _cached(network, size, int8)
     if path.is_file():
         try:
             return _opened(path.read_bytes())
         except Exception:  # damaged; the runtime's own exceptions share no base class
             path.unlink(missing_ok=True)
     data = _exported(network, size)
+    if int8:
+        from tensorsim.render.crops import rendered_crops
+        from tensorsim.vision.quantise import quantised
+
+        data = quantised(data, rendered_crops(size))
     # A cache that cannot be written costs an export in every run.
     with suppress(OSError), complete_file(path) as scratch:
         scratch.write_bytes(data)
     return _opened(data)
 
 
-def _cached(network: nn.Module, size: tuple[int, int]) -> Path:
+def _cached(network: nn.Module, size: tuple[int, int], int8: bool) -> Path:
     from tensorsim.registry import cache_dir
 
-    digest = hashlib.sha256(f"{network!r} {size} {torch.__version__}".encode())
+    digest = hashlib.sha256(f"{network!r} {size} {int8} {torch.__version__}".encode())
     for name, value in network.state_dict().items():
         digest.update(name.encode())
         digest.update(value.cpu().contiguous().numpy().tobytes())

@@ -8,8 +8,10 @@ import torch
 
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
+from tensorsim.render.crops import rendered_crops
 from tensorsim.vision import onnx_engine
 from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose, in_onnxruntime
+from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 
@@ -78,3 +80,29 @@ def test_without_the_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
     with pytest.raises(TensorsimError, match="--engine onnxruntime: it cannot be imported"):
         onnx_engine._opened(b"")
+
+
+@torch.no_grad()
+def test_in_8_bits_key_points_stay_where_they_are(tmp_path: Path) -> None:
+    network = ts.vision.HRNet.from_pretrained()
+    # Other people than those whose ranges were taken.
+    crops = rendered_crops(network.input_size, people=2, seed=100)
+    plain, small = network(crops), OnnxPose(network, int8=True)(crops)
+    decode = HeatmapDecoder()
+    (expected, scores), (found, _) = decode(plain), decode(small)
+    away = (found - expected).norm(dim=-1)[scores > 0.3]
+    assert away.quantile(0.9) < 0.5
+    assert float((small - plain).abs().max()) > 1e-3  # it is another network
+    assert [path.stat().st_size < 5e6 for path in exported(tmp_path)] == [True]
+    OnnxPose(network)(crops[:1])
+    assert len(exported(tmp_path)) == 2
+
+
+def test_rendered_crops_show_people() -> None:
+    crops = rendered_crops((64, 48), people=2, poses=3)
+    assert crops.shape[1:] == (3, 64, 48)
+    assert 2 <= crops.shape[0] <= 6
+    assert crops.min() >= 0
+    assert crops.max() <= 1
+    assert torch.equal(crops, rendered_crops((64, 48), people=2, poses=3))
+    assert not torch.equal(crops[0], crops[-1])

@@ -5,6 +5,7 @@ centred and brought to unit scale, as the paper does; here with a weight per joi
 not count.
 """
 
+import copy
 import math
 
 import torch
@@ -140,11 +141,10 @@ class NearestPoseLifter(nn.Module):
 
     def tilted(self, pitch_rad: float, roll_rad: float = 0.0) -> "NearestPoseLifter":
         """The same for a camera of another tilt and roll."""
-        search = self.search
-        return NearestPoseLifter(
-            search.library, search.yaws, self.neighbours, self.search_joints, self.tolerance, self.temporal,
-            search.chunk, pitch_rad, roll_rad,
-        ).to(search.library.device)  # fmt: skip
+        other = copy.copy(self)
+        other._modules = {"search": self.search.tilted(pitch_rad)}
+        other.roll_rad = float(roll_rad)
+        return other
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
         """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""

@@ -154,6 +154,8 @@ class PoseSearch(nn.Module):
         chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair. Blocks of 8192
             poses are its least.
         pitch_rad: upward tilt of the camera; poses are compared, and given, in its axes right, forward, up.
+        blocks: order and starts of another search of the same poses, whose blocks are nearly as good for another
+            tilt; None sorts anew.
 
     Shape:
         key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, ``pose * yaws + heading``, best
@@ -169,7 +171,13 @@ class PoseSearch(nn.Module):
     coarse: Tensor
 
     def __init__(
-        self, library: Tensor, yaws: int, neighbours: int, chunk: int, pitch_rad: float = 0.0
+        self,
+        library: Tensor,
+        yaws: int,
+        neighbours: int,
+        chunk: int,
+        pitch_rad: float = 0.0,
+        blocks: tuple[Tensor, list[int]] | None = None,
     ) -> None:
         super().__init__()
         self.yaws, self.neighbours, self.chunk = yaws, neighbours, chunk
@@ -182,7 +190,7 @@ class PoseSearch(nn.Module):
             ]
         )
         self.block = max(BLOCK, 3 * neighbours)
-        order, self.starts = blocks_of_similar(seen, self.block)
+        order, self.starts = blocks_of_similar(seen, self.block) if blocks is None else blocks
         centres, radius, rounding = [], [], []
         coarse = torch.empty(len(seen), 32, dtype=torch.bfloat16)
         for start, stop in zip(self.starts[:-1], self.starts[1:], strict=True):
@@ -204,6 +212,13 @@ class PoseSearch(nn.Module):
         self.register_buffer("radius", torch.stack(radius), persistent=False)
         self.register_buffer("rounding", torch.stack(rounding), persistent=False)
         self.register_buffer("coarse", coarse, persistent=False)
+
+    @torch.jit.unused
+    def tilted(self, pitch_rad: float) -> "PoseSearch":
+        """The same for a camera of another tilt."""
+        blocks = self.order, self.starts
+        other = PoseSearch(self.library, self.yaws, self.neighbours, self.chunk, pitch_rad, blocks)
+        return other.to(self.library.device)
 
     def poses(self, index: Tensor) -> Tensor:
         """Poses (..., 14, 3) of indices (...)."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 ARRAY_FORMATS = ("npz", "mat", "h5")
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from tensorsim.array_files import array_formats, save_arrays
 from tensorsim.commands.options import FIELDS, RadarOptions
 from tensorsim.commands.panel import PANEL, PanelOptions
 from tensorsim.commands.simulate import Simulate
 from tensorsim.config import SimulationConfig
-from tensorsim.data.array_files import array_formats, save_arrays
 from tensorsim.errors import TensorsimError
 
 ARRAYS: dict[str, np.ndarray | float] = {

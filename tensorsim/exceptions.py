@@ -1,0 +1,38 @@
+"""Exceptions of tensorsim, without torch: the command line says what is wrong with its options before it loads that."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+class TensorsimError(ValueError):
+    """Input that tensorsim refuses; the message says what came and what was expected."""
+
+
+class TensorsimWarning(UserWarning):
+    """A result is returned, but it may not be what the caller expects."""
+
+
+def check_positive(value: float, name: str) -> None:
+    """Refuse a number that is not finite and above zero."""
+    if not (value > 0.0 and value < float("inf")):
+        raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """The messages of tensorsim's own warnings in the block, each once; other warnings pass through."""
+    messages: list[str] = []
+    show = warnings.showwarning
+
+    def collect(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if not issubclass(category, TensorsimWarning):
+            show(message, category, *rest, **more)
+        elif str(message) not in messages:
+            messages.append(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", TensorsimWarning)
+        warnings.showwarning = collect
+        yield messages

@@ -1,0 +1,43 @@
+"""The networks in ONNX Runtime give the people and the maps that they give in torch."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tensorsim import cli
+from tensorsim.commands.demo import FILM_FPS, film_person
+from tensorsim.data.video_writer import write_video
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("film") / "walk.mp4"
+    frames = film_person(7, 20, seed=3).film.frames
+    write_video(path, frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
+    return path
+
+
+def simulated(film: Path, out: Path, engine: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    options = ["--engine", engine, "--device", "cpu", "--classifier", "none", "--quiet"]
+    cli.main(["simulate", str(film), "--out", str(out), *options])
+    return dict(np.load(out / "pose.npz")), dict(np.load(out / "maps.npz"))
+
+
+def test_key_points_and_maps_of_the_engines_agree(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "home"))
+    expected, truth = simulated(film, tmp_path / "torch", "torch")
+    found, maps = simulated(film, tmp_path / "onnx", "onnxruntime")
+    assert expected["valid"].any()
+    seen = (expected["keypoint_scores"] > 0.3) & expected["valid"][..., None]
+    away = np.linalg.norm(found["keypoints_px"] - expected["keypoints_px"], axis=-1)[seen]
+    assert away.max() < 0.5
+    for name in ("range_time", "range_time_mti", "doppler_time"):
+        shown = truth[name] > 1e-2 * truth[name].max()  # 40 dB
+        assert np.abs(20 * np.log10(maps[name][shown] / truth[name][shown])).max() < 0.1
+
+    small, _ = simulated(film, tmp_path / "int8", "int8")
+    away = np.linalg.norm(small["keypoints_px"] - expected["keypoints_px"], axis=-1)[seen]
+    assert 0 < np.median(away) < 0.5
