@@ -216,16 +216,16 @@ def read(folder: Path) -> tuple[Tensor, Tensor]:
 
 
 def pictures(masks: Tensor) -> Tensor:
-    """Masks (N, 128, 256) to pictures (N, 1, 40, 64) of +-156 Hz, without the filter's start in the first columns."""
+    """Masks (N, 128, 256) to pictures (N, 1, 80, 64) of +-156 Hz, without the filter's start in the first columns."""
     shown = masks[:, 24:104].float()
     shown[..., :4] = 0.0
-    return F.avg_pool2d(shown.unsqueeze(1), (2, 4))
+    return F.avg_pool2d(shown.unsqueeze(1), (1, 4))
 
 
 def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
     """Pictures moved in time, thickened, thinned, and with cells missing."""
     shown = shift(shown, 14, -1, generator)
-    shown = shift(shown, 1, -2, generator)
+    shown = shift(shown, 2, -2, generator)
     return drop_cells(thicken(shown, generator), 0.03, generator)
 
 
