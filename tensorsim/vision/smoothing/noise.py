@@ -97,12 +97,17 @@ def keypoint_noise(scores: Tensor, height_px: Tensor, height_m: float = 1.75) ->
 
 
 def noise_with_depth(
-    noise: Tensor, deviation: Tensor, joints: Tensor, camera_m: Tensor, height_m: float = 1.75
+    noise: Tensor,
+    deviation: Tensor,
+    joints: Tensor,
+    camera_m: Tensor,
+    height_m: float = 1.75,
+    share: float = DEPTH_NOISE,
 ) -> Tensor:
     """Standard deviation of joints along world axes whose depth is less certain than their place in the picture.
 
     Errors of depth move a joint along its line of sight. They are alike in neighbouring frames, which no filter
-    removes, so that only :data:`DEPTH_NOISE` of the spread counts as noise. Only the diagonal of the covariance is
+    removes, so that only a ``share`` of the spread counts as noise. Only the diagonal of the covariance is
     kept, as the smoother takes coordinates for independent.
 
     Args:
@@ -111,9 +116,10 @@ def noise_with_depth(
         joints: (..., J, 3) metres.
         camera_m: (3,) position of the camera.
         height_m: of the body.
+        share: of the spread of depths that changes from frame to frame.
 
     Returns:
         (..., J, 3) metres.
     """
     sight = F.normalize(joints.detach() - camera_m, dim=-1)
-    return (noise.square() + (DEPTH_NOISE * height_m * deviation.unsqueeze(-1) * sight).square()).sqrt()
+    return (noise.square() + (share * height_m * deviation.unsqueeze(-1) * sight).square()).sqrt()
