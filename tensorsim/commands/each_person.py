@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tensorsim.data.array_files import array_formats
+from tensorsim.array_files import array_formats
 
 if TYPE_CHECKING:
     from tensorsim.commands.options import RadarOptions, Run
