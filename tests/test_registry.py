@@ -187,7 +187,7 @@ SHOWN = {
     "DnCNN": (2, 24, 40),
     "SPNet": (2, 1, 64, 64),
     "SPGNet": (2, 1, 32, 32),
-    "measured-glasgow": (2, 1, 40, 64),
+    "measured-glasgow": (2, 1, 80, 64),
     "measured-kmkim": (2, 1, 64, 15),
     "measured-radhar": (2, 1, 16, 60),
 }
