@@ -103,10 +103,11 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
         for band in (4.0, 0.6)
     )
     error = level * (0.006 * quick + 0.009 * slow)
-    # Somebody whose trunk is not upright is found badly.
+    # Somebody whose trunk is not upright is found badly, half of those who lie not at all: points anywhere on them.
     trunk = (joints[:, 1] - (joints[:, 8] + joints[:, 11]) / 2)[:, 2] / (0.3 * height_m)
     tilted = (1.0 - trunk).clamp(0.0, 1.0)
-    error = error * (1 + 2.0 * tilted)[:, None, None]
+    worse = 2.0 + 10.0 * tilted * (draw(0.0, 1.0) < 0.5)[0]
+    error = error * (1 + worse * tilted)[:, None, None]
     each = Draw(17, draw.generator)
     # A point that is lost is taken for something else nearby, and its score is low for a part of that time.
     wild = _spell(frames, 0.12, 0.03, 0.3, each).T
@@ -135,7 +136,7 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
 
 
 def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: Draw) -> Tensor:
-    """In which frames (T,) somebody is followed: most who lie down are lost, some come late or leave early."""
+    """In which frames (T,) somebody is followed: many who lie down are lost, some come late or leave early."""
     frames = len(found)
     time = torch.arange(frames)
     seen = (scores >= 0.3).sum(-1) >= 4
@@ -147,13 +148,13 @@ def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: D
     lying = tilted > 0.7
     if bool(lying.any()):
         chance = float(draw(0.0, 1.0))
-        if chance < 0.5:  # lost for good some time after
+        if chance < 0.3:  # lost for good some time after
             lost = int(torch.nonzero(lying)[0]) + float(draw(0.0, 1.2)) * fps
             if bool(lying[-1]):
                 followed &= time < lost
             else:  # found again when up
                 followed &= (time < lost) | (time > int(torch.nonzero(lying)[-1]))
-        elif chance < 0.65:
+        elif chance < 0.4:
             followed &= ~lying
     return followed
 
