@@ -40,6 +40,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
         runs: where simulations run.
         longest_s: longest film in seconds.
     """
+    # Long, for it declares the page from top to bottom, in the order in which it is read.
     made = controls()
     with gr.Blocks(title="tensorsim", analytics_enabled=False, delete_cache=(600, 3600)) as page:
         gr.Markdown("# tensorsim\nWhat a radar would have seen of the people in a film.")

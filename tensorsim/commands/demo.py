@@ -45,6 +45,7 @@ class Demo(NetworkOptions, RadarOptions):
 
     def run(self) -> None:
         """Do it."""
+        # Long, for it is the list of the steps; each is a call.
         from tensorsim.motion.activities import activity_index
 
         self.check(self.out)

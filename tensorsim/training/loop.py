@@ -198,6 +198,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
         TensorsimError: the checkpoint is damaged or belongs to another run, a loss that is not finite, TensorBoard
             missing.
     """
+    # Long, for nearly every line needs the state of the run.
     rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     device = _joined(config, processes)
     recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
