@@ -20,7 +20,7 @@ ARRAYS: dict[str, np.ndarray | float] = {
     "valid": np.array([[True, False]]),
     "fps": 29.97,
 }
-PAGE = Path(__file__).resolve().parents[2] / "notebooks" / "matlab.md"
+PAGE = Path(__file__).resolve().parents[1] / "notebooks" / "matlab.md"
 
 
 def test_every_format_holds_the_same(tmp_path: Path) -> None:

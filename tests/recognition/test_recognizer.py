@@ -125,7 +125,7 @@ def test_the_shipped_network_is_the_small_one() -> None:
     assert recognise.doppler_picture.size == 32
     named = ActivityRecognizer.from_pretrained(RADAR, "spnet-activities")
     assert isinstance(named.network, SPNet)
-    assert named.doppler_picture.size == 112
+    assert named.doppler_picture.size == 64
 
 
 def test_own_classifiers_are_saved_with_their_class_names(tmp_path: Path) -> None:
