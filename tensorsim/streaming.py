@@ -38,17 +38,6 @@ class Found(NamedTuple):
     background_px_s: float | None = None
 
 
-def pose_of_film(
-    stage: VideoToPose,
-    reader: VideoReader,
-    device: torch.device,
-    quiet: bool = False,
-    calibrate: bool = False,
-) -> Pose:
-    """The Pose that :func:`people_of_film` finds."""
-    return people_of_film(stage, reader, device, quiet, calibrate).pose
-
-
 def people_of_film(
     stage: VideoToPose,
     reader: VideoReader,

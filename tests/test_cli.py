@@ -71,7 +71,7 @@ def test_streaming_equals_the_graph(walk: Path) -> None:
     stage = VideoToPose(RectangleDetector(), StandingPose(), frames_per_batch=3)
     whole = torch.cat(list(reader.chunks(100)))
     with torch.no_grad():
-        streamed = streaming.pose_of_film(stage, reader, torch.device("cpu"), quiet=True)
+        streamed = streaming.people_of_film(stage, reader, torch.device("cpu"), quiet=True).pose
         assert_same(streamed, stage(whole.unsqueeze(0), reader.fps), atol=1e-5)
         smoother = ts.motion.SavitzkyGolay(33, 3)
         for options in (

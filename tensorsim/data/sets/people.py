@@ -126,10 +126,10 @@ class PeopleFinder:
 
     def _found(self, file: Path) -> Motion:
         from tensorsim.data.video import VideoReader
-        from tensorsim.streaming import pose_of_film
+        from tensorsim.streaming import people_of_film
 
         with one_thread():  # for the same bits everywhere
-            pose = pose_of_film(self.networks, VideoReader(file), torch.device("cpu"), quiet=True)
+            pose = people_of_film(self.networks, VideoReader(file), torch.device("cpu"), quiet=True).pose
         return Motion(pose.joints[0], pose.valid[0], VideoReader(file).fps)
 
     @cached_property

@@ -74,9 +74,9 @@ BOXES = torch.tensor(
 )
 
 
-class TestRtmPose(StageTester):
-    batch_shapes = ((2,),)
-    batched_arguments = (0, 1, 2)
+class OnnxTester(StageTester):
+    """Of stages that read an ONNX file."""
+
     gradient_arguments = ()  # ONNX Runtime has none
     scripts = False  # an edge
     exports = False
@@ -84,6 +84,11 @@ class TestRtmPose(StageTester):
     @pytest.fixture(autouse=True)
     def _file(self, tmp_path: Path) -> None:
         self.path = write_network(tmp_path / "rtmpose.onnx")
+
+
+class TestRtmPose(OnnxTester):
+    batch_shapes = ((2,),)
+    batched_arguments = (0, 1, 2)
 
     def make(self) -> nn.Module:
         return RtmPose(self.path, flip_test=True)
@@ -106,15 +111,8 @@ class TestRtmPose(StageTester):
         ]
 
 
-class TestOnnxSimcc(StageTester):
+class TestOnnxSimcc(OnnxTester):
     batch_shapes = ((3,),)
-    gradient_arguments = ()  # ONNX Runtime has none
-    scripts = False  # an edge
-    exports = False
-
-    @pytest.fixture(autouse=True)
-    def _file(self, tmp_path: Path) -> None:
-        self.path = write_network(tmp_path / "rtmpose.onnx")
 
     def make(self) -> nn.Module:
         return OnnxSimcc(self.path, flip_test=True)
