@@ -281,7 +281,7 @@ class PoseSearch(nn.Module):
             fresh = (guess[found] != candidate[:, None]).all(dim=-1)
             new_frames.append(found[fresh])
             new_poses.append(candidate[fresh])
-            waiting += int(fresh.sum())
+            waiting += new_frames[-1].shape[0]
             if waiting > 4096 or i == len(blocks) - 1:
                 joined, candidates = torch.cat(new_frames), torch.cat(new_poses)
                 for at in range(0, waiting, 16384):

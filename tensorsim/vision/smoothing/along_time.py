@@ -22,10 +22,8 @@ def nearest_valid(valid: Tensor) -> Tensor:
     """
     frames = valid.shape[-1]
     time = torch.arange(frames, device=valid.device).expand(valid.shape)
-    before = torch.where(valid, time, torch.full_like(time, -frames))
-    before = running_max(before)
-    after = torch.where(valid, time, torch.full_like(time, 2 * frames))
-    after = -running_max(-after.flip(-1)).flip(-1)
+    before = running_max(torch.where(valid, time, torch.full_like(time, -frames)))
+    after = -running_max(-torch.where(valid, time, torch.full_like(time, 2 * frames)).flip(-1)).flip(-1)
     nearest = torch.where(time - before <= after - time, before, after)
     return torch.where(valid.any(dim=-1, keepdim=True), nearest, time)
 
