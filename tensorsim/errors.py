@@ -156,7 +156,9 @@ def check_finite(x: Tensor, name: str) -> None:
     if is_exporting():
         return
     # One pass over the values; only sums that are not finite, which large finite values have too, need a look at each.
-    if not bool(torch.isfinite(x.detach().sum())) and not bool(torch.isfinite(x).all()):
+    # A finite sum less itself is zero; isfinite takes several passes over a complex number.
+    total = x.detach().sum()
+    if not bool(total - total == 0) and not bool(torch.isfinite(x).all()):
         raise TensorsimError(f"{name}: got NaN or infinite values, expected finite numbers")
 
 

@@ -86,7 +86,7 @@ class Augmentation:
     shift: float = 0.04
     edge: float = 0.04
     upright: float = 0.4
-    lay: float = 0.06
+    lay: float = 0.12
     half: float = 0.25
     cut: float = 0.25
 

@@ -213,7 +213,8 @@ class DopplerTimeMap(DopplerFrames):
         clips = max(1, self.block_size // (columns * self.bins)) if columns == count else 1
         step = max(1, self.block_size // (min(clips, batch) * columns * self.bins))
         # With autograd the blocks are joined at the end; without, each is written to its place while in the cache.
-        joined = series.requires_grad
+        # A single block is the map itself.
+        joined = series.requires_grad or (columns == count and clips >= batch)
         rows: list[Tensor] = []
         doppler_time = torch.real(series).new_empty([0 if joined else batch * count, self.bins])
         for clip in range(0, batch, clips):
@@ -230,7 +231,7 @@ class DopplerTimeMap(DopplerFrames):
                     place = clip * count + first
                     doppler_time[place : place + row.shape[0]] = row
         if joined:
-            doppler_time = torch.cat(rows)
+            doppler_time = rows[0] if len(rows) == 1 else torch.cat(rows)
         return unflatten_batch(
             doppler_time.unflatten(0, [batch, count]).transpose(1, 2), list(profiles.shape[:-2])
         )
