@@ -1,75 +1,80 @@
-"""``python -m tests.mutation [--count 300] [--seed 0] [FILE ...]``: which slips do the nearest tests not notice?"""
+"""Which slips do the nearest tests not notice? Prints them, and the share that is noticed.
+
+``python -m tests.mutation --count 300`` takes the same slips at every call with the same ``--seed`` and goes on
+where the results file ends, until ``--minutes`` have passed. ``--again`` tries once more those that were not
+noticed. A file alone, ``FILE`` or ``FILE:LINE``, takes only the slips of that file or line.
+"""
 
 import argparse
-import os
-import random
-import shutil
-import subprocess
+import hashlib
+import json
 import sys
-import tempfile
+import time
 from pathlib import Path
 
+from tqdm import tqdm
+
+from tests.mutation.equivalent import explained
+from tests.mutation.nearest import ROOT
+from tests.mutation.runner import Runner
 from tests.mutation.slips import Slip, slips
 
-ROOT = Path(__file__).resolve().parents[2]
 #: Where the mathematics is.
 ROOMS = ("body", "geometry", "motion", "radar", "enhance", "recognition", "vision")
-#: No test of one stage takes longer, unless a slip has made it endless.
-SECONDS = 300
 
 
-def nearest_tests(file: Path) -> list[Path]:
-    """The test file of the same name, else those of its room that import the module."""
-    part = file.relative_to(ROOT / "tensorsim")
-    own = ROOT / "tests" / part.with_name(f"test_{part.name}")
-    if own.is_file():
-        return [own]
-    module = ".".join(("tensorsim", *part.with_suffix("").parts))
-    room = sorted((ROOT / "tests" / part.parts[0]).rglob("test_*.py"))
-    importing = [test for test in room if module in test.read_text(encoding="utf-8")]
-    return importing or sorted((ROOT / "tests" / part.parent).glob("test_*.py"))
+def sampled(places: list[str], count: int, seed: int) -> dict[str, tuple[Path, Slip]]:
+    """``count`` slips by name, those whose hashes with the seed are smallest: an edited line moves no others."""
+    rooms = [str(file) for room in ROOMS for file in sorted((ROOT / "tensorsim" / room).rglob("*.py"))]
+    every = {}
+    for place in places or rooms:
+        name, _, line = place.partition(":")
+        file = (ROOT / name).resolve()
+        if file.name == "__init__.py":
+            continue
+        for slip in slips(file.read_text(encoding="utf-8")):
+            if not line or slip.line == int(line):
+                every.setdefault(f"{file.relative_to(ROOT)}: {slip.after}", (file, slip))
+    chosen = sorted(every, key=lambda name: hashlib.sha256(f"{seed} {name}".encode()).digest())
+    return {name: every[name] for name in chosen[:count]}
 
 
-def notices(file: Path, slip: Slip, tests: list[Path]) -> bool:
-    """Whether the tests fail on a copy of the package that has the slip."""
-    with tempfile.TemporaryDirectory() as folder:
-        copied = Path(folder)
-        for name in ("tensorsim", "tests"):
-            shutil.copytree(ROOT / name, copied / name, ignore=shutil.ignore_patterns("__pycache__"))
-        (copied / "models").symlink_to(ROOT / "models")
-        shutil.copy(ROOT / "pyproject.toml", copied)
-        (copied / file.relative_to(ROOT)).write_text(slip.source, encoding="utf-8")
-        names = [str(test.relative_to(ROOT)) for test in tests]
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *names]
-        environment = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
-        try:
-            done = subprocess.run(
-                command, cwd=folder, env=environment, capture_output=True, timeout=SECONDS, check=False
-            )
-        except subprocess.TimeoutExpired:
-            return True
-        return done.returncode != 0
+def parsed() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
+    parser.add_argument("places", nargs="*", metavar="FILE[:LINE]")
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=float("inf"))
+    parser.add_argument("--results", type=Path, default=Path("out/mutation.json"))
+    parser.add_argument("--again", action="store_true", help="try once more what was not noticed")
+    return parser.parse_args()
 
 
 def main() -> None:
     """Sample slips, run the nearest tests on each, print those that pass unnoticed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("files", nargs="*", type=Path)
-    parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    rooms = [file for room in ROOMS for file in sorted((ROOT / "tensorsim" / room).rglob("*.py"))]
-    files = [file.resolve() for file in options.files or rooms if file.name != "__init__.py"]
-    every = [(file, slip) for file in files for slip in slips(file.read_text(encoding="utf-8"))]
-    sample = random.Random(options.seed).sample(every, min(options.count, len(every)))
-    survivors = 0
-    for number, (file, slip) in enumerate(sample, 1):
-        if not notices(file, slip, nearest_tests(file)):
-            survivors += 1
-            print(f"survives: {file.relative_to(ROOT)}:{slip.line}: {slip.what}", flush=True)
-        print(f"{number} of {len(sample)}, {number - survivors} noticed", file=sys.stderr, flush=True)
+    options, begin = parsed(), time.monotonic()
+    sample = sampled(options.places, options.count, options.seed)
+    results = json.loads(options.results.read_text()) if options.results.is_file() else {}
+    options.results.parent.mkdir(parents=True, exist_ok=True)
+    left = [n for n in sample if n not in results or (options.again and results[n] == "survives")]
+    with Runner() as runner:
+        for name in tqdm(left, unit="slip", file=sys.stderr, mininterval=5):
+            if time.monotonic() - begin > 60 * options.minutes:
+                break
+            results[name] = runner.outcome(*sample[name])
+            options.results.write_text(json.dumps(results, indent=1))
+
+    reasons, done = explained(), [name for name in sample if name in results]
+    survivors = [name for name in done if results[name] == "survives"]
+    for name in survivors:
+        file, slip = sample[name]
+        state = "explained" if name in reasons else "survives"
+        print(f"{state}: {file.relative_to(ROOT)}:{slip.line}\n  - {slip.before}\n  + {slip.after}")
+    known = sum(name in reasons for name in survivors)
     print(
-        f"{len(sample) - survivors} of {len(sample)} slips noticed ({100 * (1 - survivors / len(sample)):.0f} %)"
+        f"{len(done) - len(survivors)} of {len(done)} slips noticed, {known} explained, "
+        f"{len(survivors) - known} not; {len(sample) - len(done)} not tried yet"
     )
 
 

@@ -1,4 +1,4 @@
-"""Slips of one operator, constant, sign, axis, comparison or order of arguments in a source text."""
+"""Slips of one operator, constant, sign, axis, comparison, call or order of two in a source text."""
 
 import ast
 import copy
@@ -22,54 +22,70 @@ _OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.BitAnd: ast.BitOr,
     ast.BitOr: ast.BitAnd,
 }
-_PAIRS = (("sin", "cos"), ("min", "max"), ("amin", "amax"), ("mean", "sum"))
+_PAIRS = (("sin", "cos"), ("min", "max"), ("amin", "amax"), ("argmin", "argmax"), ("mean", "sum"))
 _NAMES = {**dict(_PAIRS), **{b: a for a, b in _PAIRS}}
+#: Operands that need no parentheses when the sign before them goes.
+_ATOMS = (ast.Constant, ast.Name, ast.Call, ast.Attribute, ast.Subscript)
 
 
 class Slip(NamedTuple):
-    """A changed source text."""
+    """A changed source text, the number of the first line that it changes, and that line before and after."""
 
     line: int
-    what: str
+    before: str
+    after: str
     source: str
 
 
 def slips(source: str) -> list[Slip]:
-    """Every slip of a source text, one at a time; messages, docstrings and annotations are left alone."""
-    found = []
-    for index in range(len(list(_changes(ast.parse(source))))):
-        tree = ast.parse(source)
-        node, change, what = list(_changes(tree))[index]
-        line = getattr(node, "lineno", 0)
-        change(node)
-        found.append(Slip(line, what, ast.unparse(tree)))
-    return found
+    """Every slip of a source text, one at a time; messages, docstrings and annotations are left alone.
+
+    Only the text of the changed expression is written anew: comments, and so comments on types, stay.
+    """
+    data = source.encode()
+    starts = [0]
+    for line in data.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    found = {}
+    for node, text in _changes(ast.parse(source)):
+        begin = starts[node.lineno - 1] + node.col_offset
+        end = starts[node.end_lineno - 1] + node.end_col_offset
+        changed = (data[:begin] + text.encode() + data[end:]).decode()
+        before, after = (whole.splitlines()[node.lineno - 1].strip() for whole in (source, changed))
+        found.setdefault((node.lineno, after), Slip(node.lineno, before, after, changed))
+    return list(found.values())
 
 
-def _changes(tree: ast.AST) -> Iterator[tuple[ast.AST, Callable[[ast.AST], None], str]]:
-    """Nodes in order, with what changes each in place and its description."""
+def _changes(tree: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
+    """Nodes in order, each with the text that takes its place."""
+
+    def changed(node: ast.AST, change: Callable[[ast.AST], None]) -> tuple[ast.AST, str]:
+        other = copy.deepcopy(node)
+        change(other)
+        return node, ast.unparse(other)
+
     for node in _computing(tree):
         if isinstance(node, ast.BinOp | ast.AugAssign | ast.BoolOp) and type(node.op) in _OPERATORS:
-            new = _OPERATORS[type(node.op)]
-            yield (
-                node,
-                lambda n, new=new: setattr(n, "op", new()),
-                f"{type(node.op).__name__} to {new.__name__}",
-            )
+            yield changed(node, lambda n: setattr(n, "op", _OPERATORS[type(n.op)]()))
         elif isinstance(node, ast.Compare) and type(node.ops[0]) in _OPERATORS:
-            old, new = type(node.ops[0]), _OPERATORS[type(node.ops[0])]
-            yield node, lambda n, new=new: n.ops.__setitem__(0, new()), f"{old.__name__} to {new.__name__}"
-        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            yield node, lambda n: setattr(n, "op", ast.UAdd()), "minus dropped"
-        elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            new_value = node.value + 1 if isinstance(node.value, int) else node.value * 1.25 + 1e-3
-            yield node, lambda n, v=new_value: setattr(n, "value", v), f"{node.value} to {new_value}"
+            yield changed(node, lambda n: n.ops.__setitem__(0, _OPERATORS[type(n.ops[0])]()))
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+            text = ast.unparse(node.operand)
+            yield node, text if isinstance(node.operand, _ATOMS) else f"({text})"
         elif isinstance(node, ast.Constant) and type(node.value) is bool:
-            yield node, lambda n: setattr(n, "value", not n.value), f"{node.value} to {not node.value}"
+            yield node, str(not node.value)
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            yield node, repr(node.value + 1 if isinstance(node.value, int) else node.value * 1.25 + 1e-3)
         elif isinstance(node, ast.Attribute) and node.attr in _NAMES:
-            yield node, lambda n: setattr(n, "attr", _NAMES[n.attr]), f"{node.attr} to {_NAMES[node.attr]}"
+            yield changed(node, lambda n: setattr(n, "attr", _NAMES[n.attr]))
         elif isinstance(node, ast.List) and len(node.elts) == 2 and isinstance(node.ctx, ast.Load):
-            yield node, lambda n: n.elts.reverse(), "order of two"
+            yield changed(node, lambda n: n.elts.reverse())
+        elif (
+            isinstance(node, ast.Expr)
+            and isinstance(node.value, ast.Call)
+            and "super()" not in ast.unparse(node)
+        ):
+            yield node, "pass"
 
 
 def _computing(tree: ast.AST) -> Iterator[ast.AST]:
@@ -81,7 +97,8 @@ def _computing(tree: ast.AST) -> Iterator[ast.AST]:
             if isinstance(child, ast.AnnAssign) and child.value is not None:
                 yield from _computing(ast.Expr(child.value))
             continue
-        if isinstance(child, ast.Call) and ast.unparse(child.func).split(".")[-1].startswith("check_"):
+        call = child.value if isinstance(child, ast.Expr) else child
+        if isinstance(call, ast.Call) and ast.unparse(call.func).split(".")[-1].startswith("check_"):
             continue
         if isinstance(child, ast.arg):
             continue
