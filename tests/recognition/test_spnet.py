@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tensorsim.errors import TensorsimError
-from tensorsim.recognition.spgnet import SPGNet
+from tensorsim.recognition.spgnet import SPGNet, TwoLevelLayer
 from tensorsim.recognition.spnet import ParallelBlock, SameConv, SPNet
 from tests.networks import settled
 from tests.stage import StageTester, assert_same
@@ -180,3 +180,70 @@ def test_weights_survive_a_file(kind: Any, tmp_path: Path) -> None:
 def test_refuses_bad_settings(network: Any, message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
         network()
+
+
+@pytest.mark.parametrize("kind", [SPNet, SPGNet])
+def test_the_mean_of_each_channel_is_subtracted(kind: type[nn.Module]) -> None:
+    network = make(kind, num_classes=3, in_channels=2)
+    x, mean = torch.rand(2, 2, 32, 32), torch.tensor([0.1, 0.7])
+    with torch.no_grad():
+        network.get_buffer("mean").zero_()
+        expected = network(x - mean[:, None, None])
+        network.get_buffer("mean").copy_(mean)
+        assert_same(network(x), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_layer_of_two_levels_written_out(stride: int) -> None:
+    """First the channels of the first level, then those of the second; ReLU after the sum, none before it."""
+    torch.manual_seed(0)
+    layer = settled(TwoLevelLayer(4, 8, stride, 2)).double()
+    x = torch.randn(2, 4, 6, 6, dtype=torch.float64)
+
+    def norm(module: Any, y: Tensor) -> Tensor:
+        scale = module.weight / (module.running_var + module.eps).sqrt()
+        return (y - module.running_mean[:, None, None]) * scale[:, None, None] + module.bias[:, None, None]
+
+    def conv(module: Any, y: Tensor, stride: int, padding: int, groups: int = 1) -> Tensor:
+        return norm(module[1], F.conv2d(y, module[0].weight, None, stride, padding, 1, groups))
+
+    o1 = conv(layer.first, conv(layer.enter, x, 1, 0).relu(), stride, 1, 2).relu()
+    o2 = conv(layer.second, o1, 1, 1, 2).relu()
+    fused = conv(layer.fuse, torch.cat([o1, o2], dim=1), 1, 0)
+    skip: Any = layer.skip
+    beside = conv(skip, x, 1, 0) if stride == 1 else conv(skip[1], conv(skip[0], x, 2, 1, 4), 1, 0)
+    with torch.no_grad():
+        assert_same(layer(x), (beside + fused).relu(), atol=1e-12)
+
+
+def test_the_heads_written_out() -> None:
+    """From the last convolution on: mean over the picture, then linear layers with ReLU between them."""
+    x = torch.rand(2, 1, 64, 48)
+    with torch.no_grad():
+        small = make(SPGNet)
+        features = small.body(x - 0.3).mean(dim=(2, 3)) @ small.fc1.weight.T
+        scale = small.norm.weight / (small.norm.running_var + small.norm.eps).sqrt()
+        features = ((features - small.norm.running_mean) * scale + small.norm.bias).relu()
+        assert_same(small(x), features @ small.fc2.weight.T, atol=1e-5)
+        large = make(SPNet)
+        y = large.conv2(large.conv1(x - 0.3).relu())
+        y = large.conv6(large.block3(large.block2(large.block1(y))).relu()).relu().mean(dim=(2, 3))
+        y = (y @ large.fc1.weight.T + large.fc1.bias).relu() @ large.fc2.weight.T + large.fc2.bias
+        assert_same(large(x), y, atol=1e-5)
+
+
+def test_layers_of_the_small_sibling() -> None:
+    """Channels and sizes of a 32x32 image through 4, 8 and 3 layers of 16, 32 and 64 times the groups."""
+    network, shapes = SPGNet(version="s2p6").eval(), []
+    for layer in network.body:
+        layer.register_forward_hook(lambda _m, _i, output: shapes.append(tuple(output.shape[1:3])))
+    with torch.no_grad():
+        network(torch.rand(1, 32, 32))
+    layers = [(96, 16)] * 4 + [(192, 8)] * 8 + [(384, 4)] * 3
+    assert shapes == [(12, 32), (24, 32), *layers, (1024, 4)]
+    torch.manual_seed(0)
+    network = SPGNet()
+    assert float(network.fc1.weight.detach().std()) == pytest.approx(0.01, rel=0.01)
+    last: Any = network.body[-1]
+    assert float(last[0].weight.detach().std()) == pytest.approx((2 / 1024) ** 0.5, rel=0.01), "fan out, 1x1"
+    assert network.dropout.p == 0.2

@@ -176,3 +176,36 @@ def test_people_cost_even_where_absence_is_not_known() -> None:
     touched = sum(int((level.grad != 0).sum()) for level in logits if level.grad is not None)
     assert 1 <= touched <= 13
     assert float(losses["box"]) > 0
+
+
+@pytest.mark.parametrize("count", [3, 1])
+def test_losses_are_sums_over_cells_by_the_sum_of_qualities(count: int) -> None:
+    """Both by the sum of qualities, at least 1, and the box loss counts twice: in NumPy, cell by cell."""
+    logits, boxes, points, strides, objects = scene(3, count)
+    if count == 1:  # hardly an overlap: the sum of qualities is below 1
+        boxes = torch.cat([points - 1.0, points + 1.0], dim=1)
+    sides = [(96 // s) ** 2 for s in STRIDES]
+    levels = [
+        part.reshape(1, 1, 96 // s, 96 // s)
+        for part, s in zip(logits.float().split(sides), STRIDES, strict=True)
+    ]
+    known = torch.ones(1, 4, 4, dtype=torch.bool)
+    valid = torch.ones(1, count, dtype=torch.bool)
+    found = detection_losses(levels, boxes.float()[None], STRIDES, objects.float()[None], valid, known)
+
+    target, quality = reference(*(x.numpy() for x in (logits, boxes, points, strides, objects)))
+    total = max(float(quality.sum()), 1.0)
+    assert (quality.sum() < 1.0) == (count == 1)
+    score = 1 / (1 + np.exp(-logits.numpy()))
+    entropy = -(quality * np.log(score) + (1 - quality) * np.log(1 - score))
+    classification = float(((quality - score) ** 2 * entropy).sum()) / total
+    box = 0.0
+    for cell in np.flatnonzero(target >= 0):
+        a, b = boxes[cell].numpy(), objects[target[cell]].numpy()
+        around = float(np.prod(np.maximum(a[2:], b[2:]) - np.minimum(a[:2], b[:2])))
+        areas = float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]))
+        union = areas / (1 + iou(a, b))
+        box += quality[cell] * (1 - iou(a, b) + (around - union) / around) / total
+    assert float(found["classification"]) == pytest.approx(classification, rel=1e-4)
+    assert float(found["box"]) == pytest.approx(box, rel=1e-4)
+    assert float(found["loss"]) == pytest.approx(classification + 2 * box, rel=1e-4)

@@ -165,3 +165,42 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
 def test_bad_settings_are_refused(tmp_path: Path, options: dict[str, Any], message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
         config(tmp_path, **options)
+
+
+def test_the_average_of_weights_begins_short(tmp_path: Path) -> None:
+    """A weight that falls by 0.1 a step: its mean keeps min(decay, (1 + n) / (10 + n)) of itself at update n."""
+
+    class Falling(Line):
+        def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+            return {"loss": net(batch["x"]).mean() * 0 + net[3].bias.sum()}
+
+        def optimiser(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.net.parameters(), lr=0.1)
+
+        def rate(self, step: int, steps: int) -> float:
+            return 1.0
+
+    first = float(Falling().net[3].bias.detach())
+    fit(Falling(), config(tmp_path, steps=12, ema_decay=0.5))
+    mean = first - 0.1
+    for count in range(1, 12):
+        kept = min(0.5, (1 + count) / (10 + count))
+        mean = kept * mean + (1 - kept) * (first - 0.1 * (count + 1))
+    assert float(weights(tmp_path)["module.3.bias"]) == pytest.approx(mean, abs=1e-6)
+
+
+def test_nets_learn_in_training_mode_and_are_judged_in_evaluation(tmp_path: Path) -> None:
+    modes: dict[str, set[bool]] = {"loss": set(), "validate": set()}
+
+    class Watched(Line):
+        def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+            modes["loss"].add(net.training)
+            return super().loss(net, batch)
+
+        def validate(self, net: nn.Module) -> dict[str, float]:
+            modes["validate"].add(net.training)
+            assert not torch.is_grad_enabled()
+            return super().validate(net)
+
+    fit(Watched(), config(tmp_path))
+    assert modes == {"loss": {True}, "validate": {False}}

@@ -1,5 +1,6 @@
 """The tracker on films of boxes whose truth is known, and on detections of real clips."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -349,6 +350,53 @@ def test_smoothed_boxes_are_nearer_the_truth_than_the_detections() -> None:
 def test_refuses_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
         GNNTracker(**settings)
+
+
+@pytest.mark.parametrize("hits", [1, 2, 9])
+@pytest.mark.parametrize("lost", [0, 3])
+def test_the_gate_is_that_of_a_kalman_filter_in_numpy(hits: int, lost: int) -> None:
+    """A detection is the person's up to d^2 = 150 of the innovation, whose variance is that of 2 x 2 matrices."""
+    q, r, f = 2e-3, 5e-4, np.array([[1.0, 1.0], [0.0, 1.0]])
+    noise = q * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])  # white acceleration, a step of one frame
+    state, covariance = np.array([300.0, 0.0]), np.diag([r, 0.04**2])
+    for t in range(1, hits + lost):
+        state, covariance = f @ state, f @ covariance @ f.T + noise
+        if t < hits:
+            gain = covariance[:, 0] / (covariance[0, 0] + r)
+            state = state + gain * (300.0 + 6 * t - state[0])
+            covariance = covariance - np.outer(gain, covariance[0])
+    state, covariance = f @ state, f @ covariance @ f.T + noise
+    reach = 400.0 * math.sqrt(20.0 * (covariance[0, 0] + r))  # the box is 400 px high
+    settings: dict[str, Any] = {
+        "process_noise": q, "measurement_noise": r, "initial_speed": 0.04, "assignment_threshold": 20.0,
+        "confirm_hits": 1, "min_hits": 1, "weak_iou": 1.0, "reach": 9.0,
+    }  # fmt: skip
+    frames = hits + lost + 1
+    for share, people in ((0.99, 1), (1.01, 2)):
+        u = torch.arange(frames, dtype=torch.float64) * 6 + 300.0
+        u[-1] = state[0] + share * reach
+        boxes = center_to_xyxy(torch.stack([u, 0 * u + 300, 0 * u + 20.0, 0 * u + 400.0], dim=-1))
+        boxes[hits : hits + lost] = torch.nan
+        tracks = GNNTracker(**settings)(film([boxes], jitter=0.0))
+        assert tracks.boxes.shape[1] == people, (share, reach)
+
+
+def test_a_second_box_of_one_person_starts_no_track() -> None:
+    """Boxes that share more than 0.4 of their union, or 0.9 of the worse one, show one person."""
+    best = torch.tensor([100.0, 100.0, 200.0, 300.0], dtype=torch.float64).repeat(8, 1)
+
+    def people(second: list[float]) -> int:
+        worse = torch.tensor(second, dtype=torch.float64).repeat(8, 1)
+        one, two = film([best], jitter=0.0), film([worse], jitter=0.0, score=0.6)
+        detections = Detections(*(torch.cat([a, b], dim=2) for a, b in zip(one, two, strict=True)))
+        return int(GNNTracker()(detections).boxes.shape[1])
+
+    # Moved along by s of 200 px they share (200 - s) / (200 + s): 0.4 at 85.7.
+    assert people([100.0, 184.0, 200.0, 384.0]) == 1
+    assert people([100.0, 187.0, 200.0, 387.0]) == 2
+    # 60 px wide and 60 high, partly outside: the share inside is what it is of its own area, not of the better one's.
+    assert people([145.0, 150.0, 205.0, 210.0]) == 1
+    assert people([147.0, 150.0, 207.0, 210.0]) == 2
 
 
 # ---- real clips ------------------------------------------------------------------------------------------
