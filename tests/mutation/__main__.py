@@ -1,7 +1,7 @@
 """Which slips do the nearest tests not notice? Prints them, and the share that is noticed.
 
 ``python -m tests.mutation --count 300`` takes the same slips at every call with the same ``--seed`` and goes on
-where the results file ends, until ``--minutes`` have passed. ``--again`` tries once more those that were not
+where the results in ``--results`` end, until ``--minutes`` have passed. ``--again`` tries once more those that were not
 noticed. A file alone, ``FILE`` or ``FILE:LINE``, takes only the slips of that file or line.
 """
 
@@ -46,7 +46,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=float("inf"))
-    parser.add_argument("--results", type=Path, default=Path("out/mutation.json"))
+    parser.add_argument("--results", type=Path, default=Path("out/mutation"))
     parser.add_argument("--again", action="store_true", help="try once more what was not noticed")
     return parser.parse_args()
 
@@ -55,15 +55,15 @@ def main() -> None:
     """Sample slips, run the nearest tests on each, print those that pass unnoticed."""
     options, begin = parsed(), time.monotonic()
     sample = sampled(options.places, options.count, options.seed)
-    results = json.loads(options.results.read_text()) if options.results.is_file() else {}
-    options.results.parent.mkdir(parents=True, exist_ok=True)
+    stored = options.results / "outcomes.json"
+    results = json.loads(stored.read_text()) if stored.is_file() else {}
     left = [n for n in sample if n not in results or (options.again and results[n] == "survives")]
-    with Runner() as runner:
+    with Runner(options.results) as runner:
         for name in tqdm(left, unit="slip", file=sys.stderr, mininterval=5):
             if time.monotonic() - begin > 60 * options.minutes:
                 break
             results[name] = runner.outcome(*sample[name])
-            options.results.write_text(json.dumps(results, indent=1))
+            stored.write_text(json.dumps(results, indent=1))
 
     reasons, done = explained(), [name for name in sample if name in results]
     survivors = [name for name in done if results[name] == "survives"]

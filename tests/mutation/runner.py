@@ -1,16 +1,18 @@
 """Runs tests on a copy of the package with one file changed."""
 
+import hashlib
 import importlib
 import importlib.util
+import json
 import multiprocessing
 import os
 import shutil
 import signal
 import sys
 import tempfile
-import time
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from tests.mutation.nearest import ROOT, nearest_tests
 from tests.mutation.slips import Slip
@@ -20,16 +22,24 @@ LIBRARIES = (
     "pytest", "hypothesis", "numpy", "scipy.signal", "scipy.optimize", "scipy.spatial", "torch", "torch._dynamo",
     "torch.export", "torch.utils.data", "torchaudio", "kornia", "cv2", "onnx", "onnxruntime", "yaml", "tyro",
 )  # fmt: skip
-#: Tests after the first file are run while all together take no longer.
-SECONDS = 12.0
+#: Tests of one slip take no longer together, but for the first few.
+SECONDS, FEW = 8.0, 3
 #: A slip may make a test endless. Tests take this many times their usual time at most, and a while to begin.
-PATIENCE, BEGIN_SECONDS = 4.0, 15.0
+PATIENCE, BEGIN_SECONDS = 5.0, 30.0
+#: No file of tests takes longer.
+LONGEST_SECONDS = 600.0
 
 
 class Runner:
-    """A copy of the package in a folder of its own; each run is a process that imports the copy."""
+    """A copy of the package in a folder of its own; each run is a process that imports the copy.
 
-    def __init__(self) -> None:
+    Args:
+        store: a folder that keeps what was learnt of each file of tests, while the package is as it is.
+    """
+
+    def __init__(self, store: Path) -> None:
+        store.mkdir(parents=True, exist_ok=True)
+        self.store = store.resolve()
         self._folder = tempfile.TemporaryDirectory(prefix="mutation")
         outer = Path(self._folder.name)
         self.root = outer / "tree"
@@ -39,8 +49,9 @@ class Runner:
         for name in ("models", "README.md", "notebooks"):
             (self.root / name).symlink_to(ROOT / name)
         (outer / "shared").symlink_to(ROOT.parent / "shared")
-        self._usual: dict[Path, tuple[list[Path], float]] = {}
-        self._seconds: dict[Path, float] = {}
+        package = sorted((self.root / "tensorsim").rglob("*.py"))
+        self._package = hashlib.sha256(b"".join(file.read_bytes() for file in package))
+        self._watched: dict[Path, dict[str, Any]] = {}
         for name in LIBRARIES:
             importlib.import_module(name)
 
@@ -53,42 +64,49 @@ class Runner:
         self._folder.cleanup()
 
     def outcome(self, file: Path, slip: Slip) -> str:
-        """ "noticed", "too slow" (noticed too) or "survives"."""
-        tests, usual = self._tests(file)
-        if not tests:
-            return "survives"
+        """``noticed``, ``too slow`` (noticed too) or ``survives``."""
+        names, seconds = self._tests(file, slip)
         copied = self.root / file.relative_to(ROOT)
         original = copied.read_text(encoding="utf-8")
         try:
             self._write(copied, slip.source)
-            code = self._run(tests, BEGIN_SECONDS + PATIENCE * usual)
+            code = self._run(names, BEGIN_SECONDS + PATIENCE * seconds)
         finally:
             self._write(copied, original)
         if code is None:
             return "too slow"
-        return "survives" if code in (0, 5) else "noticed"  # 5: pytest found no tests
+        return "survives" if code in (0, 5) else "noticed"  # 5: there are no tests
 
-    def _tests(self, file: Path) -> tuple[list[Path], float]:
-        """The nearest tests that pass without a slip, and the seconds that they take."""
-        if file not in self._usual:
-            chosen: list[Path] = []
-            total = 0.0
-            for test in nearest_tests(file):
-                if test not in self._seconds:
-                    begin = time.monotonic()
-                    code = self._run([test], 60.0)
-                    self._seconds[test] = time.monotonic() - begin
-                    if code in (1, 2, 3, 4):
-                        raise SystemExit(f"{test.relative_to(ROOT)} fails without a slip")
-                    if code is None:
-                        self._seconds[test] = float("inf")
-                if self._seconds[test] < float("inf") and (
-                    not chosen or total + self._seconds[test] <= SECONDS
-                ):
-                    chosen.append(test)
-                    total += self._seconds[test]
-            self._usual[file] = chosen, total
-        return self._usual[file]
+    def _tests(self, file: Path, slip: Slip) -> tuple[list[str], float]:
+        """Nearest tests that run the statement, those of the first file first and quick ones first; their seconds.
+
+        All tests where none runs it: what stands outside of functions is run by the import.
+        """
+        part = str(file.relative_to(ROOT))
+        tests = [(n, name, w) for n, test in enumerate(nearest_tests(file)) for name, w in self._watch(test)]
+        hits = [t for t in tests if not set(slip.lines).isdisjoint(t[2]["lines"].get(part, []))]
+        chosen: list[str] = []
+        total = 0.0
+        for _, name, watched in sorted(hits or tests, key=lambda t: (t[0], t[2]["seconds"])):
+            if len(chosen) < FEW or total + watched["seconds"] <= SECONDS:
+                chosen.append(name)
+                total += watched["seconds"]
+        return chosen, total
+
+    def _watch(self, test: Path) -> list[tuple[str, dict[str, Any]]]:
+        """Each test of a file with its seconds and the lines that it runs, without a slip."""
+        if test not in self._watched:
+            key = self._package.copy()
+            key.update(test.read_bytes())
+            stored = self.store / f"{test.stem}.{key.hexdigest()[:16]}.json"
+            if not stored.is_file():
+                scratch = Path(self._folder.name) / "watched.json"
+                code = self._run([str(test.relative_to(ROOT))], LONGEST_SECONDS, scratch)
+                if code not in (0, 5):
+                    raise SystemExit(f"{test.relative_to(ROOT)}: fails, or takes too long, without a slip")
+                shutil.move(scratch, stored)
+            self._watched[test] = json.loads(stored.read_text())
+        return list(self._watched[test].items())
 
     def _write(self, copied: Path, text: str) -> None:
         """Two slips within a second may have equal lengths: what was compiled before must go."""
@@ -96,20 +114,22 @@ class Runner:
         for compiled in (copied.parent / "__pycache__").glob(f"{copied.stem}.*"):
             compiled.unlink()
 
-    def _run(self, tests: list[Path], seconds: float) -> int | None:
-        """What pytest returns, or none after so many seconds."""
-        names = [str(test.relative_to(ROOT)) for test in tests]
-        process = multiprocessing.get_context("fork").Process(target=_pytest, args=(self.root, names))
+    def _run(self, names: list[str], seconds: float, watched: Path | None = None) -> int | None:
+        """What pytest returns for tests or a file of tests, or none after so many seconds."""
+        process = multiprocessing.get_context("fork").Process(
+            target=_pytest, args=(self.root, names, watched)
+        )
         process.start()
-        process.join(seconds)
-        if process.is_alive():
-            os.killpg(process.pid, signal.SIGKILL)
-            process.join()
-            return None
-        return process.exitcode
+        try:
+            process.join(seconds)
+            return process.exitcode
+        finally:
+            if process.is_alive():
+                os.killpg(process.pid, signal.SIGKILL)
+                process.join()
 
 
-def _pytest(root: Path, names: list[str]) -> None:
+def _pytest(root: Path, names: list[str], watched: Path | None) -> None:
     """In a process of its own: run tests of the copy, up to the first that fails."""
     os.setsid()  # so that what tests start ends with them
     os.chdir(root)
@@ -128,5 +148,11 @@ def _pytest(root: Path, names: list[str]) -> None:
     import pytest
     import torch
 
+    from tests.mutation.watch import Choose, Watch
+
     torch.set_num_threads(1)
-    os._exit(pytest.main(["-x", "-q", "-n", "0", "-p", "no:cacheprovider", *names]))
+    files = sorted({name.partition("::")[0] for name in names})
+    plugin = Watch(root, watched) if watched else Choose(names)
+    early = "ignore::pytest.PytestAssertRewriteWarning"  # of LIBRARIES
+    options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-W", early]
+    os._exit(pytest.main([*options, *files], plugins=[plugin]))

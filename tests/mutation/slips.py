@@ -29,9 +29,10 @@ _ATOMS = (ast.Constant, ast.Name, ast.Call, ast.Attribute, ast.Subscript)
 
 
 class Slip(NamedTuple):
-    """A changed source text, the number of the first line that it changes, and that line before and after."""
+    """A changed source text, the first line that it changes, before and after, and the lines of its statement."""
 
     line: int
+    lines: range
     before: str
     after: str
     source: str
@@ -47,13 +48,28 @@ def slips(source: str) -> list[Slip]:
     for line in data.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     found = {}
-    for node, text in _changes(ast.parse(source)):
+    tree = ast.parse(source)
+    statements = _statements(tree)
+    for node, text in _changes(tree):
         begin = starts[node.lineno - 1] + node.col_offset
         end = starts[node.end_lineno - 1] + node.end_col_offset
         changed = (data[:begin] + text.encode() + data[end:]).decode()
         before, after = (whole.splitlines()[node.lineno - 1].strip() for whole in (source, changed))
-        found.setdefault((node.lineno, after), Slip(node.lineno, before, after, changed))
+        lines = statements.get(node.lineno, range(node.lineno, node.lineno + 1))
+        slip = Slip(node.lineno, lines, before, after, changed)
+        found.setdefault((node.lineno, after), slip)
     return list(found.values())
+
+
+def _statements(tree: ast.AST) -> dict[int, range]:
+    """For each line the lines of its statement, of compound ones those of the head."""
+    found = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.stmt):
+            body = getattr(node, "body", None)
+            end = max(node.lineno + 1, body[0].lineno) if body else node.end_lineno + 1
+            found.update(dict.fromkeys(range(node.lineno, end), range(node.lineno, end)))
+    return found
 
 
 def _changes(tree: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:

@@ -76,9 +76,9 @@ def mean_gait(maps) -> GaitParameters:
 
 def test_measured_walk(shared_data):
     gait = GAIT(measured_map(shared_data, "walking"))
-    assert 0.8 < float(gait.torso_m_s) < 1.8
-    assert 0.7 < float(gait.step_hz) / 2 < 1.3
-    assert 1.5 < float(gait.limb_m_s / gait.torso_m_s) < 4.0
+    assert 1.0 < float(gait.torso_m_s) < 1.6
+    assert 0.9 < float(gait.step_hz) / 2 < 1.3
+    assert 1.4 < float(gait.limb_m_s / gait.torso_m_s) < 2.5
 
 
 def test_measured_run(shared_data):
@@ -99,13 +99,15 @@ def test_simulated_gait_is_that_of_the_joints(name, shared_data):
 
 
 def test_simulated_gait_resembles_the_measured(shared_data):
-    for name, clips, speed in (("walking", WALKS, 0.3), ("running", RUNS, 0.5)):
+    # People choose how fast they run; steps, and limbs beside the torso, go with the speed.
+    for name, clips, speed in (("walking", WALKS, 0.15), ("running", RUNS, 0.4)):
         measured = GAIT(measured_map(shared_data, name))
         simulated = mean_gait(simulated_map(recorded_joints(shared_data, clip)) for clip in clips)
         assert float(simulated.torso_m_s) == pytest.approx(float(measured.torso_m_s), rel=speed)
-        assert float(simulated.step_hz) == pytest.approx(float(measured.step_hz), rel=0.15)
+        assert float(simulated.step_hz) == pytest.approx(float(measured.step_hz), rel=0.08)
         # Points at ankles shine brighter than shins: the simulated envelope is the wider one in a walk.
-        assert float(simulated.limb_m_s) == pytest.approx(float(measured.limb_m_s), rel=0.55)
+        limbs = [float(gait.limb_m_s / gait.torso_m_s) for gait in (simulated, measured)]
+        assert limbs[0] == pytest.approx(limbs[1], rel=0.3)
 
 
 class TestDirections:
@@ -136,7 +138,7 @@ class TestDirections:
         for direction in (45, 315):
             ratio = measured[direction] / measured[0]
             assert 0.6 < ratio < 1.0
-            assert float(simulated[direction] / simulated[0]) == pytest.approx(ratio, abs=0.25)
+            assert float(simulated[direction] / simulated[0]) == pytest.approx(ratio, abs=0.16)
 
     def test_walk_across_changes_sign_in_the_middle(self, shared_data):
         measured = self.read(shared_data, 90).square()
@@ -155,5 +157,5 @@ class TestDirections:
     def test_steps_and_limbs(self, direction, shared_data):
         measured = self.estimator()(self.read(shared_data, direction))
         forwards = self.estimator()(self.read(shared_data, 0))
-        assert float(measured.step_hz) == pytest.approx(float(forwards.step_hz), rel=0.15)
-        assert 1.4 < float(measured.limb_m_s / measured.torso_m_s) < 4.0
+        assert float(measured.step_hz) == pytest.approx(float(forwards.step_hz), rel=0.1)
+        assert 1.8 < float(measured.limb_m_s / measured.torso_m_s) < 3.2

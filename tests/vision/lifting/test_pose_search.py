@@ -1,6 +1,7 @@
 """The search for nearest poses, against brute force in NumPy and weighted least squares."""
 
 import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,35 @@ def test_selection_of_scores_and_pairs() -> None:
     )
     assert (frame.tolist(), pose.tolist()) == ([0, 0, 1, 1], [1, 4, 3, 2])
     torch.testing.assert_close(fit, torch.tensor([0.2, 0.1, 0.7, 0.5]))
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("uniform", [True, False])
+def test_rounding_of_scores_is_within_its_bound(uniform: bool) -> None:
+    """The scores of a block fall short of cosines in float64 by the bound at most, which is no wider than it must be."""
+    search = PoseSearch(standardise_poses(sample_poses(500, seed=4)).float(), 4, 3, 2**20)
+    keypoints = pictures(200, 5).float()
+    weights = torch.ones(200, 14)
+    if not uniform:
+        weights = torch.rand(200, 14, generator=torch.Generator().manual_seed(0))
+    weights = weights / weights.sum(dim=-1, keepdim=True)
+    k = (keypoints - (weights[..., None] * keypoints).sum(dim=1, keepdim=True)).double()
+    w = weights.double()[..., None]
+    moment = (w * k / (w * k.square()).sum(dim=(1, 2), keepdim=True).sqrt()).mT.flatten(1).float()
+    poses = all_headings(search.library, 4)
+    for block, (start, stop) in enumerate(itertools.pairwise(search.starts)):
+        score, slack = search._scores(block, moment, weights, uniform)
+        members = poses[search.order[start:stop]]
+        exact = weighted_cosine(keypoints[:, None], weights[:, None], members[None]) - 1.0
+        # What bfloat16 rounds of the score itself, the search allows for in its threshold.
+        rounded = 2.0**-8 * score.abs() if uniform else torch.zeros_like(score)
+        low, high = exact - score - rounded, score - exact - rounded
+        assert bool((low <= slack[:, None]).all())
+        assert bool((high <= (slack[:, None] if uniform else 5e-6)).all())
+        # Numbers lose one part in 2^9 of the distances from the centre at most.
+        offset = (math.sqrt(14.0) * moment - search.centres[block]).norm(dim=-1)
+        most = 1.4 * 2.0**-8 * offset * search.radius[block] + 8e-5 if uniform else torch.tensor(2e-5)
+        assert bool((slack <= most).all()), "no wider than it must be"
 
 
 @pytest.mark.slow
