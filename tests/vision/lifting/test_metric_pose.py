@@ -415,3 +415,75 @@ def test_ankles_stand_at_zero_which_is_the_sole_less_the_ankle_height() -> None:
     assert float(lowest_ankle(joints).abs().max()) < 1e-6
     neck = (0.818 - ANKLE_HEIGHT) * TALL
     assert float(joints[0, 1, 2]) == pytest.approx(neck, abs=0.02)
+
+
+# ---- thresholds, from both sides ----------------------------------------------------------------------------
+
+
+def range_of_late_frames(image: Tensor, lifted: Lifted, scores: Tensor) -> float:
+    joints, _ = place_seen(MetricPose(person_height_m=(TALL,)), image, scores, lifted)
+    return float(mid_hips(joints)[75:, 1].mean())
+
+
+@pytest.mark.parametrize(("seen", "trusted"), [(9, False), (10, True)])
+def test_ten_joints_make_a_reliable_size(seen: int, trusted: bool) -> None:
+    image, lifted = film(walker((0.0, 4.0), (0.3, 0.0)))
+    scores = torch.ones(90, 14, dtype=torch.float64)
+    scores[60:, seen:] = 0.0
+    lifted = lifted._replace(scale=torch.cat([lifted.scale[:60], lifted.scale[60:] / 1.05]))
+    assert range_of_late_frames(image, lifted, scores) == pytest.approx(4.2 if trusted else 4.0, abs=0.06)
+
+
+@pytest.mark.parametrize(("error", "trusted"), [(0.249, True), (0.251, False)])
+def test_a_pose_that_fits_badly_has_no_reliable_size(error: float, trusted: bool) -> None:
+    image, lifted = film(walker((0.0, 4.0), (0.3, 0.0)))
+    distance = lifted.distance.clone()
+    distance[60:] = error
+    scale = torch.cat([lifted.scale[:60], lifted.scale[60:] / 1.05])
+    found = lifted._replace(scale=scale, distance=distance)
+    late = range_of_late_frames(image, found, torch.ones(90, 14, dtype=torch.float64))
+    assert late == pytest.approx(4.2 if trusted else 4.0, abs=0.06)
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(0.64, False), (0.66, True)])
+def test_a_part_of_less_than_two_thirds_of_the_size_is_discarded(factor: float, kept: bool) -> None:
+    image, lifted = film(walker((0.0, 4.0), (0.0, 0.0)))
+    shown = [j for j, name in enumerate(JOINTS) if "knee" in name or "ankle" in name]
+    scores = torch.zeros(90, 14, dtype=torch.float64)
+    scores[:85], scores[85:, shown] = 1.0, 1.0
+    found = misread(image, lifted, slice(85, 90), shown, factor)
+    _, seen = place_seen(MetricPose(person_height_m=(TALL,)), image, scores, found)
+    assert bool(seen[85:].any()) is kept
+
+
+@pytest.mark.parametrize("fps", [30.0, 1.0])
+def test_the_focal_length_comes_from_the_first_half_second(fps: float) -> None:
+    """Median of 15 valid frames at 30 per second, of one frame where half a second has none."""
+    scale = torch.linspace(300.0, 600.0, 40, dtype=torch.float64)[None]
+    valid = torch.ones(1, 40, dtype=torch.bool)
+    valid[0, :3] = False
+    metres = [torch.full((1, 1), x, dtype=torch.float64) for x in (4.0, 1.6)]
+    focal = MetricPose()._focal_from(metres[0], metres[1], scale, torch.full_like(scale, 0.1), valid, fps)
+    middle = float(scale[0, 3 + 7]) if fps == 30.0 else float(scale[0, 3])
+    torch.testing.assert_close(focal, torch.full_like(scale, middle * (4.0 / 1.6 + 0.1)))
+
+
+def test_pictures_have_their_centre_in_the_middle_of_the_pixels() -> None:
+    """Pixel centres are at integers: 0 to 639 and 0 to 479."""
+    like = torch.zeros(1, dtype=torch.float64)
+    assert MetricPose()._center_px(like, 480, 640).tolist() == [319.5, 239.5]
+    assert MetricPose()._focal_px(640) == pytest.approx(320 / math.tan(math.pi / 6))
+
+
+def test_usual_settings() -> None:
+    module = MetricPose()
+    assert module.heights.tolist() == [1.80, 1.70]
+    assert module.distances.tolist() == [4.00, 0.50]
+    assert (module.keypoint_threshold, module.mode, module.calibrated) == (0.3, "camera", False)
+    assert (module.range_smoothing_s, module.floor_window_s) == (0.3, 1.5)
+    other = MetricPose(None, (1.6,), (3.0,), 0.4, "paper", 0.2, 1.0, True)
+    seen_by = other.seen_by(CameraConfig(focal_px=900.0))
+    assert (seen_by.focal_px, seen_by.heights.tolist(), seen_by.distances.tolist()) == (900.0, [1.6], [3.0])
+    assert (seen_by.keypoint_threshold, seen_by.mode, seen_by.calibrated) == (0.4, "paper", True)
+    assert (seen_by.range_smoothing_s, seen_by.floor_window_s) == (0.2, 1.0)
+    assert MetricPose().seen_by(CameraConfig()).distance_gives_focal is False
