@@ -22,7 +22,7 @@ LIBRARIES = (
     "pytest", "hypothesis", "numpy", "scipy.signal", "scipy.optimize", "scipy.spatial", "torch", "torch._dynamo",
     "torch.export", "torch.utils.data", "torchaudio", "kornia", "cv2", "onnx", "onnxruntime", "yaml", "tyro",
 )  # fmt: skip
-#: Tests of one slip take no longer together, but for the first few.
+#: Tests of one slip and file take no longer together, but for the first few.
 SECONDS, FEW = 8.0, 3
 #: A slip may make a test endless. Tests take this many times their usual time at most, and a while to begin.
 PATIENCE, BEGIN_SECONDS = 5.0, 30.0
@@ -65,35 +65,37 @@ class Runner:
 
     def outcome(self, file: Path, slip: Slip) -> str:
         """``noticed``, ``too slow`` (noticed too) or ``survives``."""
-        names, seconds = self._tests(file, slip)
         copied = self.root / file.relative_to(ROOT)
         original = copied.read_text(encoding="utf-8")
-        try:
-            self._write(copied, slip.source)
-            code = self._run(names, BEGIN_SECONDS + PATIENCE * seconds)
-        finally:
-            self._write(copied, original)
-        if code is None:
-            return "too slow"
-        return "survives" if code in (0, 5) else "noticed"  # 5: there are no tests
+        for test in nearest_tests(file):
+            names, seconds = self._choice(test, str(file.relative_to(ROOT)), slip.lines)
+            try:
+                self._write(copied, slip.source)
+                code = self._run(names, BEGIN_SECONDS + PATIENCE * seconds)
+            finally:
+                self._write(copied, original)
+            if code is None:
+                return "too slow"
+            if code not in (0, 5):  # 5: there are no tests
+                return "noticed"
+        return "survives"
 
-    def _tests(self, file: Path, slip: Slip) -> tuple[list[str], float]:
-        """Nearest tests that run the statement, those of the first file first and quick ones first; their seconds.
+    def _choice(self, test: Path, part: str, lines: range) -> tuple[list[str], float]:
+        """Tests of a file that run these lines of a part of the package, quick ones first, and their seconds.
 
-        All tests where none runs it: what stands outside of functions is run by the import.
+        All tests where none runs them: what stands outside of functions is run by the import.
         """
-        part = str(file.relative_to(ROOT))
-        tests = [(n, name, w) for n, test in enumerate(nearest_tests(file)) for name, w in self._watch(test)]
-        hits = [t for t in tests if not set(slip.lines).isdisjoint(t[2]["lines"].get(part, []))]
+        tests = sorted(self._watch(test).items(), key=lambda item: item[1]["seconds"])
+        hits = [item for item in tests if not set(lines).isdisjoint(item[1]["lines"].get(part, []))]
         chosen: list[str] = []
         total = 0.0
-        for _, name, watched in sorted(hits or tests, key=lambda t: (t[0], t[2]["seconds"])):
+        for name, watched in hits or tests:
             if len(chosen) < FEW or total + watched["seconds"] <= SECONDS:
                 chosen.append(name)
                 total += watched["seconds"]
         return chosen, total
 
-    def _watch(self, test: Path) -> list[tuple[str, dict[str, Any]]]:
+    def _watch(self, test: Path) -> dict[str, dict[str, Any]]:
         """Each test of a file with its seconds and the lines that it runs, without a slip."""
         if test not in self._watched:
             key = self._package.copy()
@@ -106,7 +108,7 @@ class Runner:
                     raise SystemExit(f"{test.relative_to(ROOT)}: fails, or takes too long, without a slip")
                 shutil.move(scratch, stored)
             self._watched[test] = json.loads(stored.read_text())
-        return list(self._watched[test].items())
+        return self._watched[test]
 
     def _write(self, copied: Path, text: str) -> None:
         """Two slips within a second may have equal lengths: what was compiled before must go."""

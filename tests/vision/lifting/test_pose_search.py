@@ -203,7 +203,7 @@ def test_selection_of_scores_and_pairs() -> None:
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("uniform", [True, False])
 def test_rounding_of_scores_is_within_its_bound(uniform: bool) -> None:
-    """The scores of a block fall short of cosines in float64 by the bound at most, which is no wider than it must be."""
+    """Scores of a block are as near to cosines in float64 as the bound says, which is no wider than it must be."""
     search = PoseSearch(standardise_poses(sample_poses(500, seed=4)).float(), 4, 3, 2**20)
     keypoints = pictures(200, 5).float()
     weights = torch.ones(200, 14)
