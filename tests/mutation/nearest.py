@@ -13,7 +13,7 @@ MOST = 3
 def nearest_tests(file: Path) -> list[Path]:
     """The test file of the same name, then those of its room that name most of what the file defines.
 
-    Where none names any of it, those nearest to the modules that import it.
+    Where few name any of it, those nearest to the modules that import it too.
     """
     return _nearest(file, frozenset())
 
@@ -31,8 +31,9 @@ def _nearest(file: Path, seen: frozenset[Path]) -> list[Path]:
         ]
         if len(found) >= MOST or (found and room is rooms[1]):
             break
-    for user in () if found else _users(file):
-        if user not in seen:
+    for user in _users(file):
+        near = user.relative_to(ROOT / "tensorsim").parts[0] == part.parts[0]
+        if user not in seen and (not found or (near and len(found) < MOST)):
             found += [test for test in _nearest(user, seen | {file}) if test not in found]
     return found[:MOST]
 
@@ -56,9 +57,10 @@ def _public(file: Path) -> list[str]:
 
 
 def _users(file: Path) -> list[Path]:
-    """Modules of the package that import this one."""
+    """Modules of the package that import this one, those of its folder first."""
     line = re.compile(rf"^\s*from {re.escape(module_name(file))} import", re.MULTILINE)
-    return [user for user in sorted((ROOT / "tensorsim").rglob("*.py")) if line.search(_text(user))]
+    users = [user for user in sorted((ROOT / "tensorsim").rglob("*.py")) if line.search(_text(user))]
+    return sorted(users, key=lambda user: user.parent != file.parent)
 
 
 @functools.cache
