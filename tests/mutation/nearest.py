@@ -13,9 +13,9 @@ MOST = 3
 def nearest_tests(file: Path) -> list[Path]:
     """The test file of the same name, then those of its room that name most of what the file defines.
 
-    Where few name any of it, those nearest to the modules that import it too.
+    Where few name any of it, those nearest to the modules that import it too. At last the test of all defaults.
     """
-    return _nearest(file, frozenset())
+    return [*_nearest(file, frozenset()), ROOT / "tests" / "test_interface.py"]
 
 
 def _nearest(file: Path, seen: frozenset[Path]) -> list[Path]:

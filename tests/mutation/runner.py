@@ -68,7 +68,9 @@ class Runner:
         copied = self.root / file.relative_to(ROOT)
         original = copied.read_text(encoding="utf-8")
         for test in nearest_tests(file):
-            names, seconds = self._choice(test, str(file.relative_to(ROOT)), slip.lines)
+            names, seconds = self._choice(test, str(file.relative_to(ROOT)), slip)
+            if not names:
+                continue
             try:
                 self._write(copied, slip.source)
                 code = self._run(names, BEGIN_SECONDS + PATIENCE * seconds)
@@ -80,16 +82,13 @@ class Runner:
                 return "noticed"
         return "survives"
 
-    def _choice(self, test: Path, part: str, lines: range) -> tuple[list[str], float]:
-        """Tests of a file that run these lines of a part of the package, quick ones first, and their seconds.
-
-        All tests where none runs them: what stands outside of functions is run by the import.
-        """
+    def _choice(self, test: Path, part: str, slip: Slip) -> tuple[list[str], float]:
+        """Tests of a file that run the statement of a part of the package, quick ones first, and their seconds."""
         tests = sorted(self._watch(test).items(), key=lambda item: item[1]["seconds"])
-        hits = [item for item in tests if not set(lines).isdisjoint(item[1]["lines"].get(part, []))]
+        hits = [item for item in tests if not set(slip.lines).isdisjoint(item[1]["lines"].get(part, []))]
         chosen: list[str] = []
         total = 0.0
-        for name, watched in hits or tests:
+        for name, watched in hits or (tests if slip.by_import else []):
             if len(chosen) < FEW or total + watched["seconds"] <= SECONDS:
                 chosen.append(name)
                 total += watched["seconds"]

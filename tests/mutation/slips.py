@@ -29,10 +29,19 @@ _ATOMS = (ast.Constant, ast.Name, ast.Call, ast.Attribute, ast.Subscript)
 
 
 class Slip(NamedTuple):
-    """A changed source text, the first line that it changes, before and after, and the lines of its statement."""
+    """A changed source text, and where the change is.
+
+    Attributes:
+        line: the first line that it changes, from 1.
+        lines: of the statement.
+        by_import: the statement stands outside of functions, or is the head of one: the import runs it.
+        before, after: the line.
+        source: the whole text.
+    """
 
     line: int
     lines: range
+    by_import: bool
     before: str
     after: str
     source: str
@@ -49,27 +58,26 @@ def slips(source: str) -> list[Slip]:
         starts.append(starts[-1] + len(line))
     found = {}
     tree = ast.parse(source)
-    statements = _statements(tree)
+    statements = dict(_statements(tree, True))
     for node, text in _changes(tree):
         begin = starts[node.lineno - 1] + node.col_offset
         end = starts[node.end_lineno - 1] + node.end_col_offset
         changed = (data[:begin] + text.encode() + data[end:]).decode()
         before, after = (whole.splitlines()[node.lineno - 1].strip() for whole in (source, changed))
-        lines = statements.get(node.lineno, range(node.lineno, node.lineno + 1))
-        slip = Slip(node.lineno, lines, before, after, changed)
+        slip = Slip(node.lineno, *statements[node.lineno], before, after, changed)
         found.setdefault((node.lineno, after), slip)
     return list(found.values())
 
 
-def _statements(tree: ast.AST) -> dict[int, range]:
-    """For each line the lines of its statement, of compound ones those of the head."""
-    found = {}
-    for node in ast.walk(tree):
+def _statements(tree: ast.AST, by_import: bool) -> Iterator[tuple[int, tuple[range, bool]]]:
+    """For each line the lines of its statement, of compound ones those of the head, and whether the import runs it."""
+    for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.stmt):
-            body = getattr(node, "body", None)
-            end = max(node.lineno + 1, body[0].lineno) if body else node.end_lineno + 1
-            found.update(dict.fromkeys(range(node.lineno, end), range(node.lineno, end)))
-    return found
+            start = min([node.lineno, *(part.lineno for part in getattr(node, "decorator_list", []))])
+            whole, body = range(start, node.end_lineno + 1), getattr(node, "body", None)
+            head = range(start, max(node.lineno + 1, body[0].lineno)) if body else whole
+            yield from ((line, (head if line in head else whole, by_import)) for line in whole)
+        yield from _statements(node, by_import and not isinstance(node, ast.FunctionDef))
 
 
 def _changes(tree: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
