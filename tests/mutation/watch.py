@@ -1,6 +1,11 @@
-"""What each test runs and how long it takes, and a choice among tests by that: plugins of pytest."""
+"""What each test runs and how long it takes, and a choice among tests by that: plugins of pytest.
+
+Tests that compare a stage with its scripted or exported form are left out: a slip changes both alike, and they take
+the most time.
+"""
 
 import json
+import re
 import sys
 import time
 from collections import defaultdict
@@ -12,16 +17,20 @@ from typing import Any
 import pytest
 
 
-class Watch:
-    """Writes the seconds of each test, and the lines of the package that it runs, to a file of JSON.
+_COMPILED = re.compile("script|export|onnx")
 
-    Code that torch compiled is not seen; tests of it run the same lines in Python too.
-    """
+
+class Watch:
+    """Writes the seconds of each test, and the lines of the package that it runs, to a file of JSON."""
 
     def __init__(self, root: Path, result: Path) -> None:
         self.package, self.start, self.result = str(root / "tensorsim"), len(str(root)) + 1, result
         self.found: dict[str, dict[str, Any]] = {}
         self.lines: dict[str, set[int]] = defaultdict(set)
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Drop what is left out."""
+        items[:] = [item for item in items if not _COMPILED.search(item.nodeid.partition("::")[2])]
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
