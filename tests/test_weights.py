@@ -1,6 +1,8 @@
 """Weight files: safe, verified, complete."""
 
 import hashlib
+import importlib
+import io
 import os
 import pickle
 import re
@@ -16,6 +18,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tensorsim import weights
 from tensorsim.errors import TensorsimError
 from tensorsim.weights import load_state_dict, load_strict
 
@@ -191,6 +194,42 @@ def test_placeholders_cannot_reach_real_objects(tmp_path: Path) -> None:
     assert same(load_state_dict(path), tensors())
     with pytest.raises(TensorsimError, match="expected tensors by name"):
         load_state_dict(save({"state_dict": {"a": Chain()}}, tmp_path / "v.pth"))
+
+
+#: Names that published files refer to, and what a pickle that is read makes of them.
+REAL = [
+    ("collections", "OrderedDict"), ("torch", "Size"), ("torch", "device"), ("torch", "float16"),
+    ("torch._utils", "_rebuild_tensor_v2"), ("torch._utils", "_rebuild_parameter"),
+]  # fmt: skip
+PLACEHOLDERS = [
+    ("mmengine.logging.history_buffer", "HistoryBuffer"), ("mmcv.utils", "ConfigDict"), ("numpy", "dtype"),
+    ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "_reconstruct"), ("datetime", "datetime"),
+    ("_codecs", "encode"), ("collections", "defaultdict"),
+    *[("builtins", name) for name in ("getattr", "set", "frozenset", "slice", "range", "complex", "bytearray")],
+]  # fmt: skip
+REFUSED = [
+    ("os", "system"), ("posix", "system"), ("nt", "system"), ("subprocess", "Popen"), ("sys", "exit"),
+    ("torch", "load"), ("torch", "compile"), ("torch._utils", "_import_dotted_name"), ("torch.jit", "load"),
+    ("torch.storage", "_load_from_bytes"), ("torch._utils", "_rebuild_device_tensor_from_numpy"),
+    ("importlib", "import_module"), ("pickle", "loads"), ("operator", "attrgetter"), ("functools", "partial"),
+    ("runpy", "run_path"), ("shutil", "rmtree"), ("tensorsim.weights", "load_state_dict"), ("mmenginex", "f"),
+    *[("builtins", n) for n in ("eval", "exec", "open", "compile", "__import__", "setattr", "globals", "print")],
+]  # fmt: skip
+
+
+def test_names_in_a_pickle_are_those_of_weights_and_of_their_logs() -> None:
+    reader = weights._TensorUnpickler(io.BytesIO(b"."))
+    for module, name in REAL:
+        found = reader.find_class(module, name)
+        real = getattr(importlib.import_module(module), name)
+        assert getattr(found, "func", found) is real, "torch's own function, in a call made for this file"
+    for module, name in PLACEHOLDERS:
+        found = reader.find_class(module, name)
+        assert issubclass(found, weights._Placeholder)
+        assert isinstance(found("anything", of="it")("again"), weights._Placeholder)
+    for module, name in REFUSED:
+        with pytest.raises(TensorsimError, match="which is code and not weights; it was not run"):
+            reader.find_class(module, name)
 
 
 def test_refuses_a_pickled_module_and_a_script(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import torch
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
+from tensorsim.data import h36m as h36m_file
 from tensorsim.data import npz
 from tensorsim.data.coco import load_coco_keypoints
 from tensorsim.data.h36m import H36M_JOINTS
@@ -281,6 +282,22 @@ def test_a_pickle_cannot_make_addresses_of_its_bytes(tmp_path: Path) -> None:
     assert len(lines) == len(paths)
     for line, path in zip(lines, paths, strict=True):
         assert line.startswith(f"TensorsimError {path}: ")
+
+
+def test_names_in_a_pickle_of_arrays_are_those_of_both_numpys_and_no_others() -> None:
+    reader = h36m_file._ArraysOnly(io.BytesIO(b"."))
+    for core in ("numpy.core.multiarray", "numpy._core.multiarray"):
+        assert reader.find_class(core, "_reconstruct") is h36m_file._Array
+    assert reader.find_class("numpy", "ndarray") is h36m_file._Array
+    assert reader.find_class("numpy", "dtype") is h36m_file._Dtype
+    assert reader.find_class("_codecs", "encode") is h36m_file._Encoded
+    for module, name in (
+        ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "frombuffer"), ("numpy", "load"),
+        ("numpy", "_reconstruct"), ("_codecs", "decode"), ("codecs", "encode"), ("builtins", "eval"),
+        ("os", "system"), ("collections", "OrderedDict"), ("numpy.core", "_reconstruct"), ("numpy", "memmap"),
+    ):  # fmt: skip
+        with pytest.raises(pickle.UnpicklingError, match="expected arrays only"):
+            reader.find_class(module, name)
 
 
 def test_a_memo_without_end_is_refused(tmp_path: Path) -> None:
