@@ -17,7 +17,16 @@ from tensorsim.evaluation.camera import (
     walk_before,
 )
 from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, with_reserve
-from tensorsim.vision.calibration.camera_fit import camera_axes, place_upright
+from tensorsim.vision.calibration.camera_fit import (
+    Bodies,
+    camera_axes,
+    fit_camera,
+    jacobian,
+    misfit,
+    place_upright,
+    residuals,
+    robust,
+)
 from tensorsim.vision.calibration.upright import is_upright, walking_share
 from tests.film import STANDING
 from tests.stage import StageTester
@@ -170,3 +179,104 @@ def test_a_tilt_that_is_hardly_known_is_drawn_towards_level() -> None:
     assert kept.height_m.tolist() == pytest.approx([3.0, 1.5 * 2**0.25])
     assert kept.horizontal_fov_rad.tolist() == pytest.approx([1.0, math.pi / 3 + (1 - math.pi / 3) / 4])
     assert torch.equal(kept.pitch_sd_rad, deviation)
+
+
+# ---- the fit, in closed form -------------------------------------------------------------------------------
+
+
+def seen(spots: list[tuple[float, float]], height_m: float, fov: float) -> Bodies:
+    """Somebody of ankles at 0.1 m and shoulders at 1.4 m on these spots before a level camera."""
+    x, y = torch.tensor(spots, dtype=torch.float64).T
+    z = torch.tensor([0.1, 1.4], dtype=torch.float64).expand(len(spots), 2)
+    image = torch.stack([(x / y)[:, None].expand(-1, 2), (height_m - z) / y[:, None]], dim=-1)
+    ones = torch.ones(1, len(spots), dtype=torch.float64)
+    return Bodies(
+        image[None] / math.tan(fov / 2), ones > 0, z[None], ones, torch.zeros(1).double(), 0.01 * ones
+    )
+
+
+def parameters(height_m: float, fov: float, factor: float, pace: float) -> Tensor:
+    return torch.tensor(
+        [0.0, 0.0, math.log(height_m), fov, math.log(factor), math.log(pace)], dtype=torch.float64
+    )
+
+
+@pytest.mark.parametrize("frames", [2, 3, 12, 30])
+def test_speeds_of_who_walks_straight(frames: int) -> None:
+    """One step of 0.1 m in each of ten frames a second is 1 m/s, in clips of any length; a tenth is one deviation."""
+    bodies = seen([(0.1 * t - 1.0, 4.0) for t in range(frames)], 1.5, 1.0)
+    away, speed = misfit(parameters(1.5, 1.0, 1.0, 0.8), bodies, 10.0)
+    torch.testing.assert_close(away, torch.zeros(1, frames, 4, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(speed, torch.full((1, frames), (1 / 0.8 - 1) / 0.1, dtype=torch.float64))
+
+
+def test_who_stands_has_no_speed_and_who_is_not_seen_no_residual() -> None:
+    bodies = seen([(0.1 * t - 1.0, 4.0) for t in range(30)], 1.5, 1.0)
+    still = bodies._replace(walking=torch.zeros(1, 30, dtype=torch.float64))
+    assert not misfit(parameters(1.5, 1.0, 1.0, 0.8), still, 10.0)[1].any()
+    hidden = torch.ones(1, 30, dtype=torch.bool)
+    hidden[0, 12] = False
+    away, speed = misfit(parameters(1.4, 1.0, 1.0, 0.8), bodies._replace(upright=hidden), 10.0)
+    assert not away[0, 12].any()
+    assert bool(away[0, [11, 13]].any(dim=-1).all())
+    # A second about frame 12, or with it at one end, has no known way.
+    assert torch.nonzero(speed[0] == 0)[:, 0].tolist() == [7, 12, 17]
+
+
+def test_shoulders_of_who_walks_lean_ahead() -> None:
+    """Somebody who walks to the right: shoulders 0.1 m ahead of where they would be above the ankles."""
+    bodies = seen([(0.1 * t - 1.0, 4.0) for t in range(12)], 1.5, 1.0)
+    image = bodies.image.clone()
+    image[..., 1, 0] += 0.1 / 4.0 / math.tan(0.5)
+    leaning = bodies._replace(image=image, lean_m=torch.full((1,), 0.1, dtype=torch.float64))
+    away, _ = misfit(parameters(1.5, 1.0, 1.0, 1.0), leaning, 10.0)
+    torch.testing.assert_close(away, torch.zeros_like(away), atol=1e-9, rtol=0)
+
+
+def test_loss_and_weights_are_those_of_cauchy() -> None:
+    """Of a body by its four residuals together, of a speed by its own."""
+    residual = torch.tensor([[[1.0, 2.0, -2.0, 4.0, 3.0]]], dtype=torch.float64)
+    loss, weight = robust(residual, 2.5)
+    squared = torch.tensor([25 / 2.5**2, 9 / 2.5**2], dtype=torch.float64)
+    torch.testing.assert_close(loss[0, 0], 2.5**2 / 2 * torch.log(1 + squared))
+    torch.testing.assert_close(weight[0, 0], 1 / (1 + squared))
+
+
+def test_slopes_are_those_of_automatic_differentiation() -> None:
+    one = seen([(0.1 * t - 1.0, 4.0 + 0.05 * t) for t in range(12)], 1.5, 1.0)
+    bodies = Bodies(*(torch.cat([field, field]) for field in one))
+    at = torch.tensor([0.05, -0.02, math.log(1.4), 1.1, 0.02, -0.03, 0.1, -0.2], dtype=torch.float64)
+    expected = torch.func.jacfwd(lambda p: residuals(p, bodies, 10.0))(at)
+    torch.testing.assert_close(jacobian(at, bodies, 10.0), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_fit_finds_the_camera_and_its_covariance() -> None:
+    """From a wrong start to the truth; the covariance is the inverse of the curvature of the loss."""
+    bodies = seen([(0.1 * t - 1.5, 3.0 + 0.1 * t) for t in range(30)], 1.7, 1.2)
+    truth = parameters(1.7, 1.2, 1.0, math.sqrt(2.0))
+    mean = truth.clone()
+    deviation = torch.tensor([0.3, 0.1, 0.4, 0.3, 0.03, 0.2], dtype=torch.float64)
+    start = (truth + torch.tensor([0.1, 0.05, -0.2, -0.15, 0.02, 0.1], dtype=torch.float64))[None]
+    share = torch.full((1, 1, 1), 0.3, dtype=torch.float64)
+    at, covariance, cost = fit_camera(start, mean, deviation, bodies, 10.0, share)
+    torch.testing.assert_close(at[0], truth, atol=1e-6, rtol=0)
+    assert float(cost[0]) < 1e-9
+    slope = jacobian(truth, bodies, 10.0).flatten(0, 2)
+    curvature = 0.3 * slope.T @ slope + torch.diag(deviation**-2)
+    torch.testing.assert_close(covariance[0], torch.linalg.inv(curvature), rtol=1e-3, atol=1e-9)
+
+
+def test_beliefs_about_cameras() -> None:
+    """Before anybody is seen: level within 20 and 3 degrees, 1.5 m high within 1.6 times, 60 degrees within 20."""
+    module, degree = CameraCalibrator(), math.pi / 180
+    expected = [0.0, 0.0, math.log(1.5), 60 * degree]
+    torch.testing.assert_close(module.mean, torch.tensor(expected, dtype=torch.float64))
+    assert module.deviation.tolist() == pytest.approx([20 * degree, 3 * degree, 0.45, 20 * degree])
+    assert math.exp(0.45) == pytest.approx(1.57, abs=0.01)
+    assert len(module.starts.unique(dim=0)) == 12
+
+
+def test_a_picture_of_one_pixel_is_a_picture() -> None:
+    nobody = torch.zeros(1, 1, 3, 17, dtype=torch.bool)[..., 0]
+    found = CameraCalibrator()(torch.zeros(1, 1, 3, 17, 2), torch.zeros(1, 1, 3, 17), nobody, 1, 1, 30.0)
+    assert float(found[2][0]) == pytest.approx(1.5)

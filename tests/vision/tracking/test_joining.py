@@ -94,3 +94,12 @@ def test_two_tracks_do_not_exchange_a_sure_for_a_doubtful_detection() -> None:
         tracks.boxes[0, 0], torch.tensor(STANDING, dtype=torch.float64).expand(40, 4), atol=1, rtol=0
     )
     assert tracks.valid[0, 1:, 30:].sum() == 0
+
+
+@pytest.mark.parametrize(("sure", "people"), [(4, 1), (5, 2)])
+def test_who_is_surely_there_twice_in_more_than_a_quarter_of_the_frames_is_two(
+    sure: int, people: int
+) -> None:
+    table, boxes, scores = clip((slice(0, 40), STANDING, 0.8), (slice(10, 26), HEAD, 0.4))
+    scores[10 : 10 + sure, 1] = 0.7
+    assert join_tracks(table, boxes, scores, torch.ones(40, dtype=torch.bool), 0.5, 23).shape[0] == people
