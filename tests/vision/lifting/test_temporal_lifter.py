@@ -225,3 +225,104 @@ def test_refuses_settings_that_cannot_be() -> None:
         PoseConfig(lifter="temporal", library="pool.safetensors")
     with pytest.raises(TensorsimError, match="lifter"):
         PoseConfig(lifter="best")  # type: ignore[arg-type]
+
+
+def sight_in_numpy(
+    keypoints: np.ndarray, scores: np.ndarray, joints: np.ndarray, joint_scores: np.ndarray, boxes: np.ndarray,
+    valid: np.ndarray, focal: float, center: np.ndarray, rotation: np.ndarray, extent: np.ndarray, fps: float,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """One track, frame by frame, with angles: features (T, 64), joints (T, 14, 2), elevation, size, azimuth (T,)."""
+    frames = len(keypoints)
+
+    def ray(pixel: np.ndarray) -> np.ndarray:
+        return rotation @ np.array([*((pixel - center) / focal), 1.0])
+
+    seen = (scores >= 0.3) & valid[:, None]
+    towards = np.zeros((frames, 3))
+    for t in np.flatnonzero(seen.sum(axis=1) >= 3):
+        units = [ray(k) / np.linalg.norm(ray(k)) for k in keypoints[t, seen[t]]]
+        towards[t] = np.mean(units, axis=0)
+    near = [slice(max(t - 10, 0), t + 11) for t in range(frames)]
+    counts = seen.sum(axis=1)
+    direction = np.array([towards[s][counts[s] >= 3].mean(axis=0) for s in near])
+    azimuth = np.arctan2(direction[:, 0], direction[:, 1])
+    elevation = direction[:, 2] / np.hypot(direction[:, 0], direction[:, 1])
+
+    def on_plane(t: int, pixel: np.ndarray) -> np.ndarray:
+        x, y, z = ray(pixel)
+        c, s = math.cos(azimuth[t]), math.sin(azimuth[t])
+        return np.array([x * c - y * s, z]) / (x * s + y * c)
+
+    log_size = np.zeros(frames)
+    for t in np.flatnonzero(counts >= 5):
+        points = np.array([on_plane(t, k) for k in keypoints[t, seen[t]]])
+        log_size[t] = np.log(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))) / 2
+    size = np.exp([log_size[s][counts[s] >= 5].mean() for s in near])
+    features, found = [], []
+    for t in range(frames):
+        offset = np.array([0.0, elevation[t]])
+        spot = [(on_plane(t, k) - offset) / size[t] * s for k, s in zip(keypoints[t], seen[t], strict=True)]
+        shown = (joint_scores[t] >= 0.3) & valid[t]
+        found.append([(on_plane(t, j) - offset) / size[t] * s for j, s in zip(joints[t], shown, strict=True)])
+        left, top, right, bottom = boxes[t]
+        middle = [(left + right) / 2, (top + bottom) / 2]
+        edges = [
+            on_plane(t, np.array([left, middle[1]]))[0] / size[t],
+            on_plane(t, np.array([right, middle[1]]))[0] / size[t],
+            (on_plane(t, np.array([middle[0], top]))[1] - elevation[t]) / size[t],
+            (on_plane(t, np.array([middle[0], bottom]))[1] - elevation[t]) / size[t],
+        ]
+        wide, tall = right - left, bottom - top
+        room = np.clip(
+            [left / wide, (extent[0] - right) / wide, top / tall, (extent[1] - bottom) / tall], 0, 1
+        )
+        more = [elevation[t], 1 + 0.5 * np.log(size[t]), valid[t], 30 / fps, counts[t] >= 5]
+        there = float(valid[t])
+        parts = [np.ravel(spot), scores[t] * seen[t], np.array(edges) * there, room * there, more]
+        features.append(np.concatenate(parts))
+    return np.array(features), np.array(found), elevation, size, azimuth
+
+
+def test_features_are_those_of_angles_in_numpy() -> None:
+    _, keypoints, scores, boxes, valid = filmed(30)
+    keypoints = keypoints + 3 * torch.randn(keypoints.shape, generator=torch.Generator().manual_seed(4))
+    boxes = boxes.clone()
+    boxes[0, :, 1] -= 30.0  # nearer to the upper edge of the picture than it is high
+    scores, valid = scores.clone(), valid.clone()
+    scores[0, 4, 7], scores[0, 9, 4:], scores[0, 11, 2:], scores[0, 13, 5] = 0.29, 0.1, 0.1, 0.3
+    valid[0, 20:23] = False
+    joints, joint_scores = coco_to_body(keypoints, scores)
+    rotation = camera_to_world(CAMERA)[:, :3].double()
+    focal, center = WIDTH / 2 / math.tan(CAMERA.horizontal_fov_rad / 2), ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    arguments = (keypoints, scores, joints, joint_scores, boxes, valid)
+    sight = level_sight(
+        *arguments,
+        torch.tensor([focal]).double(),
+        torch.tensor([center]).double(),
+        rotation[None],
+        torch.tensor([[WIDTH, HEIGHT]]).double(),
+        torch.tensor([24.0]).double(),
+    )
+    expected = sight_in_numpy(
+        *(x[0].numpy() for x in arguments), focal, np.array(center), rotation.numpy(),
+        np.array([WIDTH, HEIGHT]), 24.0,
+    )  # fmt: skip
+    angle = torch.atan2(sight.azimuth[0, :, 1], sight.azimuth[0, :, 0])
+    for mine, theirs in zip((*sight[:4], angle[None]), expected, strict=True):
+        np.testing.assert_allclose(mine[0].numpy(), theirs, atol=2e-5)
+
+
+def test_where_nobody_is_seen_for_long_the_camera_looks() -> None:
+    """Direction ahead of the camera, and a size of 0.08."""
+    _, keypoints, scores, boxes, valid = filmed(4)
+    joints, joint_scores = coco_to_body(keypoints, scores * 0)
+    one = torch.ones(1, dtype=torch.float64)
+    rotation = camera_to_world(CAMERA)[None, :, :3].double()
+    sight = level_sight(
+        keypoints, scores * 0, joints, joint_scores, boxes, valid, 500 * one, torch.tensor([[319.5, 239.5]]).double(),
+        rotation, torch.tensor([[WIDTH, HEIGHT]]).double(), 30 * one,
+    )  # fmt: skip
+    assert sight.size.unique().tolist() == pytest.approx([0.08])
+    np.testing.assert_allclose(sight.elevation.numpy(), math.tan(CAMERA.pitch_rad), rtol=1e-6)
+    assert float(torch.atan2(sight.azimuth[0, 0, 1], sight.azimuth[0, 0, 0])) == pytest.approx(CAMERA.yaw_rad)
+    assert not sight.joints.any()
