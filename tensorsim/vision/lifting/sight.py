@@ -125,7 +125,7 @@ def level_sight(
     mean = (unit * seen[..., None]).sum(dim=-2) / count.clamp(min=1.0)[..., None]
     ahead = rotation[:, None, :, 2]  # where nobody is for long
     direction = windowed_mean(mean, (count >= 3).to(there.dtype)) + 1e-6 * ahead
-    flat = direction[..., :2].square().sum(dim=-1).clamp(min=1e-18).sqrt()  # 1e-6 squared is not small
+    flat = direction[..., :2].square().sum(dim=-1).clamp(min=1e-18).sqrt()  # well below 1e-6 squared
     azimuth = torch.stack([direction[..., 1] / flat, direction[..., 0] / flat], dim=-1)
     elevation = (direction[..., 2] / flat).clamp(-4.0, 4.0)
 
