@@ -11,7 +11,10 @@ from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.floor import (
+    floor_under,
     fused_range,
+    looks_bent,
+    lowered,
     lowest_ankle,
     range_on_floor,
     upright_share,
@@ -131,3 +134,103 @@ def test_somebody_who_lies_is_on_the_floor() -> None:
     assert float((mid_hips(placed) - mid_hips(world))[:, 1].abs().max()) < 0.15
     assert float(placed[..., 2].min()) > -0.1
     assert float(placed[35:, :, 2].max()) < 0.7
+
+
+# ---- thresholds, from both sides -----------------------------------------------------------------------------
+
+
+def in_picture(
+    trunk_px: float = 60.0, lean_deg: float = 0.0, bones: tuple[float, float] = (1.0, 1.0)
+) -> Tensor:
+    """Joints (14, 2) with legs 100 px long from hip to ankle, whose bones are ``bones`` times as long."""
+    joints = torch.zeros(14, 2, dtype=torch.float64)
+    lean = math.radians(lean_deg)
+    joints[1] = trunk_px * torch.tensor([math.sin(lean), -math.cos(lean)])
+    for first, longer in zip((8, 11), bones, strict=True):
+        joints[first + 1] = torch.tensor([50 * math.sqrt(longer**2 - 1), 50.0])
+        joints[first + 2] = torch.tensor([0.0, 100.0])
+    return joints + 300.0
+
+
+@pytest.mark.parametrize(
+    ("image", "bent"),
+    [
+        (in_picture(), False),
+        (in_picture(trunk_px=41.0), False),
+        (in_picture(trunk_px=39.0), True),
+        (in_picture(trunk_px=89.0), False),
+        (in_picture(trunk_px=91.0), True),
+        (in_picture(lean_deg=39.0), False),
+        (in_picture(lean_deg=-41.0), True),
+        (in_picture(bones=(1.24, 1.24)), False),
+        (in_picture(bones=(1.26, 1.26)), True),
+        (in_picture(bones=(2.0, 1.0)), False),
+        (in_picture(bones=(1.0, 2.0)), False),
+        (-in_picture(), True),  # legs up
+    ],
+)
+def test_what_does_not_look_like_a_stand_is_bent(image: Tensor, bent: bool) -> None:
+    seen = torch.ones(14, dtype=torch.bool)
+    assert bool(looks_bent(image, seen)) is bent
+    for joint in range(14):
+        hidden = seen.clone()
+        hidden[joint] = False
+        matters = joint == 1 or joint >= 8
+        assert bool(looks_bent(image, hidden)) is (bent and not matters)
+
+
+def test_upright_share_between_its_ends() -> None:
+    joints = torch.zeros(4, 14, 3, dtype=torch.float64)
+    joints[:, 3, 2] = torch.tensor([0.5, 0.6, 0.69, 0.78]).double() * 1.8
+    share = upright_share(joints, torch.full((4,), 1.8, dtype=torch.float64))
+    assert share.tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0], abs=1e-6)
+
+
+def test_only_lines_that_fall_by_three_hundredths_meet_the_floor() -> None:
+    depth, floor = torch.zeros(14, dtype=torch.float64), torch.tensor(-1.5, dtype=torch.float64)
+    seen = torch.ones(14, dtype=torch.bool)
+    flat = torch.full((14,), -0.029, dtype=torch.float64)
+    assert range_on_floor(flat, depth, floor, seen)[0].isinf()
+    assert float(range_on_floor(flat - 0.002, depth, floor, seen)[0]) == pytest.approx(1.5 / 0.031)
+
+
+@pytest.mark.parametrize(("by_floor", "counts"), [(0.29, False), (0.31, True), (99.0, True), (101.0, False)])
+def test_floors_from_30_cm_to_100_m_count(by_floor: float, counts: bool) -> None:
+    half = torch.tensor([0.5], dtype=torch.float64)
+    size = torch.tensor([4.0], dtype=torch.float64)
+    _, share, precision = fused_range(
+        size,
+        half,
+        torch.tensor([by_floor]).double(),
+        torch.tensor([2.0]).double(),
+        torch.tensor([0.06]).double(),
+    )
+    variance = (4.0 * 0.09) ** 2
+    expected = 0.5 * variance / (variance + 0.0144) if counts else 0.0
+    assert float(share) == pytest.approx(expected)
+    assert float(precision) == pytest.approx(min(0.12**2 / (variance * (1 - expected)), 1.0))
+
+
+def test_near_ranges_are_good_to_a_centimetre_and_no_precision_is_below_a_thousandth() -> None:
+    far = torch.tensor([math.inf], dtype=torch.float64)
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    near = fused_range(0.05 * one, zero, far, far, 0.06 * one)[2]
+    assert float(near) == pytest.approx(1.0), "both are held at 1 cm"
+    assert float(fused_range(0.2 * one, zero, far, far, 0.06 * one)[2]) == pytest.approx(1e-4 / 0.03**2)
+
+
+def test_floor_is_a_low_quantile_of_the_lower_ankle() -> None:
+    """Ankles at 0.1 m but for a jump of 1.4 s, in a window of 3 s: the floor stays; what is lower for long counts."""
+    joints = torch.ones(120, 14, 3, dtype=torch.float64)
+    joints[:, (10, 13), 2] = 0.1
+    joints[:, 13, 2] += 0.3  # the lower one tells
+    joints[40:82, (10, 13), 2] += 0.5
+    there = torch.ones(120, dtype=torch.bool)
+    torch.testing.assert_close(floor_under(joints, there, 30.0, 3.0), torch.full((120,), 0.1).double())
+    once = joints.clone()
+    once[20:24, 10, 2] = -1.0  # four frames of ninety are less than 15 %
+    torch.testing.assert_close(floor_under(once, there, 30.0, 3.0)[30:90], torch.full((60,), 0.1).double())
+    there[20:24] = False
+    torch.testing.assert_close(floor_under(once, there, 30.0, 0.2), floor_under(joints, there, 30.0, 0.2))
+    down = lowered(joints, torch.full((120,), 0.25, dtype=torch.float64))
+    torch.testing.assert_close(joints - down, torch.tensor([0.0, 0.0, 0.25]).double().expand(120, 14, 3))
