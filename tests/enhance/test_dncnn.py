@@ -289,3 +289,9 @@ def test_refuses_bad_settings() -> None:
         MapDenoiser(small(), tile=0)
     with pytest.raises(TensorsimError, match="scale: got 'sqrt', expected one of"):
         MapDenoiser(small(), scale="sqrt")
+
+
+def test_normalisation_is_that_of_the_authors() -> None:
+    """KAIR builds its networks with an epsilon of 1e-4, ten times that of torch."""
+    norms = [module for module in DnCNN(depth=5).modules() if isinstance(module, nn.BatchNorm2d)]
+    assert [norm.eps for norm in norms] == [1e-4] * 3

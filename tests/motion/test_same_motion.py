@@ -1,4 +1,4 @@
-"""The same seed gives the same movement, release after release, and a slip in one of their many numbers shows.
+"""The same seed gives the same movements and echoes, release after release: slips in their many numbers show.
 
 After a change that is meant, ``python -m tests.motion.test_same_motion`` prints the new numbers.
 """
@@ -12,10 +12,17 @@ from torch.utils import _pytree as pytree
 
 from tensorsim.motion import everyday
 from tensorsim.motion.activities import ActivityGenerator, perform
+from tensorsim.motion.body13 import Body13Scatterers
+from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.exercises import EXERCISES
+from tensorsim.motion.limb_scatterers import LimbScatterers
 from tensorsim.motion.people import People, PeopleConfig, draw_people, nominal_people
 from tensorsim.motion.pose_sampler import FAMILIES, sample_angles, sample_poses
 from tensorsim.motion.scripts import SCRIPTS
+from tensorsim.motion.sway import PosturalSway
+from tensorsim.motion.vital_signs import VitalSigns
+
+TX, RX = (-0.1, 0.0, 1.5), (0.1, 0.0, 1.5)
 
 
 def people(count: int = 6) -> People:
@@ -37,6 +44,12 @@ def numbers(fields: object) -> Tensor:
     return torch.cat([torch.as_tensor(leaf).double().flatten() for leaf in pytree.tree_leaves(fields)])
 
 
+def scattered(stage: Callable[..., object]) -> Tensor:
+    """Positions and cross sections of two people who walk."""
+    joints = moved(SCRIPTS[7]).unflatten(1, (16, 5))[:2, :, 0]
+    return numbers(stage(joints, torch.full((2, 16), 0.9, dtype=torch.float64)))
+
+
 MOVEMENTS: dict[str, Callable[[], Tensor]] = {
     **{script.__name__: lambda script=script: moved(script) for script in SCRIPTS},  # type: ignore[misc]
     **{name: lambda script=script: moved(script) for name, script in EXERCISES.items()},  # type: ignore[misc]
@@ -47,6 +60,12 @@ MOVEMENTS: dict[str, Callable[[], Tensor]] = {
     "people": lambda: numbers(people(30)),
     "nominal people": lambda: numbers(nominal_people(3)),
     "generated": generated,
+    "body at 24 GHz": lambda: scattered(BodyScatterers(TX, RX, 24e9).double()),
+    "body at 77 GHz": lambda: scattered(BodyScatterers(TX, RX, 77e9, per_segment=2).double()),
+    "limbs": lambda: scattered(LimbScatterers(TX, RX).double()),
+    "sway": lambda: numbers(PosturalSway(30.0, seed=3).double()(moved(SCRIPTS[0])[:, :20])),
+    "vital signs": lambda: numbers(VitalSigns(30.0, seed=3).double()(moved(SCRIPTS[0])[:, :20])),
+    "13 parts": lambda: scattered(Body13Scatterers().double()),
     "poses": lambda: sample_poses(200, seed=3, limb_deviation=0.1),
     **{
         f"poses {family}": lambda family=family: numbers(  # type: ignore[misc]
@@ -88,6 +107,12 @@ EXPECTED: dict[str, tuple[float, float, float]] = {
     "people": (2.605459119, 11.314580193, 0.273716358),
     "nominal people": (2.639910796, 11.299597557, -0.122049055),
     "generated": (1.354291850, 2.048837490, 0.018859477),
+    "body at 24 GHz": (0.908127462, 2.046528189, 0.018789602),
+    "body at 77 GHz": (0.919122373, 2.050034158, 0.014323806),
+    "limbs": (0.883861972, 2.044381251, 0.024223990),
+    "sway": lambda: numbers(PosturalSway(30.0, seed=3).double()(moved(SCRIPTS[0])[:, :20])),
+    "vital signs": lambda: numbers(VitalSigns(30.0, seed=3).double()(moved(SCRIPTS[0])[:, :20])),
+    "13 parts": (0.978186514, 2.060814121, -0.011213718),
     "poses": (0.032511370, 0.185558932, 0.000755826),
     "poses 0": (0.107872149, 0.234981182, -0.011963000),
     "poses 1": (0.281702944, 0.611550721, -0.024892804),

@@ -9,7 +9,7 @@ import torch
 from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
+from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile, gate_bins
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.radar import reference
 from tests.radar.scenes import SMALL, complex_noise
@@ -102,3 +102,15 @@ def test_leakage_shows_at_its_delay():
 def test_bad_arguments():
     with pytest.raises(TensorsimError, match="window: got 'kaiser'"):
         RangeProfile(FREE, "kaiser")
+
+
+def test_a_gate_has_the_bins_within_it() -> None:
+    """Bins on its edges belong to it, also where 1.1 m over 0.1 m is a little more than 11."""
+    assert 1.1 / 0.1 > 11
+    assert gate_bins((1.1, 2.0), 0.1, 100) == (11, 20)
+    assert gate_bins((0.3, 0.7), 0.1, 100) == (3, 7)
+    assert gate_bins((1.10005, 1.99995), 0.1, 100) == (12, 19)
+    assert gate_bins((-5.0, 99.0), 0.1, 50) == (0, 49)
+    for gate in ((1.11, 1.19), (2.0, 1.0), (6.0, 7.0), (-2.0, -1.0), (0.0, float("nan"))):
+        with pytest.raises(TensorsimError, match="gate_m: got"):
+            gate_bins(gate, 0.1, 50)

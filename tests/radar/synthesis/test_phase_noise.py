@@ -123,3 +123,7 @@ def test_normal_numbers() -> None:
 
 def test_numbers_belong_to_their_pulse() -> None:
     assert torch.equal(normal(0, torch.arange(7, 12), 5), normal(0, torch.arange(20), 5)[7:12])
+
+
+def test_offsets_below_one_hertz_are_offsets() -> None:
+    assert PhaseNoise(RADAR, (0.5, 1e6), (-60.0, -100.0))(beat(10.0, 2)).isfinite().all()

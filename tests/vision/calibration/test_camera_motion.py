@@ -115,3 +115,12 @@ def test_the_similarity_is_that_of_the_background() -> None:
 def test_a_rate_that_cannot_be_is_refused() -> None:
     with pytest.raises(TensorsimError, match="fps"):
         BackgroundMotion(0.0)
+
+
+@pytest.mark.parametrize(
+    ("fps", "every", "steps"), [(30.0, 3, 10), (25.0, 2, 12), (60.0, 6, 10), (1.0, 1, 1)]
+)
+def test_pictures_a_tenth_of_a_second_apart_make_a_second(fps: float, every: int, steps: int) -> None:
+    motion = BackgroundMotion(fps)
+    assert (motion._every, motion._second) == (every, steps)
+    assert motion._per_s == pytest.approx(fps / (every * steps))

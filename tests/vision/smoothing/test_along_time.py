@@ -95,3 +95,11 @@ def test_brief_gaps_lie_between_seen_frames() -> None:
     expected = torch.tensor([[c == "b" for c in row] for row in brief])
     assert torch.equal(brief_gaps(seen, 2), expected)
     assert not brief_gaps(seen, 0).any()
+
+
+def test_only_ratios_of_weights_count() -> None:
+    x = torch.randn(30, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.linspace(0.1, 1.0, 30, dtype=torch.float64)
+    expected = local_linear(x, weights, 2.0)
+    torch.testing.assert_close(local_linear(x, 1e-7 * weights, 2.0), expected)
+    assert torch.equal(local_linear(x, 0 * weights, 2.0), x), "where nothing counts the value stays"
