@@ -105,9 +105,10 @@ def test_bad_arguments():
 
 
 def test_a_gate_has_the_bins_within_it() -> None:
-    """Bins on its edges belong to it, also where 1.1 m over 0.1 m is a little more than 11."""
-    assert 1.1 / 0.1 > 11
-    assert gate_bins((1.1, 2.0), 0.1, 100) == (11, 20)
+    """Bins on its edges belong to it, also where quotients are a little above or below whole numbers."""
+    assert 0.9 / 0.3 > 3
+    assert gate_bins((0.9, 2.1), 0.3, 100) == (3, 7)
+    assert 0.7 / 0.1 < 7
     assert gate_bins((0.3, 0.7), 0.1, 100) == (3, 7)
     assert gate_bins((1.10005, 1.99995), 0.1, 100) == (12, 19)
     assert gate_bins((-5.0, 99.0), 0.1, 50) == (0, 49)
