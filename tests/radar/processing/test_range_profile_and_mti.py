@@ -106,8 +106,8 @@ def test_bad_arguments():
 
 def test_a_gate_has_the_bins_within_it() -> None:
     """Bins on its edges belong to it, also where quotients are a little above or below whole numbers."""
-    assert 0.9 / 0.3 > 3
-    assert gate_bins((0.9, 2.1), 0.3, 100) == (3, 7)
+    assert 2.1 / 0.3 > 7
+    assert gate_bins((2.1, 3.0), 0.3, 100) == (7, 10)
     assert 0.7 / 0.1 < 7
     assert gate_bins((0.3, 0.7), 0.1, 100) == (3, 7)
     assert gate_bins((1.10005, 1.99995), 0.1, 100) == (12, 19)
