@@ -326,3 +326,23 @@ def test_where_nobody_is_seen_for_long_the_camera_looks() -> None:
     np.testing.assert_allclose(sight.elevation.numpy(), math.tan(CAMERA.pitch_rad), rtol=1e-6)
     assert float(torch.atan2(sight.azimuth[0, 0, 1], sight.azimuth[0, 0, 0])) == pytest.approx(CAMERA.yaw_rad)
     assert not sight.joints.any()
+
+
+@pytest.mark.parametrize(("shift", "moved"), [(0.5, 0.0), (1.5, 0.5), (2.1, 1.0), (5.0, 1.0)])
+def test_key_points_far_from_the_found_body_give_way_to_it(shift: float, moved: float) -> None:
+    """Up to ``near`` standing heights they stay, from twice that on the body's joints take their places."""
+    torch.manual_seed(0)
+    _, keypoints, scores, boxes, valid = filmed()
+    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()
+    with torch.no_grad():
+        found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        body, seen = coco_to_body(keypoints, scores)
+        exact = lifter.in_picture(
+            found, body, 0 * seen, HEIGHT, WIDTH
+        )  # the found body, where nothing is seen
+        away = exact.keypoints + torch.tensor([1.0, 0.0]) * shift * lifter.near * exact.scale[..., None, None]
+        lifted = lifter.in_picture(found, away, torch.ones_like(seen), HEIGHT, WIDTH)
+    share = ((away - lifted.keypoints)[..., 0] / (away - exact.keypoints)[..., 0]).mean()
+    assert float(share) == pytest.approx(moved, abs=0.005)  # the scale is that of the joints that count
+    if shift < 1.0:
+        assert torch.equal(lifted.keypoints, away)
