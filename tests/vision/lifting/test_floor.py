@@ -234,3 +234,65 @@ def test_floor_is_a_low_quantile_of_the_lower_ankle() -> None:
     torch.testing.assert_close(floor_under(once, there, 30.0, 0.2), floor_under(joints, there, 30.0, 0.2))
     down = lowered(joints, torch.full((120,), 0.25, dtype=torch.float64))
     torch.testing.assert_close(joints - down, torch.tensor([0.0, 0.0, 0.25]).double().expand(120, 14, 3))
+
+
+def at_once() -> tuple[Tensor, Tensor]:
+    """World joints (90, 14, 3) of 45 frames of a stand and 45 of a squat, and the frames of the squat."""
+    deep = torch.arange(90) >= 45
+    both = squat()
+    return torch.where(deep[:, None, None], both[-1], both[0]), deep
+
+
+def on_floor(world: Tensor, by_size: Tensor) -> tuple[Tensor, ...]:
+    """Ranges of the hips, which frames tell, who stands and precisions, of a level camera 1.8 m above the floor."""
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.8), focal_px=900.0, center_px=(640.0, 360.0))
+    image, lifted = film(world, camera)
+    module = MetricPose(camera, (TALL,))
+    ones = torch.ones(1, len(world), dtype=torch.float64)
+    return module._on_floor(
+        by_size[None], image[None], TALL * lifted.depth[None], 900.0 * ones, torch.tensor([640.0, 360.0]).double(),
+        module.camera_pose, torch.full((1, 1), TALL, dtype=torch.float64), ones[..., None].expand(1, -1, 14) > 0,
+        ones > 0, FPS,
+    )  # fmt: skip
+
+
+def test_floor_and_size_are_weighed_by_15_percent_and_6_centimetres() -> None:
+    world, deep = at_once()
+    true = mid_hips(world)[:, 1]
+    by_size = torch.where(deep, 1.3 * true, true)
+    ranges, tells, stands, _ = on_floor(world, by_size)
+    ankle = world[:, (10, 13)].mean(dim=1)
+    variance, floor_variance = (0.15 * by_size).square(), (0.06 * ankle[:, 1] / 1.8).square()
+    expected = by_size + variance / (variance + floor_variance) * (true - by_size)
+    torch.testing.assert_close(ranges[0, deep], expected[deep], atol=2e-3, rtol=0)
+    torch.testing.assert_close(ranges[0, ~deep], true[~deep], atol=1e-3, rtol=0)
+    assert bool(tells.all())
+    assert torch.equal(stands[0], ~deep)
+
+
+@pytest.mark.parametrize(("moved", "taken"), [(1.39, True), (1.41, False), (0.61, True), (0.59, False)])
+def test_nobody_falls_further_than_two_fifths_of_the_range(moved: float, taken: bool) -> None:
+    world, deep = at_once()
+    hips = mid_hips(world)[:, 1]
+    stood = float(hips[0])
+    world[..., 1] += torch.where(deep, moved * stood - hips, 0.0)[:, None]
+    ranges = on_floor(world, torch.full((90,), stood, dtype=torch.float64))[0][0, deep]
+    far = (ranges / stood - 1).abs()
+    assert bool((far > 0.3).all() if taken else (far < 0.01).all())
+
+
+def test_feet_at_the_lower_edge_of_the_picture_stand_on_nothing() -> None:
+    """From 0.97 of the picture's height on a foot may be cut off: the range is then that of the size."""
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.8), focal_px=900.0, center_px=(640.0, 360.0))
+    world = squat()
+    deep = upright_share(world, torch.tensor(TALL, dtype=torch.float64)) < 0.5
+    image, lifted = film(world, camera)
+    wrong = lifted._replace(scale=lifted.scale * torch.where(deep, 1 / 1.4, 1.0))
+    fields = Lifted(*(field[None, None] for field in wrong))
+    ones, feet = torch.ones(1, 1, 90, 14, dtype=torch.float64), image[:, (10, 13), 1]
+    for height, near in ((float(feet.max()) / 0.965, True), (float(feet.min()) / 0.975, False)):
+        placed, _ = MetricPose(camera, (TALL,))(
+            image[None, None], ones, fields, ones[..., 0] > 0, height, WIDTH, FPS
+        )
+        off = (mid_hips(placed[0, 0]) - mid_hips(world))[80:, 1].abs()
+        assert bool((off < 0.2).all() if near else (off > 0.4).all())
