@@ -296,3 +296,10 @@ def test_feet_at_the_lower_edge_of_the_picture_stand_on_nothing() -> None:
         )
         off = (mid_hips(placed[0, 0]) - mid_hips(world))[80:, 1].abs()
         assert bool((off < 0.2).all() if near else (off > 0.4).all())
+
+
+def test_who_is_nine_tenths_upright_stands() -> None:
+    world = squat()
+    share = upright_share(world, torch.tensor(TALL, dtype=torch.float64))
+    assert share[43:45].tolist() == pytest.approx([0.95, 0.86], abs=0.01), "on both sides"
+    assert torch.equal(on_floor(world, mid_hips(world)[:, 1])[2][0], share >= 0.9)
