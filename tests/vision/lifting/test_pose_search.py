@@ -84,6 +84,17 @@ def test_equal_weights_give_the_nearest_neighbours_of_normalised_poses(chunk: in
 
 
 @pytest.mark.usefixtures("small_blocks")
+def test_what_fits_badly_is_searched_exactly_too() -> None:
+    """Cosines far from one are rounded by more than bounds of the products say: the threshold allows for it."""
+    library = standardise_poses(sample_poses(600, seed=4))
+    keypoints = torch.randn(60, 14, 2, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    index = PoseSearch(library, 8, 32, 2**22)(keypoints, torch.ones(60, 14, dtype=torch.float64)).numpy()
+    distance = brute_force(keypoints.numpy(), all_headings(library, 8).numpy())
+    found = np.take_along_axis(distance, index, axis=1)
+    np.testing.assert_allclose(found, np.sort(distance, axis=1)[:, :32], atol=1e-9, rtol=0)
+
+
+@pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("neighbours", [1, 32])
 def test_float32_finds_the_same(neighbours: int) -> None:
     library = standardise_poses(sample_poses(2000, seed=4)).float()
