@@ -9,7 +9,7 @@ import torch
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.skeleton import body_to_coco
-from tensorsim.config import CameraConfig
+from tensorsim.config import JOINTS, CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 
@@ -107,3 +107,21 @@ def test_boxes_surround_the_keypoints_that_have_a_score() -> None:
     extra = 0.1 * (high - low).max()
     np.testing.assert_allclose(boxes[0].numpy(), [*(low - extra), *(high + extra)], rtol=1e-5)
     assert (boxes[1] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("u", "v"), [(-0.5, 100.0), (WIDTH - 0.5, 100.0), (100.0, -0.5), (100.0, HEIGHT - 0.5)]
+)
+def test_the_picture_reaches_half_a_pixel_beyond_the_centres_of_its_edges(u: float, v: float) -> None:
+    camera, wrist = CameraConfig(), JOINTS.index("right_wrist")
+    focal = WIDTH / 2 / math.tan(camera.horizontal_fov_rad / 2)
+    middle = torch.tensor([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+    for pixels, inside in ((0.1, 1.0), (-0.1, 0.0)):
+        pixel = torch.tensor([u, v])
+        pixel = pixel + pixels * (middle - pixel).sign() * (torch.tensor([u, v]) != 100.0)
+        across = (pixel - middle) / focal * 3.0
+        joints = bodies((0.0, 3.0))[:, :1].clone()
+        joints[0, 0, wrist] = torch.stack([across[0], torch.tensor(3.0), 1.5 - across[1]])
+        keypoints, scores = seen_keypoints(joints, torch.ones(1, 1, dtype=torch.bool), camera, HEIGHT, WIDTH)
+        torch.testing.assert_close(keypoints[0, 0, 10], pixel.double(), atol=1e-4, rtol=0)
+        assert float(scores[0, 0, 10]) == inside

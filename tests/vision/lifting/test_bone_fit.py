@@ -13,7 +13,8 @@ from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.lifting.block_tridiagonal import solve_block_tridiagonal
 from tensorsim.vision.lifting.bone_branches import choose_branches, smoothest_sequence
-from tensorsim.vision.lifting.bone_cost import expected_acceleration
+from tensorsim.vision.lifting.bone_cost import BoneClip, BoneCost, expected_acceleration
+from tensorsim.vision.lifting.bone_descent import BoneDescent, second_difference_hessian
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tests.stage import StageTester
 
@@ -327,3 +328,46 @@ def test_settings_are_checked() -> None:
     ):
         with pytest.raises(TensorsimError, match=message):
             BoneFit(**options)
+
+
+@pytest.mark.parametrize("frames", [3, 6, 7])
+@pytest.mark.parametrize("floor", [False, True])
+def test_a_step_is_that_of_the_dense_normal_equations(frames: int, floor: bool) -> None:
+    """Gauss-Newton with damping: gradient and Jacobian by automatic differentiation, one matrix for everything."""
+    generator = torch.Generator().manual_seed(frames)
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    lines = torch.nn.functional.normalize(random(2, frames, 13, 3) - 0.5, dim=-1)
+    stiffness = torch.nn.functional.pad(50 * random(2, frames - 2, 13), [0, 0, 2, 2])
+    clip = BoneClip(
+        lines, 4 + random(2, frames, 13), 0.1 + random(2, 8), random(2, frames, 13, 2) - 0.3, stiffness,
+        30 * (random(2, frames, 13) > 0.2), 0.01 * (random(2, frames, 12) > 0.7),
+    )  # fmt: skip
+    cost = BoneCost(0.025, 0.05, 0.3, 0.3, 0.005, floor).double()
+    r, stretch, bone_m = clip.given + 0.1 * random(2, frames, 13), 0.1 * random(2, 8), 0.02 + 0.01 * random(2)
+    damping = torch.tensor([1.0, 0.03], dtype=torch.float64)
+    parts = second_difference_hessian(clip.stiffness, frames)
+    found = BoneDescent(cost)._step(clip, r, stretch, bone_m, damping, *parts)
+    step, stretch_step = (x.numpy() for x in found)
+
+    count = 13 * frames
+    jacobian_of = torch.autograd.functional.jacobian
+    gradients = jacobian_of(lambda a, b: cost(clip, a, b, bone_m).sum() / 2, (r, stretch))
+    slopes = jacobian_of(lambda a, b: cost.bone_errors(clip, a, b, bone_m)[2], (r, stretch))
+    for k in range(2):
+        by_r = slopes[0][k, :, :, k].reshape(frames * 12, count)
+        jacobian = torch.cat([by_r, slopes[1][k, :, :, k].reshape(frames * 12, 8)], dim=1).numpy()
+        matrix = jacobian.T @ jacobian
+        matrix[:count, :count] += torch.block_diag(*cost.given(clip, r)[1][k]).numpy() + 250 * float(
+            damping[k]
+        ) * np.eye(count)
+        if floor:
+            matrix[:count, :count] += np.diag(cost.floor(clip, r)[1][k].flatten())
+        bend = np.kron(np.diff(np.eye(frames), 2, axis=0), np.eye(13))
+        matrix[:count, :count] += bend.T @ np.diag(stiffness[k, 2:-2].flatten()) @ bend
+        matrix[count:, count:] += (1 / 0.025**2 + 1000 * float(damping[k])) * np.eye(8)
+        expected = np.linalg.solve(matrix, -torch.cat([g[k].flatten() for g in gradients]).numpy())
+        np.testing.assert_allclose(step[k].ravel(), expected[:count], rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(stretch_step[k], expected[count:], rtol=1e-7, atol=1e-10)
