@@ -236,3 +236,8 @@ def test_echo_of_the_targets_refuses_what_has_no_echo(scale, rcs, message):
     positions = scale * torch.tensor([[0.0, 3.0, 1.0], [0.0, 4.0, 1.0]])
     with pytest.raises(TensorsimError, match=message):
         EchoSynthesizer(FREE).target_echo(positions, torch.tensor([1.0, rcs]))
+
+
+def test_times_of_pulses_go_on_from_the_first() -> None:
+    times = EchoSynthesizer(RadarConfig(prf_hz=500.0)).pulse_times(1000, 4)
+    assert times.tolist() == pytest.approx([2.0, 2.002, 2.004, 2.006], abs=1e-12)
