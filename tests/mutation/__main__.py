@@ -1,8 +1,8 @@
 """Which slips do the nearest tests not notice? Prints them, and the share that is noticed.
 
 ``python -m tests.mutation --count 300`` takes the same slips at every call with the same ``--seed`` and goes on
-where the results in ``--results`` end, until ``--minutes`` have passed. ``--again`` tries once more those that were not
-noticed. A file alone, ``FILE`` or ``FILE:LINE``, takes only the slips of that file or line.
+where the results in ``--results`` end, until ``--minutes`` have passed. ``--again`` tries once more those that were
+neither noticed nor explained in ``equivalent.txt``. A file alone, ``FILE`` or ``FILE:LINE``, takes only the slips of that file or line.
 """
 
 import argparse
@@ -47,7 +47,9 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=float("inf"))
     parser.add_argument("--results", type=Path, default=Path("out/mutation"))
-    parser.add_argument("--again", action="store_true", help="try once more what was not noticed")
+    parser.add_argument(
+        "--again", action="store_true", help="try once more what was neither noticed nor explained"
+    )
     return parser.parse_args()
 
 
@@ -57,7 +59,9 @@ def main() -> None:
     sample = sampled(options.places, options.count, options.seed)
     stored = options.results / "outcomes.json"
     results = json.loads(stored.read_text()) if stored.is_file() else {}
-    left = [n for n in sample if n not in results or (options.again and results[n] == "survives")]
+    reasons = explained()
+    doubtful = [name for name in sample if results.get(name) == "survives" and name not in reasons]
+    left = [*(doubtful if options.again else []), *(name for name in sample if name not in results)]
     with Runner(options.results) as runner:
         for name in tqdm(left, unit="slip", file=sys.stderr, mininterval=5):
             if time.monotonic() - begin > 60 * options.minutes:
@@ -65,7 +69,7 @@ def main() -> None:
             results[name] = runner.outcome(*sample[name])
             stored.write_text(json.dumps(results, indent=1))
 
-    reasons, done = explained(), [name for name in sample if name in results]
+    done = [name for name in sample if name in results]
     survivors = [name for name in done if results[name] == "survives"]
     for name in survivors:
         file, slip = sample[name]

@@ -112,3 +112,12 @@ def test_power_is_differentiable():
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(TensorsimError, match=message):
         PointCloud(0.04, 0.6, **settings)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(2, 6), (6, 2)])
+def test_maps_of_a_batch_with_fewer_cells_than_points(rows, columns):
+    cube = complex_noise(3, A, rows, columns)
+    found = torch.ones(3, rows, columns, dtype=torch.bool)
+    points = PointCloud(1.0, 1.0, points=20, peaks_only=False)(cube, found)
+    assert points.valid.sum(-1).tolist() == [12, 12, 12], "every cell is a point"
+    assert not points.valid[:, 12:].any()
