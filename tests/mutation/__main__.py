@@ -2,7 +2,8 @@
 
 ``python -m tests.mutation --count 300`` takes the same slips at every call with the same ``--seed`` and goes on
 where the results in ``--results`` end, until ``--minutes`` have passed. ``--again`` tries once more those that were
-neither noticed nor explained in ``equivalent.txt``. A file alone, ``FILE`` or ``FILE:LINE``, takes only the slips of that file or line.
+neither noticed nor explained in ``equivalent.txt``. ``FILE`` or ``FILE:LINE`` takes only the slips of that file or
+line.
 """
 
 import argparse
