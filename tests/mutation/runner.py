@@ -98,7 +98,7 @@ class Runner:
         """Each test of a file with its seconds and the lines that it runs, without a slip."""
         if test not in self._watched:
             key = self._package.copy()
-            key.update(test.read_bytes())
+            key.update((self.root / test.relative_to(ROOT)).read_bytes())
             stored = self.store / f"{test.stem}.{key.hexdigest()[:16]}.json"
             if not stored.is_file():
                 scratch = Path(self._folder.name) / "watched.json"
