@@ -16,6 +16,7 @@ from tensorsim.evaluation.camera import (
     known_camera,
     walk_before,
 )
+from tensorsim.vision.calibration import calibrator
 from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, with_reserve
 from tensorsim.vision.calibration.camera_fit import (
     Bodies,
@@ -85,17 +86,17 @@ def test_somebody_who_walks_tells_the_camera(tilt: float, height: float, fov: fl
 
 
 def test_nobody_tells_nothing() -> None:
-    calibrator = CameraCalibrator(most_frames=10)
+    module = CameraCalibrator(most_frames=10)
     args = TestCameraCalibrator().inputs((), torch.float64)
     lying = args[0].flip(-1)
     for keypoints, valid in ((args[0], torch.zeros_like(args[2])), (lying, args[2])):
-        found = calibrator(keypoints, args[1], valid, *args[3:])
+        found = module(keypoints, args[1], valid, *args[3:])
         assert int(found.frames) == 0
         assert float(found.pitch_rad) == pytest.approx(0.0, abs=1e-6)
         assert float(found.horizontal_fov_rad) == pytest.approx(math.pi / 3, abs=1e-6)
         assert float(found.height_m) == pytest.approx(1.5, abs=1e-6)
         assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0), rel=1e-3)
-    found = calibrator(args[0][:0], args[1][:0], args[2][:0], *args[3:])
+    found = module(args[0][:0], args[1][:0], args[2][:0], *args[3:])
     assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0))
 
 
@@ -280,3 +281,40 @@ def test_a_picture_of_one_pixel_is_a_picture() -> None:
     nobody = torch.zeros(1, 1, 3, 17, dtype=torch.bool)[..., 0]
     found = CameraCalibrator()(torch.zeros(1, 1, 3, 17, 2), torch.zeros(1, 1, 3, 17), nobody, 1, 1, 30.0)
     assert float(found[2][0]) == pytest.approx(1.5)
+
+
+def test_bodies_that_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half the time in place, then going: heights of ankles and shoulders of a stand and of a walk, and their noise."""
+    time = torch.arange(120, dtype=torch.float64) / FPS
+    body = standing(400.0, 200.0).expand(120, 17, 2).clone()
+    going = (time - 2.0).clamp(min=0.0)
+    body[:, 15, 0] += 25 * (2 * math.pi * going).sin()
+    body[:, 16, 0] -= 25 * (2 * math.pi * going).sin()
+    body = body + torch.stack([60 * going, 0 * going], dim=-1)[:, None]
+    taken: list[Any] = []
+
+    def fit(start: Tensor, mean: Tensor, deviation: Tensor, bodies: Bodies, *_: Any) -> Any:
+        taken.extend([mean, deviation, bodies])
+        return start, torch.eye(start.shape[1]).double().expand(len(start), -1, -1), torch.zeros(len(start))
+
+    monkeypatch.setattr(calibrator, "fit_camera", fit)
+    there = torch.ones(1, 120, dtype=torch.bool)
+    CameraCalibrator((1.6,))(body[None], torch.ones(1, 120, 17).double(), there, HEIGHT, WIDTH, FPS)
+    mean, deviation, bodies = taken
+    assert bodies.walking[0, :45].max() == 0
+    assert bodies.walking[0, 80:100].min() == 1
+    for when, shares in ((slice(0, 45), (0.039, 0.818)), (slice(80, 100), (0.075, 0.798))):
+        expected = 1.6 * torch.tensor(shares, dtype=torch.float64)
+        torch.testing.assert_close(
+            bodies.above_floor[0, when], expected.expand_as(bodies.above_floor[0, when])
+        )
+    assert bodies.lean_m.tolist() == pytest.approx([0.03 * 1.6])
+    ankles, shoulders = body[10, 15:].mean(dim=0), body[10, 5:7].mean(dim=0)
+    middle = torch.tensor([(WIDTH - 1) / 2, (HEIGHT - 1) / 2], dtype=torch.float64)
+    torch.testing.assert_close(
+        bodies.image[0, 10], (torch.stack([ankles, shoulders]) - middle) / (WIDTH / 2), atol=1e-3, rtol=0
+    )
+    size = float((ankles - shoulders).norm()) / (WIDTH / 2)
+    assert float(bodies.noise[0, 10]) == pytest.approx(math.hypot(0.02 * size, 2 / (WIDTH / 2)), rel=1e-3)
+    assert mean[4:].tolist() == pytest.approx([0.0, math.log(0.7 * 1.6)])
+    assert deviation[4:].tolist() == pytest.approx([0.08 / 1.6, 0.2])

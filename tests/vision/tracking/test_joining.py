@@ -103,3 +103,14 @@ def test_who_is_surely_there_twice_in_more_than_a_quarter_of_the_frames_is_two(
     table, boxes, scores = clip((slice(0, 40), STANDING, 0.8), (slice(10, 26), HEAD, 0.4))
     scores[10 : 10 + sure, 1] = 0.7
     assert join_tracks(table, boxes, scores, torch.ones(40, dtype=torch.bool), 0.5, 23).shape[0] == people
+
+
+def test_pairs_are_found_where_there_are_more_tracks_than_frames() -> None:
+    table = torch.tensor([[0, 0], [1, 1], [2, -1], [-1, 2]])
+    right = torch.tensor([300.0, 0.0, 300.0, 0.0], dtype=torch.float64)
+    standing = torch.tensor(STANDING, dtype=torch.float64)
+    boxes = torch.stack([standing + right, standing + 2 * right, standing]).expand(2, 3, 4)
+    found = join_tracks(
+        table, boxes, torch.full((2, 3), 0.8).double(), torch.ones(2, dtype=torch.bool), 0.5, 5
+    )
+    assert found.tolist() == [[0, 0], [1, 1], [2, 2]]
