@@ -292,3 +292,30 @@ def test_lifts_motion_capture_that_it_has_not_seen(shared_data: Path, pool: str)
     assert default[0] < (9.0 if pool == "other clips" else 13.0)
     assert default[0] < nearest[0]
     assert default[1] < 0.6 * nearest[1]
+
+
+@pytest.mark.parametrize("there", [(True, True, True), (True, False, True), (False, False, True)])
+def test_shares_are_those_of_all_sequences(there: tuple[bool, ...]) -> None:
+    """Probabilities of candidates by enumeration of all 3^3 sequences; poses of the first two frames are the same."""
+    generator = torch.Generator().manual_seed(0)
+    lifter = NearestPoseLifter(standardise_poses(sample_poses(20)), yaws=1, neighbours=3, tolerance=0.1)
+    poses = 0.01 * torch.randn(1, 3, 3, 14, 3, generator=generator, dtype=torch.float64)
+    poses[:, 1] = poses[:, 0]
+    scale = 200 + torch.rand(1, 3, 3, generator=generator, dtype=torch.float64)
+    distance = 0.02 * torch.rand(1, 3, 3, generator=generator, dtype=torch.float64)
+    found = lifter._share(poses, scale, distance, torch.tensor([there]))
+
+    weight = np.zeros((3, 3, 3))
+    size = lifter.change / lifter.size_change * np.log(scale[0].numpy())
+    for path in np.ndindex(3, 3, 3):
+        total = sum(-0.5 / 0.1**2 * float(distance[0, t, path[t]]) * there[t] for t in range(3))
+        for t in range(2):
+            a, b = poses[0, t, path[t]].numpy(), poses[0, t + 1, path[t + 1]].numpy()
+            change = np.sum((a - b) ** 2) / 14 + (size[t, path[t]] - size[t + 1, path[t + 1]]) ** 2
+            kept = t == 0 and not (there[0] and there[1])  # a frame without a pose has that of its neighbour
+            moved = 0.0 if path[t] == path[t + 1] else -np.inf
+            total += moved if kept else -0.5 / lifter.change**2 * change
+        weight[path] = np.exp(total)
+    weight /= weight.sum()
+    expected = np.stack([weight.sum(axis=tuple({0, 1, 2} - {t})) for t in range(3)])
+    np.testing.assert_allclose(found[0].numpy(), expected, atol=1e-6)
