@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tensorsim.commands.training import PeopleOptions
-from tensorsim.exceptions import check_positive
+from tensorsim.exceptions import TensorsimError, check_positive
 
 if TYPE_CHECKING:
     from tensorsim.training.pose_data import Person
@@ -47,6 +47,8 @@ class TrainPose(PeopleOptions):
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 
         check_positive(self.learning_rate, "--learning-rate")
+        if self.first_steps > 0 and (min(self.first_size) < 32 or any(side % 32 for side in self.first_size)):
+            raise TensorsimError(f"--first-size: got {self.first_size}, expected (H, W), multiples of 32")
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=500)
         torch.manual_seed(self.seed)
         net = HRNet(HRNetConfig(self.width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)

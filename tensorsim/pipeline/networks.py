@@ -23,7 +23,7 @@ def top_down(pose: nn.Module, flip_test: bool = True) -> nn.Module:
     """A heat-map network as a stage (frames, boxes, valid) -> (key points, scores); such a stage stays as it is."""
     if is_pose_estimator(pose):
         return check_part(pose, "pose")
-    return TopDownPose(check_part(pose, "network"), flip_test=flip_test)
+    return TopDownPose(check_part(pose, "network"), flip_test=flip_test, stand_up=True)
 
 
 def pretrained_detector(source: str | os.PathLike[str] | None = None) -> RTMDet | AcfDetector:
@@ -63,7 +63,7 @@ def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: boo
         network = CPM.from_pretrained(source)
     else:
         network = HRNet.from_pretrained(source)
-    return TopDownPose(network, flip_test=flip_test)
+    return TopDownPose(network, flip_test=flip_test, stand_up=True)
 
 
 def pretrained_lifter(people: PoseConfig) -> NearestPoseLifter | TemporalLifter:

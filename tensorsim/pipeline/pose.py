@@ -104,6 +104,8 @@ class VideoToPose(nn.Module):
         self.detection_interval = detection_interval
         self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
+        #: Who is hidden for longer is gone until they are seen again.
+        self.longest_gap_s = 1.0
         #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
         self.noise_share = 0.03
         #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
@@ -338,8 +340,9 @@ class VideoToPose(nn.Module):
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
-        # Nobody is where no frame of a track shows a joint.
-        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & usable.any(dim=-1, keepdim=True))
+        # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
+        there = usable | brief_gaps(usable, int(self.longest_gap_s * fps))
+        return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
 
 
 def _camera_position(metric_pose: nn.Module) -> tuple[float, float, float]:

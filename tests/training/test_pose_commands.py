@@ -80,6 +80,7 @@ def test_nobody_held_out_is_trained_on(data: Path) -> None:
         ({"rendered_seed": -1}, "--rendered-seed: got -1"),
         ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
         ({"width": 0}, "HRNetConfig"),
+        ({"first_steps": 1, "first_size": (192, 144)}, r"--first-size: got \(192, 144\), expected"),
     ],
 )
 def test_bad_options_are_refused_before_people_are_rendered(

@@ -15,12 +15,13 @@ FPS, FRAMES = 30.0, 24
 def lifted(scores: torch.Tensor, sideways_px: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Joints (T, 14, 3) and validity (T,) of a standing body, its wrists moved by (T,) pixels."""
     body = torch.tensor(STANDING) * 200.0 + torch.tensor([320.0, 150.0])
-    keypoints = body.expand(1, 1, FRAMES, 17, 2).clone()
+    frames = len(sideways_px)
+    keypoints = body.expand(1, 1, frames, 17, 2).clone()
     keypoints[0, 0, :, 9:11, 0] += sideways_px[:, None]
-    there = torch.ones(1, 1, FRAMES, dtype=torch.bool)
-    tracks = Tracks(torch.zeros(1, 1, FRAMES, 4), there, there)
+    there = torch.ones(1, 1, frames, dtype=torch.bool)
+    tracks = Tracks(torch.zeros(1, 1, frames, 4), there, there)
     stage = VideoToPose(nn.Identity(), nn.Identity(), lifter=NearestPoseLifter(load_pose_library()[::40]))
-    pose = stage.lift(tracks, keypoints, scores.expand(1, 1, FRAMES, 17), 480, 640, FPS)
+    pose = stage.lift(tracks, keypoints, scores.expand(1, 1, frames, 17), 480, 640, FPS)
     return pose.joints[0, 0], pose.valid[0, 0]
 
 
@@ -46,3 +47,12 @@ def test_no_joint_is_faster_than_a_body_can_move() -> None:
     assert float((joints[12:14, (4, 7)] - joints[8, (4, 7)]).norm(dim=-1).max()) < 0.3, (
         "taken out, not followed"
     )
+
+
+def test_who_is_hidden_for_long_is_gone_and_for_a_moment_is_not() -> None:
+    scores = torch.ones(120, 17)
+    scores[10:30] = 0.0  # 0.67 s
+    scores[50:90] = 0.0  # 1.33 s
+    scores[110:] = 0.0  # never seen again
+    _, valid = lifted(scores, torch.zeros(120))
+    assert (~valid).nonzero()[:, 0].tolist() == [*range(50, 90), *range(110, 120)]

@@ -17,6 +17,7 @@ from tensorsim.vision.calibration.upright import (
     WALKING,
     ends_of_body,
     is_upright,
+    steadily,
     walking_share,
 )
 from tensorsim.vision.smoothing.along_time import local_linear
@@ -207,7 +208,7 @@ class CameraCalibrator(nn.Module):
     ) -> Tensor:
         """Means, deviations and number of frames (9,) of the camera of one clip of key points (P, T, 17, 2)."""
         people, frames = valid.shape[0], valid.shape[1]
-        upright = is_upright(keypoints, scores, self.keypoint_threshold) & valid
+        upright = steadily(is_upright(keypoints, scores, self.keypoint_threshold), valid, fps)
         count = upright.sum().reshape(1).double()
         walking = walking_share(keypoints, upright, fps)
         ends = ends_of_body(keypoints)

@@ -56,6 +56,19 @@ def is_upright(keypoints: Tensor, scores: Tensor, threshold: float) -> Tensor:
     return seen & down & aligned & (bones < 1.35) & (ratio > 0.4) & (ratio < 1.1) & (legs_px > 10.0)
 
 
+def steadily(upright: Tensor, valid: Tensor, fps: float, share: float = 0.8) -> Tensor:
+    """Frames (..., T) bool in which a body is upright, as it is in most valid frames within 0.4 s.
+
+    Somebody who sits looks upright in a frame here and there.
+    """
+    radius = int(0.4 * fps)
+    ones = torch.ones(1, 1, 2 * radius + 1, dtype=torch.float64, device=upright.device)
+    stacked = torch.stack([upright & valid, valid]).to(torch.float64)
+    counts = torch.nn.functional.conv1d(stacked.reshape(-1, 1, upright.shape[-1]), ones, padding=radius)
+    counts = counts.reshape(stacked.shape)
+    return upright & valid & (counts[0] >= share * counts[1])
+
+
 def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
     """How much people walk: 0 standing to 1 walking, from how the ankles move against each other within a second.
 

@@ -213,7 +213,11 @@ class MetricPose(nn.Module):
             # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
             # reliable: those frames follow the others.
             many = seen.sum(dim=-1) >= self.whole_body_joints
+            # Of who is cut off by the left or right edge of the picture, the network puts what is beyond at the edge.
+            across = keypoints[..., 0] / max(image_width - 1, 1)
+            beyond = (seen & ((across < 0.01) | (across > 0.99))).any(dim=-1)
             whole = valid & many & (lifted.distance < self.poor_fit)
+            whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid & many)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
             center = self._center_px(keypoints, image_height, image_width)

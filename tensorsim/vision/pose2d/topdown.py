@@ -1,10 +1,12 @@
 """Top-down pose estimation: boxes of people in images to COCO-17 keypoints, through crops and heat maps."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from tensorsim.config import COCO_KEYPOINTS
-from tensorsim.errors import TensorsimError, check_finite, check_rank, check_size
+from tensorsim.errors import TensorsimError, check_finite, check_rank, check_size, is_exporting
 from tensorsim.vision.pose2d.crops import BoxCrop, check_boxes, crop_to_image
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 
@@ -42,6 +44,28 @@ class FlipTest(nn.Module):
         return (maps + turned) / 2
 
 
+def quarter_turns(keypoints: Tensor) -> Tensor:
+    """Quarter turns counter-clockwise, 0 to 3, that bring the trunk of COCO keypoints (..., 17, 2) nearest to upright.
+
+    Returns:
+        (...) int64.
+    """
+    up = keypoints[..., 5:7, :].mean(-2) - keypoints[..., 11:13, :].mean(-2)  # from the hips to the shoulders
+    return torch.atan2(up[..., 0], -up[..., 1]).div(math.pi / 2).round().long().remainder(4)
+
+
+def turn_back(points: Tensor, turns: int, height: int, width: int) -> Tensor:
+    """Points (..., 2) of ``rot90(crop, turns)`` to points of the crop, which is of this height and width."""
+    u, v = points[..., 0], points[..., 1]
+    if turns == 1:
+        return torch.stack([width - 1 - v, u], -1)
+    if turns == 2:
+        return torch.stack([width - 1 - u, height - 1 - v], -1)
+    if turns == 3:
+        return torch.stack([v, height - 1 - u], -1)
+    return points
+
+
 class TopDownPose(nn.Module):
     """Keypoints of the people in boxes: crop, heat maps, decode, back to the image.
 
@@ -57,6 +81,8 @@ class TopDownPose(nn.Module):
         crop_size: (H, W) of the crops; None takes the ``input_size`` of the network, or (256, 192) if it has
             none.
         crops_per_batch: how many crops the network gets at once.
+        stand_up: whoever leans by more than 45 degrees is looked at again, turned by quarter turns to stand upright,
+            and the keypoints with the higher mean score are kept: networks have seen few people who lie.
 
     Raises:
         TensorsimError: arguments out of range; ranks or batch sizes that do not fit; integer boxes; valid boxes that
@@ -71,6 +97,7 @@ class TopDownPose(nn.Module):
         padding: float = 1.25,
         crop_size: tuple[int, int] | None = None,
         crops_per_batch: int = 32,
+        stand_up: bool = False,
     ) -> None:
         super().__init__()
         if crops_per_batch < 1:
@@ -78,11 +105,15 @@ class TopDownPose(nn.Module):
         if crop_size is None:
             crop_size = getattr(network, "input_size", (256, 192))
         self.crop = BoxCrop(crop_size, padding)
+        self.wide_crop = BoxCrop(
+            (crop_size[1], crop_size[0]), padding
+        )  # to be turned by one quarter or three
         self.network = FlipTest(network) if flip_test else network
         if isinstance(decode, str):
             decode = HeatmapDecoder(decode, stride=getattr(network, "stride", 4))
         self.decoder = decode
         self.crops_per_batch = crops_per_batch
+        self.stand_up = stand_up
         self.keypoints = len(COCO_KEYPOINTS)
 
     def forward(self, images: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,14 +148,12 @@ class TopDownPose(nn.Module):
         heights = [boxes.new_zeros(0, self.keypoints)]
         for start in range(0, people.shape[0], self.crops_per_batch):
             some = people[start : start + self.crops_per_batch]
-            crops = self.crop(images, some, image_of[start : start + self.crops_per_batch])
-            points, scores = self.decoder(self.network(crops))
-            found.append(
-                crop_to_image(points, some, self.crop.height, self.crop.width, self.crop.padding).to(
-                    boxes.dtype
-                )
-            )
-            heights.append(scores.to(boxes.dtype))
+            index = image_of[start : start + self.crops_per_batch]
+            points, scores = self.look(images, some, index, 0)
+            if self.stand_up and not is_exporting():
+                points, scores = self.look_again(images, some, index, points, scores)
+            found.append(points)
+            heights.append(scores)
         person_scores = torch.cat(heights)
         check_finite(person_scores, "TopDownPose heat maps")
 
@@ -133,3 +162,33 @@ class TopDownPose(nn.Module):
         keypoints[valid] = torch.cat(found)
         keypoint_scores[valid] = person_scores
         return keypoints, keypoint_scores
+
+    def look(self, images: Tensor, boxes: Tensor, index: Tensor, turns: int) -> tuple[Tensor, Tensor]:
+        """Keypoints (N, 17, 2) in pixels of the image and scores (N, 17) of boxes (N, 4), in crops turned so often."""
+        if turns % 2 == 1:
+            crops, height, width = self.wide_crop(images, boxes, index), self.crop.width, self.crop.height
+        else:
+            crops, height, width = self.crop(images, boxes, index), self.crop.height, self.crop.width
+        points, scores = self.decoder(self.network(torch.rot90(crops, turns, [2, 3])))
+        points = turn_back(points, turns, height, width)
+        points = crop_to_image(points, boxes, height, width, self.crop.padding)
+        return points.to(boxes.dtype), scores.to(boxes.dtype)
+
+    def look_again(
+        self, images: Tensor, boxes: Tensor, index: Tensor, points: Tensor, scores: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Keypoints and scores of boxes, after a second look at those who lean."""
+        turns = quarter_turns(points)
+        for turn in range(1, 4):
+            lean = (turns == turn).nonzero()[:, 0]
+            if lean.shape[0] > 0:
+                turned, heights = self.look(images, boxes[lean], index[lean], turn)
+                better = heights[:, 5:].mean(-1) > scores[lean, 5:].mean(-1)
+                rows = lean[better]
+                points = points.index_copy(0, rows, turned[better])
+                scores = scores.index_copy(0, rows, heights[better])
+        return points, scores
+
+    def extra_repr(self) -> str:
+        """What print shows beside the parts."""
+        return f"crops_per_batch={self.crops_per_batch}, stand_up={self.stand_up}"

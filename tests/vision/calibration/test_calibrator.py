@@ -28,7 +28,7 @@ from tensorsim.vision.calibration.camera_fit import (
     residuals,
     robust,
 )
-from tensorsim.vision.calibration.upright import is_upright, walking_share
+from tensorsim.vision.calibration.upright import is_upright, steadily, walking_share
 from tests.film import STANDING
 from tests.stage import StageTester
 
@@ -165,6 +165,20 @@ def test_upright_is_upright() -> None:
     hidden = seen.clone()
     hidden[15] = 0.1
     assert not bool(is_upright(body, hidden, 0.3))
+
+
+def test_who_sits_and_looks_upright_now_and_then_does_not_count() -> None:
+    upright = torch.zeros(3, 90, dtype=torch.bool)
+    upright[0, 30:60], upright[1, ::2], upright[2] = True, True, True
+    valid = torch.ones_like(upright)
+    valid[2, 45:] = False
+    found = steadily(upright, valid, FPS)
+    radius = int(0.4 * FPS)
+    # At the ends of the half that is upright, up to a fifth of the frames around are not.
+    begins = next(t for t in range(30, 60) if 30 - t + radius <= 0.2 * (2 * radius + 1))
+    assert found[0].nonzero()[:, 0].tolist() == list(range(begins, 89 - begins + 1))
+    assert not bool(found[1].any())
+    assert torch.equal(found[2], valid[2])
 
 
 def test_a_tilt_that_is_hardly_known_is_drawn_towards_level() -> None:

@@ -388,6 +388,20 @@ def test_a_part_taken_for_a_small_body_says_nothing() -> None:
     assert seen.all()
 
 
+def test_size_does_not_count_where_the_left_or_right_edge_cuts_somebody_off() -> None:
+    world = walker((1.2, 4.0), (0.6, 0.0))  # walks out of the picture to the right
+    image, lifted = film(world)
+    assert bool((image[:, :, 0] <= 0.98 * WIDTH).all(dim=-1)[:20].all())
+    cut = image.clone()
+    cut[..., 0] = cut[..., 0].clamp(max=WIDTH - 1.0)
+    frames = int((image[..., 0] < 0.99 * (WIDTH - 1)).all(dim=-1).sum())
+    assert 20 < frames < 85, "the picture ends within the film"
+    found = misread(image, lifted, slice(frames, 90), list(range(14)), 0.6)
+    joints, _ = place_seen(MetricPose(person_height_m=(TALL,)), cut, torch.ones(90, 14).double(), found)
+    off = (joints[:, [8, 11], 1].mean(-1) - world[:, [8, 11], 1].mean(-1)).abs()
+    assert float(off.max()) < 0.15
+
+
 def test_a_lifted_walker_recedes_at_its_speed() -> None:
     """The whole way: a pool that has other poses, noise of 2 px, and no knowledge of the scale."""
     world = walker((0.2, 3.0), (0.0, 1.3))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
-from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
+from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose, quarter_turns
 from tests.stage import StageTester, assert_same
 
 #: COCO's constants of the object keypoint similarity: twice the annotators' standard deviation, nose first.
@@ -106,6 +106,49 @@ class TestWithHRNet(TestTopDownPose):
         torch.manual_seed(0)
         network = HRNet(HRNetConfig(width=4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4), (64, 32))
         return TopDownPose(network, decode="quarter", flip_test=True).eval()
+
+
+class TestStandUp(TestTopDownPose):
+    """With a second look at those who lean; an untrained network finds trunks in all directions."""
+
+    def make(self) -> nn.Module:
+        torch.manual_seed(0)
+        network = HRNet(HRNetConfig(width=4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4), (64, 32))
+        return TopDownPose(network, decode="quarter", stand_up=True).eval()
+
+
+class Upright(nn.Module):
+    """Shoulders are red, hips blue, all else green; heat maps are high only where red is above blue in the crop."""
+
+    def forward(self, crops: Tensor) -> Tensor:
+        maps = crops[:, :, ::4, ::4]
+        rows = torch.arange(maps.shape[2], dtype=crops.dtype).view(1, 1, -1, 1)
+        red, _, blue = ((maps * rows).sum((2, 3)) / maps.sum((2, 3))).unbind(1)
+        gain = torch.where(blue - red > 5, 1.0, 0.5).view(-1, 1, 1, 1)
+        colours = [1] * 5 + [0, 0] + [1] * 4 + [2, 2] + [1] * 4
+        return maps[:, colours] * gain
+
+
+@pytest.mark.parametrize("lean", range(4))
+def test_who_leans_is_looked_at_again_upright(lean: int) -> None:
+    upright = torch.stack(
+        [blob(torch.tensor([[90.0, 30 + 40 * row]]), 180, 150, 5)[0, 0] for row in range(3)]
+    )
+    image = upright.rot90(-lean, [1, 2])[None]  # clockwise as seen
+    height, width = image.shape[2:]
+    box = torch.tensor([20.0, 15, width - 21, height - 11]).view(1, 1, 4)
+    known = torch.tensor([[90.0, 70], [90, 30], [90, 110]])  # of the face, the shoulders, the hips
+    for turn in range(lean):
+        known = torch.stack([(149, 179)[turn % 2] - known[:, 1], known[:, 0]], -1)
+    valid = torch.ones(1, 1, dtype=torch.bool)
+    first, low = TopDownPose(Upright(), crop_size=(128, 96))(image, box, valid)
+    second, high = TopDownPose(Upright(), crop_size=(128, 96), stand_up=True)(image, box, valid)
+    assert quarter_turns(first).item() == lean
+    for found in (first, second):
+        torch.testing.assert_close(found[0, 0, [0, 5, 11]], known, atol=0.4, rtol=0)
+    # Pixels of the maps are up to two pixels of the crop away from the brightest one.
+    assert (0.3 if lean else 0.7) < float(low.mean()) < (0.55 if lean else 1.05)
+    assert 0.7 < float(high.mean()) < 1.05
 
 
 @pytest.mark.parametrize("decode", ["dark", "quarter"])
