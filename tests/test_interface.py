@@ -39,7 +39,8 @@ def defaults(called: Callable[..., object]) -> str:
 
 
 def test_defaults_are_those_of_the_interface() -> None:
-    assert interface() == FILE.read_text(encoding="utf-8").splitlines()
+    written = FILE.read_text(encoding="utf-8").splitlines()
+    assert interface() == written, f"if this is meant: python -m tests.test_interface > tests/{FILE.name}"
 
 
 if __name__ == "__main__":
