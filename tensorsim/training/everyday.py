@@ -57,7 +57,7 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
         Variant(everyday.swing_fist, 0.0, None, 0.35),
     ),
     (Variant(scripts.kick, 0.4, None, 0.6), Variant(everyday.kick_ball, -0.5, 1.2, 0.4, (0.65, 1.0))),
-    (Variant(scripts.grab, 0.3, None, 0.45), Variant(exercises.pick_up, 0.0, 2.5, 0.55, (0.8, 2.2))),
+    (Variant(scripts.grab, 0.3, None, 0.4), Variant(exercises.pick_up, 0.0, 2.5, 0.6, (0.9, 2.8))),
     (Variant(scripts.sit_down, 0.8, 1.9, 1.0, (0.8, 1.7)),),
     (Variant(scripts.stand_up, 0.7, 2.0, 1.0, (0.8, 1.7)),),
     (Variant(scripts.rotate, 0.0, None, 1.0, (0.7, 1.3)),),
