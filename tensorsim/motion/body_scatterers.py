@@ -24,7 +24,7 @@ TORSO_ROUGHNESS, LIMB_ROUGHNESS = 0.2, 0.35
 WHOLE_BODY = 1.4
 #: What is left of the cross section of limbs at 77 GHz, and by how much it is more at 24 GHz and below, fitted to
 #: measured walks: see the class.
-LIMB_SHARES = {"upper_arm": 0.67, "forearm": 0.2, "thigh": 0.285, "shank": 0.22, "foot": 0.12}
+LIMB_SHARES = {"upper_arm": 0.67, "forearm": 0.2, "thigh": 0.285, "shank": 0.19, "foot": 0.085}
 LIMBS_AT_24_GHZ = 1.3
 
 
