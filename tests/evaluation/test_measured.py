@@ -147,7 +147,9 @@ def test_smoother_of_the_paper_dims_quick_limbs(hz, gain):
     assert float(smooth[0, middle].std() / joints[0, middle].std()) == pytest.approx(gain, abs=0.05)
 
 
-@pytest.mark.parametrize(("hz", "seen_hz"), [(100.0, 100.0), (-190.0, -190.0), (290.0, -210.0), (-410.0, 90.0)])
+@pytest.mark.parametrize(
+    ("hz", "seen_hz"), [(100.0, 100.0), (-190.0, -190.0), (290.0, -210.0), (-410.0, 90.0)]
+)
 def test_half_the_pulse_rate_wraps_what_is_beyond_half_of_the_axis(hz, seen_hz):
     """Of 1000 pulses a second every second one sees +-250 Hz; both tones have their level."""
     time = torch.arange(400, dtype=torch.float64) / 1000

@@ -51,7 +51,9 @@ def test_feet_stand_on_the_floor(moved):
     elif name == "getting up":
         assert float(joint(joints, "head")[:, 0, 2].max()) < 0.3
         assert float((joint(joints, "head")[:, -1, 2] / people.height_m).min()) > 0.75
-        torch.testing.assert_close(lowest[:, -1], torch.full_like(lowest[:, -1], ANKLE_HEIGHT), rtol=0, atol=0.002)
+        torch.testing.assert_close(
+            lowest[:, -1], torch.full_like(lowest[:, -1], ANKLE_HEIGHT), rtol=0, atol=0.002
+        )
     elif name in ("jumping", "jumping jacks", "running"):
         assert bool((lowest.amin(dim=1) < ANKLE_HEIGHT + 0.012).all())
         assert float(lowest.max()) > ANKLE_HEIGHT + 0.015
