@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import tensorsim as ts
+from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.results import people_of
@@ -191,6 +192,33 @@ def test_a_foot_alone_at_the_end_of_a_track_does_not_fold_the_body() -> None:
     hips = joints[0, 0, 16:, [8, 11], 2]
     assert hips.min() > 0.7
     assert (joints[0, 0, 16:, 8, 1].diff() > 0).all(), "goes on walking away"
+
+
+class MeasuredFrames(nn.Module):
+    """A smoother that keeps which frames of which joints it was given as measured."""
+
+    def __init__(self, smoother: nn.Module) -> None:
+        super().__init__()
+        self.smoother, self.measured = smoother, torch.empty(0)
+
+    def forward(self, joints: Tensor, measured: Tensor, fps: float, noise: Tensor) -> Tensor:
+        self.measured = measured
+        return self.smoother(joints, measured, fps, noise)
+
+
+def test_brief_gaps_of_a_joint_are_predicted_and_longer_ones_are_not() -> None:
+    """A quarter of a second is two frames here: the smoother coasts through those, and takes the matched pose else."""
+    stage = pipeline().video_to_pose
+    whole = stage(film(*walker(20, FPS, 4.0, 0.5, 0.0)).unsqueeze(0), FPS)
+    stage.smoother = MeasuredFrames(stage.smoother)
+    scores = whole.keypoint_scores.clone()
+    scores[:, :, 6:8, 10] = 0.0  # the right wrist for two frames
+    scores[:, :, 6:9, 9] = 0.0  # the left one for three
+    tracks = ts.Tracks(whole.boxes, whole.valid, whole.valid)
+    stage.lift(tracks, whole.keypoints, scores, 240, 320, FPS)
+    expected = torch.ones(20, 14, dtype=torch.bool)
+    expected[6:8, JOINTS.index("right_wrist")] = False
+    assert torch.equal(stage.smoother.measured[0, 0], expected)
 
 
 def test_a_track_that_shows_no_joint_is_nobody() -> None:

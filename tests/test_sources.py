@@ -207,6 +207,19 @@ def test_gaps_of_a_track_are_bridged_and_frames_are_cut(
     assert float(steps.max()) < 0.3, "coasts through the gap"
 
 
+def test_every_second_frame_is_a_file_of_half_the_rate(
+    filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    """Also in the smoother, which takes times from the rate: the same joints, to the bit."""
+    camera, keypoints, scores = filmed
+    whole, half = tmp_path / "whole.json", tmp_path / "half.json"
+    whole.write_text(json.dumps(coco_json(keypoints, scores)))
+    half.write_text(json.dumps(coco_json(keypoints[:, ::2], scores[:, ::2])))
+    kept = keypoint_source(whole, lifter(camera, 1.75), 2 * FPS, CANVAS, Cut(None, None, 2)).find(True).pose
+    alone = keypoint_source(half, lifter(camera, 1.75), FPS, CANVAS).find(True).pose
+    assert torch.equal(kept.joints, alone.joints)
+
+
 @pytest.mark.parametrize(
     ("fps", "size", "message"),
     [(None, CANVAS, "expected --fps"), (0.0, CANVAS, "fps: got 0.0"), (30.0, None, "expected --image-size")],

@@ -26,6 +26,8 @@ class EvaluateFilms(NetworkOptions):
     """Folder of the results."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Radars."""
+    body: Literal["joints", "limbs", "version1", "surface"] | None = None
+    """Scatterers of a person, as in `tensorsim simulate`."""
     classifier: str | None = None
     """Activity classifier: path or name. Default: the shipped one."""
     only: tuple[str, ...] = ()
@@ -69,7 +71,7 @@ class EvaluateFilms(NetworkOptions):
         reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:
-            config = RadarOptions(scene=name, classifier=self.classifier).configuration()
+            config = RadarOptions(scene=name, body=self.body, classifier=self.classifier).configuration()
             recognizer = load_recognizer(config)
             if recognizer is None:
                 raise TensorsimError("--classifier: got 'none', expected weights")

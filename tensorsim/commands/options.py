@@ -95,8 +95,8 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     classifier: str | None = None
     """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
-    least_probability: float = 0.0
-    """A label whose probability is lower is "not sure"."""
+    least_probability: float = 0.2
+    """A label whose probability is lower is "not sure". 0 always gives the likeliest of the twelve."""
     seed: int | None = None
     """Seed of everything that is random. Default: 0."""
     colormap: Literal["turbo", "viridis", "jet", "parula", "gray"] = "turbo"

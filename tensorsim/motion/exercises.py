@@ -10,9 +10,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from tensorsim.body.proportions import THIGH
 from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot
 from tensorsim.motion.people import People
-from tensorsim.motion.scripts import toppling
+from tensorsim.motion.scripts import over_the_knees, toppling
 from tensorsim.motion.timing import bell, segment
 
 #: Gravity in m/s^2.
@@ -91,9 +92,38 @@ def fall_down(time: Tensor, who: People) -> Act:
         flexion=(arms, arms),
         elbow=(12 + v(40.0) * down, 12 + v(40.0) * down),
     )
-    act = on_the_spot(time, pose)
-    upright = 1 - segment(time, 0.0 * v(1.0) + 0.3, v(0.9))
-    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+    return _lying(on_the_spot(time, pose), segment(time, 0.0 * v(1.0) + 0.3, v(0.9)))
+
+
+def bend(time: Tensor, who: People) -> Act:
+    """Bends down with nearly straight legs, the hands at the shins, and comes up again."""
+    v = Vary(who)
+    down = _there_and_back(time, v(1.0), v(0.4), v(1.0))
+    arms = 2 + v(10.0) * down
+    pose = make_pose(time, who, pitch=v(82.0) * down, nod=-20 * down, flexion=(arms, arms))
+    return on_the_spot(time, pose)
+
+
+def lie_down(time: Tensor, who: People) -> Act:
+    """Lies down over the knees and hands, and stays prone."""
+    v = Vary(who)
+    end = v(2.4)
+    pose = over_the_knees(time, who, v, segment(time, 0 * end, end), bell(time, 0 * end, end))
+    return _lying(on_the_spot(time, pose), segment(time, 0 * end, 0 * end + 0.35))
+
+
+def get_up(time: Tensor, who: People) -> Act:
+    """Lies prone, gets up over the knees and stands."""
+    v = Vary(who)
+    end = v(2.0)
+    pose = over_the_knees(time, who, v, 1 - segment(time, 0 * end, end), bell(time, 0 * end, end))
+    act = _lying(on_the_spot(time, pose), 1 - segment(time, end - 0.35, end))
+    return act._replace(moment=end[..., None].expand_as(act.moment))  # feet are held where they stand then
+
+
+def _lying(act: Act, share: Tensor) -> Act:
+    """A movement whose feet do not carry where ``share`` (B, T) is 1."""
+    return act._replace(hold=(1 - share)[..., None].expand_as(act.hold), level=1 - share)
 
 
 def squat(time: Tensor, who: People) -> Act:
@@ -295,11 +325,37 @@ def creep(time: Tensor, who: People) -> Act:
     )
 
 
+def crawl(time: Tensor, who: People) -> Act:
+    """Goes on hands and knees, a hand with the knee of the other side."""
+    v = Vary(who)
+    swing = v(18.0)
+    # The knee that carries stays where it is while the hips pass over it.
+    thigh_m = THIGH * who.height_m[:, None]
+    cycle = 4 * thigh_m * torch.sin(torch.deg2rad(swing)) / who.speed_m_s[:, None]
+    ahead = swing * torch.sin(2 * math.pi * _cycle_share(time, cycle, who))
+    lean, arms, elbow = 75.0, 70.0, v(35.0)
+    pose = make_pose(
+        time,
+        who,
+        lean=lean,
+        nod=-v(30.0),
+        hip=(lean + ahead, lean - ahead),
+        knee=(90 + ahead, 90 - ahead),
+        flexion=(arms - ahead, arms + ahead),
+        elbow=(elbow, elbow),
+    )
+    act = on_the_spot(time, pose)
+    return _lying(act, torch.ones_like(time))._replace(path=who.speed_m_s[:, None] * time)
+
+
 #: The movements of this file by name.
 EXERCISES: dict[str, Callable[[Tensor, People], Act]] = {
     "picking up": pick_up,
     "drinking": drink,
+    "bending": bend,
     "falling": fall_down,
+    "lying down": lie_down,
+    "getting up": get_up,
     "squats": squat,
     "jumping": jump,
     "jumping jacks": jumping_jack,
@@ -307,4 +363,5 @@ EXERCISES: dict[str, Callable[[Tensor, People], Act]] = {
     "running": run,
     "striding": stride,
     "creeping": creep,
+    "crawling": crawl,
 }

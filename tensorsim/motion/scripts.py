@@ -208,16 +208,11 @@ def walk_to_sit(time: Tensor, who: People) -> Act:
     return with_gait(time, who, _seat(time, who, v, seated, bow), pace, path)
 
 
-def fall_to_walk(time: Tensor, who: People) -> Act:
-    """Lies prone, gets up over the knees and walks off."""
-    v = Vary(who)
-    start = v(0.25)
-    end = start + v(1.6)
-    down = 1 - segment(time, start, end)
-    kneel = bell(time, start, end)
+def over_the_knees(time: Tensor, who: People, v: Vary, down: Tensor, kneel: Tensor) -> BodyPose:
+    """Between standing (``down`` 0) and lying prone (1), over the knees and hands where ``kneel`` is 1."""
     arms = 2 + 170 * down - 60 * kneel
     rest = 1 - 0.4 * down  # legs straighten when they carry nothing
-    base = make_pose(
+    return make_pose(
         time,
         who,
         lean=88 * down,
@@ -228,6 +223,15 @@ def fall_to_walk(time: Tensor, who: People) -> Act:
         flexion=(arms, arms),
         elbow=(12 + 20 * kneel, 12 + 20 * kneel),
     )
+
+
+def fall_to_walk(time: Tensor, who: People) -> Act:
+    """Lies prone, gets up over the knees and walks off."""
+    v = Vary(who)
+    start = v(0.25)
+    end = start + v(1.6)
+    down = 1 - segment(time, start, end)
+    base = over_the_knees(time, who, v, down, bell(time, start, end))
     go = end + 0.15
     act = with_gait(
         time, who, base, segment(time, go, go + 1.0), who.speed_m_s[:, None] * travel(time, go, go + 1.0)

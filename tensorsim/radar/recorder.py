@@ -155,7 +155,7 @@ class Recorder(nn.Module):
         power = self.noise.noise_power(levels.signal).repeat_interleave(self.channels)
         noise, drawn = self.profile_noise(like, power)
         noise = noise.reshape([clean.shape[0], -1, clean.shape[1]]).transpose(1, 2)
-        return clean + noise, drawn.reshape([-1, self.channels]).mean(-1)
+        return noise.add_(clean), drawn.reshape([-1, self.channels]).mean(-1)
 
     def step(self, positions: Tensor) -> int:
         """Pulses of every clip to work on at a time."""

@@ -1,6 +1,6 @@
 """Search for nearest poses: time and memory against faiss and NumPy in the same run.
 
-python -m tests.benchmarks.bench_lifter [poses] [frames] [--threads N]
+python -m tests.benchmarks.bench_lifter [poses] [frames] [--threads N] [--cpu]
 
 Faiss is in an extra: `pip install -e ".[bench]"`. Its exact search (IndexFlatL2) compares the same 28 numbers, centred
 projections of unit norm. Two pools: people at all headings, searched with walking people, and random numbers, in
@@ -20,7 +20,7 @@ from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.vision.lifting.pose_library import all_headings, standardise_poses
 from tensorsim.vision.lifting.pose_search import PoseSearch, seen_along_depth
-from tests.benchmarks.timing import medians
+from tests.benchmarks.timing import chosen_clock, medians
 
 try:
     import faiss
@@ -77,7 +77,7 @@ def compare(name: str, library: Tensor, seen: Tensor, neighbours: int) -> None:
         flat.add(points)
         peers["faiss"] = lambda: flat.search(queries, neighbours)[1]
     own = [lambda: search(keypoints, equal), lambda: search(keypoints, varied)]
-    took = medians([*own, *peers.values()], 5)
+    took = medians([*own, *peers.values()], 5, chosen_clock())
     weighted = took.pop(1)
     print(
         f"{name}, {neighbours} nearest: {took[0]:.3f} s; pool sorted once in {built:.1f} s; +{extra:.0f} MiB peak"
@@ -97,6 +97,7 @@ def main() -> None:
     parser.add_argument("poses", type=int, nargs="?", default=1_877_420)
     parser.add_argument("frames", type=int, nargs="?", default=120)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--cpu", action="store_true", help="processor time instead of wall time")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     print(f"{options.poses} poses x {options.frames} frames, {options.threads} threads")

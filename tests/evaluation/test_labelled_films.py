@@ -99,6 +99,12 @@ def test_the_command_labels_films_and_runs_the_networks_once(
     assert CountingDetector.frames == seen, "kept in cache/"
     assert json.loads((out / "films.json").read_text()) == [walk]
 
+    cli.main([*arguments, "--only", "walk", "--body", "surface"])
+    assert CountingDetector.frames == seen
+    (other,) = json.loads((out / "films.json").read_text())
+    assert other["people"] == walk["people"]
+    assert other["scenes"] != walk["scenes"]
+
 
 @pytest.mark.filterwarnings("ignore:.* its frames are up to")
 def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -> None:

@@ -147,6 +147,17 @@ def test_smoother_of_the_paper_dims_quick_limbs(hz, gain):
     assert float(smooth[0, middle].std() / joints[0, middle].std()) == pytest.approx(gain, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("hz", "seen_hz"), [(100.0, 100.0), (-190.0, -190.0), (290.0, -210.0), (-410.0, 90.0)]
+)
+def test_half_the_pulse_rate_wraps_what_is_beyond_half_of_the_axis(hz, seen_hz):
+    """Of 1000 pulses a second every second one sees +-250 Hz; both tones have their level."""
+    time = torch.arange(400, dtype=torch.float64) / 1000
+    tone = torch.exp(2j * torch.pi * hz * time).expand(3, 400)
+    expected = torch.exp(2j * torch.pi * seen_hz * time).expand(3, 400)
+    torch.testing.assert_close(motions.at_half_the_pulse_rate(tone), expected, rtol=0, atol=1e-9)
+
+
 def test_without_a_test_folder_the_last_clips_of_each_class_are_tested(folders, tmp_path):
     labels = torch.tensor([0] * 10 + [1] * 4 + [0] * 10)
     early, late = run.split(labels)

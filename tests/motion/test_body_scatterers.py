@@ -260,6 +260,7 @@ def test_energy_over_speed_is_that_of_measured_walks(shared_data: Path) -> None:
             body = eval_bodies.make_body("surface", eval_bodies.FMCW)
             found = eval_bodies.mean([eval_bodies.simulated_fmcw(body, joints) for joints in walks])
             assert found.above_1_5 == pytest.approx(measured.above_1_5, rel=0.3)
+            assert found.above_2 == pytest.approx(measured.above_2, rel=0.4)
             assert found.speed_95 == pytest.approx(measured.speed_95, rel=0.15)
         points = eval_bodies.simulated_fmcw(eval_bodies.make_body("joints", eval_bodies.FMCW), walks[0])
         assert points.above_1_5 > 3 * measured.above_1_5

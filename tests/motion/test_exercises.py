@@ -10,7 +10,7 @@ from tensorsim.motion.exercises import EXERCISES
 from tensorsim.motion.people import PeopleConfig, draw_people
 
 RATE = 200.0
-SPEEDS = {"running": (2.0, 3.4), "striding": (1.3, 2.0), "creeping": (0.4, 1.1)}
+SPEEDS = {"running": (2.0, 3.4), "striding": (1.3, 2.0), "creeping": (0.4, 1.1), "crawling": (0.3, 0.7)}
 BONES = [("right_hip", "right_knee"), ("left_knee", "left_ankle"), ("neck", "right_shoulder"),
          ("left_elbow", "left_wrist")]  # fmt: skip
 
@@ -46,11 +46,19 @@ def test_feet_stand_on_the_floor(moved):
     assert float(lowest.min()) > ANKLE_HEIGHT - 0.006
     if name == "falling":
         assert float(joint(joints, "head")[:, -1, 2].max()) < 0.6
+    elif name == "lying down":
+        assert float(joint(joints, "head")[:, -1, 2].max()) < 0.3
+    elif name == "getting up":
+        assert float(joint(joints, "head")[:, 0, 2].max()) < 0.3
+        assert float((joint(joints, "head")[:, -1, 2] / people.height_m).min()) > 0.75
+        torch.testing.assert_close(
+            lowest[:, -1], torch.full_like(lowest[:, -1], ANKLE_HEIGHT), rtol=0, atol=0.002
+        )
     elif name in ("jumping", "jumping jacks", "running"):
         assert bool((lowest.amin(dim=1) < ANKLE_HEIGHT + 0.012).all())
         assert float(lowest.max()) > ANKLE_HEIGHT + 0.015
     else:
-        assert float(lowest.max()) < ANKLE_HEIGHT + 0.012
+        assert float(lowest.max()) < ANKLE_HEIGHT + (0.035 if name == "crawling" else 0.012)
     assert float(joints[..., 2].min()) > 0.0
 
 
@@ -92,3 +100,28 @@ def test_squats_and_jumps_have_their_size():
     rise = hips["jumping"].amax(1) - hips["jumping"][:, :1].amin(1)
     assert bool((rise < 0.35).all())
     assert bool((hips["drinking"].amax(1) - hips["drinking"].amin(1) < 0.05).all())
+
+
+def test_hands_and_knees_carry_who_crawls():
+    """Knees and hands are at the floor, the back is level, and a knee hardly moves while it carries."""
+    people = draw_people(4, PeopleConfig(variation=0.0), torch.Generator().manual_seed(1))
+    people = people._replace(speed_m_s=torch.linspace(0.3, 0.6, 4, dtype=torch.float64))
+    time = (torch.arange(800, dtype=torch.float64) / RATE).expand(4, -1)
+    joints = perform(EXERCISES["crawling"], time, people)
+    height = people.height_m[:, None]
+    for name in ("right_knee", "left_knee", "right_wrist", "left_wrist"):
+        assert float((joint(joints, name)[..., 2] / height).max()) < 0.1
+    fall = joint(joints, "neck")[..., 2] - joint(joints, "right_hip")[..., 2]
+    assert float(fall.abs().max()) < 0.2
+    knees = torch.stack([joint(joints, "right_knee"), joint(joints, "left_knee")], dim=-2)[..., 1]
+    slower = (knees.diff(dim=1) * RATE).amin(-1)
+    assert float((slower.abs() / people.speed_m_s[:, None]).median()) < 0.5
+
+
+def test_hands_of_who_bends_come_to_the_shins():
+    people = draw_people(4, PeopleConfig(variation=0.0), torch.Generator().manual_seed(1))
+    time = (torch.arange(500, dtype=torch.float64) / RATE).expand(4, -1)
+    joints = perform(EXERCISES["bending"], time, people)
+    wrist, knee = joint(joints, "right_wrist")[..., 2], joint(joints, "right_knee")[..., 2]
+    assert bool((wrist.amin(1) < knee.amin(1)).all())
+    assert bool((wrist[:, -1] > knee[:, -1] + 0.2).all())

@@ -19,6 +19,7 @@ from tensorsim.evaluation.measured.motions import (
     Unrest,
     act_out,
     add_unrest,
+    at_half_the_pulse_rate,
     at_instants,
     dim_limbs,
     knots,
@@ -71,6 +72,7 @@ class Effects:
         image: a weak mirror image in Doppler.
         shuffling: people end farther back after sitting down, farther ahead after rising.
         cfar: a threshold by the surroundings of a cell; else one for the whole map, 10 dB above its median.
+        prf: sweeps fast enough for everybody; else half as many, so that limbs above 3.2 m/s wrap.
     """
 
     to_and_fro: bool = True
@@ -86,6 +88,7 @@ class Effects:
     image: bool = True
     shuffling: bool = True
     cfar: bool = True
+    prf: bool = True
 
 
 class Glasgow:
@@ -154,6 +157,8 @@ class Glasgow:
             rcs = dim_limbs(rcs, draw, -9.0, 3.0, self.scatterers.per_segment)
         positions, rcs = at_instants(positions, at), linear(rcs, at)
         echo = self.echo(positions, rcs)
+        if not self.effects.prf:
+            echo = at_half_the_pulse_rate(echo.transpose(1, 2)).transpose(1, 2)
         echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
         signal_db = draw(28.0, 48.0) if self.effects.levels else draw(38.0, 38.0)
         if self.effects.image:

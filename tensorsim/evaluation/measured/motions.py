@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from tensorsim.body.kinematics import rotation
@@ -214,6 +215,19 @@ def in_beam(positions: Tensor, rcs: Tensor, height_m: float, width_deg: Tensor) 
     across = positions[..., 2] - height_m
     elevation = torch.rad2deg(torch.atan2(across, positions[..., :2].norm(dim=-1)))
     return rcs * torch.exp(-4 * math.log(2) * (elevation / width_deg[..., None]).square())
+
+
+def at_half_the_pulse_rate(echo: Tensor) -> Tensor:
+    """Echo (..., M) as a radar of half the pulse rate has it: what is faster than half of the axis wraps.
+
+    Every second pulse, interpolated to all M (even) by a Fourier transform, so that the Doppler axis stays.
+    """
+    pulses = echo.shape[-1]
+    quarter = pulses // 4
+    slow = torch.fft.fftshift(torch.fft.fft(echo[..., ::2]), dim=-1)
+    before = pulses // 2 - quarter
+    whole = F.pad(slow, [before, pulses - before - slow.shape[-1]])
+    return 2 * torch.fft.ifft(torch.fft.ifftshift(whole, dim=-1))
 
 
 def linear(values: Tensor, time_s: Tensor) -> Tensor:

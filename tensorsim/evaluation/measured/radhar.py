@@ -13,6 +13,7 @@ from tensorsim.evaluation.measured.motions import (
     Unrest,
     act_out,
     add_unrest,
+    at_half_the_pulse_rate,
     at_instants,
     dim_limbs,
     in_beam,
@@ -51,6 +52,7 @@ class Effects:
         levels: signal drawn for each clip; else always the same.
         beam: a beam that is narrow in elevation.
         hands: a scatterer at each wrist.
+        prf: chirps as fast as the radar's; else half as many, so that what is above 2.5 m/s wraps.
     """
 
     to_and_fro: bool = True
@@ -60,6 +62,7 @@ class Effects:
     levels: bool = True
     beam: bool = True
     hands: bool = True
+    prf: bool = True
 
 
 class RadHar:
@@ -114,6 +117,9 @@ class RadHar:
             positions = torch.cat([positions, joints[:, :, _WRISTS]], dim=2)
             rcs = torch.cat([rcs, hands.to(rcs.dtype)], dim=2)
         echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
+        if not self.effects.prf:
+            frames = echo.unflatten(1, (FRAMES, RADHAR_CHIRPS)).transpose(2, 3)
+            echo = at_half_the_pulse_rate(frames).transpose(2, 3).flatten(1, 2)
         echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
         shape = (*echo.shape[1:],)
         noise = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float()) / 2**0.5

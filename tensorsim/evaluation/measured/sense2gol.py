@@ -12,6 +12,7 @@ from tensorsim.evaluation.measured.motions import (
     Draw,
     Unrest,
     add_unrest,
+    at_half_the_pulse_rate,
     at_instants,
     dim_limbs,
     in_beam,
@@ -59,6 +60,7 @@ class Effects:
         image: the mirror image of unequal I and Q.
         saturation: steps and limits of the 12-bit converter.
         beam: a beam that is narrow in elevation.
+        prf: samples fast enough for everybody; else half as many, so that limbs above 4.7 m/s wrap.
     """
 
     speeding_up: bool = True
@@ -67,6 +69,7 @@ class Effects:
     image: bool = True
     saturation: bool = True
     beam: bool = True
+    prf: bool = True
 
 
 def doppler_maps(iq: Tensor) -> Tensor:
@@ -131,6 +134,9 @@ class Sense2Gol:
         if self.effects.dim_limbs:
             rcs = dim_limbs(rcs, draw, -10.0, 2.0, self.scatterers.per_segment)
         echo = self.echo(at_instants(positions, self.at), linear(rcs, self.at))
+        if not self.effects.prf:
+            bursts = echo.unflatten(-1, (FRAMES, SENSE2GOL_BURST_SAMPLES))
+            echo = at_half_the_pulse_rate(bursts).flatten(-2)
         far = echo[:, : 6 * SENSE2GOL_BURST_SAMPLES].abs().square().mean(-1, keepdim=True).sqrt()
         echo = echo / far * 10 ** (draw(36.0, 52.0) / 20).float()
         if self.effects.image:

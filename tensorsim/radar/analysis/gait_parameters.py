@@ -5,8 +5,9 @@ estimation with radar*, IET Radar, Sonar & Navigation 2 (2008): half of the ampl
 speed of the torso, 95 % of it below the speed of the fastest limb. The sign of the speed is ignored, so that the
 symmetric maps of a real signal give the same result as those of a complex one.
 
-Noise would add amplitude at high speeds. Power is therefore averaged over a few cells, the noise floor of each frame
-is subtracted, and cells below a threshold above the floor are set to 0.
+Noise would add amplitude at high speeds. Power is therefore averaged over neighbouring cells, the noise floor of each
+frame is subtracted, and cells that do not exceed a threshold above the floor in any of several averages are set to 0:
+large averages find weak limbs in noise, small ones keep the edges of strong ones.
 """
 
 import math
@@ -29,9 +30,8 @@ from tensorsim.errors import (
 #: Cells this far below the strongest of their frame are set to 0.
 DYNAMIC_RANGE_DB = 25.0
 
-#: Power is averaged over this range of speed and time.
-AVERAGE_M_S = 0.2
-AVERAGE_S = 0.08
+#: Power is averaged over these ranges of speed in m/s and time in s.
+AVERAGES = ((0.2, 0.08), (0.4, 0.16), (0.8, 0.16), (0.8, 0.32))
 
 #: The noise floor is the median of the fastest quarter of the axis. The threshold is the floor plus this multiple of
 #: the distance from the median to the upper quartile: a false alarm rate of about 1e-4 for white noise in one range
@@ -107,8 +107,11 @@ class GaitEstimator(nn.Module):
         signed, ascending = speed_m_s.detach().double().sort()
         speed, order = signed.abs().sort()
         first = int((speed <= SLOWEST_M_S).sum())
-        bins = round(AVERAGE_M_S / max(float(signed.diff().median()), 1e-9)) if len(signed) > 1 else 1
-        self.average = (2 * min(bins // 2, len(signed)) + 1, 2 * round(AVERAGE_S * frame_rate_hz / 2) + 1)
+        step_m_s = max(float(signed.diff().median()), 1e-9) if len(signed) > 1 else math.inf
+        self.averages = [
+            (2 * min(round(m_s / step_m_s) // 2, len(signed)) + 1, 2 * round(s * frame_rate_hz / 2) + 1)
+            for m_s, s in AVERAGES
+        ]
         self.bins = speed_m_s.shape[0]
         self.frame_rate_hz = float(frame_rate_hz)
         self.second = math.ceil(frame_rate_hz)
@@ -157,25 +160,32 @@ class GaitEstimator(nn.Module):
     def _power_above_noise(self, doppler_time: Tensor) -> Tensor:
         """Power by ascending speed less the noise floor, 0 where there is no echo: (..., F, K) -> (..., F', K).
 
-        The threshold applies to the average over neighbouring cells. The power itself keeps its resolution.
+        The threshold applies to averages over neighbouring cells. The power itself keeps its resolution.
         """
         power = doppler_time.index_select(-2, self.ascending).square()
         maps = power.reshape(-1, 1, power.shape[-2], power.shape[-1])
-        margin = (self.average[0] // 2, self.average[1] // 2)
-        average = F.avg_pool2d(maps, self.average, 1, margin, count_include_pad=False).view_as(power)
-        power, average = power.index_select(-2, self.order), average.index_select(-2, self.order)
-        fastest = average[..., -(average.shape[-2] // 4) :, :]
-        floor, quartile = fastest.median(-2)[0], fastest.quantile(0.75, -2)
-        # How much noise varies around its floor is the same in all frames of a clip.
-        spread = (
-            torch.where(floor > 0, quartile / floor - 1, math.nan).nanmedian(-1, keepdim=True)[0].nan_to_num()
-        )
-        least = (floor * (1 + self.threshold * spread)).unsqueeze(-2)
-        echo = (average >= least) & (power >= self.quietest * power.amax(-2, keepdim=True))
+        power = power.index_select(-2, self.order)
+        found = torch.zeros_like(power, dtype=torch.bool)
+        floors: list[Tensor] = []
+        for size in self.averages:
+            margin = (size[0] // 2, size[1] // 2)
+            average = F.avg_pool2d(maps, size, 1, margin, count_include_pad=False).view_as(doppler_time)
+            average = average.index_select(-2, self.order)
+            fastest = average[..., -(average.shape[-2] // 4) :, :]
+            floor, quartile = fastest.median(-2)[0], fastest.quantile(0.75, -2)
+            # How much noise varies around its floor is the same in all frames of a clip.
+            spread = torch.where(floor > 0, quartile / floor - 1, math.nan)
+            spread = spread.nanmedian(-1, keepdim=True)[0].nan_to_num()
+            found = found | (average >= (floor * (1 + self.threshold * spread)).unsqueeze(-2))
+            floors.append(floor)
+        echo = found & (power >= self.quietest * power.amax(-2, keepdim=True))
+        floor = floors[0]
         return torch.where(echo, (power - floor.unsqueeze(-2)).clamp_min(0.0), 0.0)
 
     def _step_rate(self, swing: Tensor, steady: Tensor) -> Tensor:
         """Strongest frequency in the band of steps of ``swing`` (W, ..., K), after removal of its trend over 1.2 s.
+
+        The trend is that of steady frames: between two walks there is none.
 
         Periodograms of ``log(swing)`` over 4 s, half overlapping, are averaged (Welch), since the phase of the steps
         changes when the person turns. Those of all W are scaled to the same power and added. ``steady`` (..., K).
@@ -183,8 +193,9 @@ class GaitEstimator(nn.Module):
         shares, frames = swing.shape[0], swing.shape[-1]
         signal = (swing + self.quietest).log().reshape(-1, 1, frames)
         half = int(0.6 * self.frame_rate_hz)
-        signal = signal - F.avg_pool1d(signal, 2 * half + 1, 1, half, count_include_pad=False)
         weight = steady.to(signal.dtype).expand(swing.shape).reshape(-1, 1, frames)
+        near = F.avg_pool1d(weight, 2 * half + 1, 1, half).clamp_min(1e-9)
+        signal = signal - F.avg_pool1d(signal * weight, 2 * half + 1, 1, half) / near
         signal = signal * F.avg_pool1d(weight, 9, 1, 4)
         span = min(frames, 4 * self.second)
         window = torch.hann_window(span, periodic=False, dtype=signal.dtype, device=signal.device)

@@ -22,6 +22,8 @@ def block_rms(magnitude: Tensor, block: int) -> Tensor:
 
 def join_pulses(earlier: Tensor, later: Tensor) -> Tensor:
     """Concatenate (B, p, R) and (B, m, R) to (B, p + m, R); in memory time varies fastest, as in both."""
+    if earlier.shape[1] == 0:
+        return later
     return torch.cat((earlier.transpose(1, 2), later.transpose(1, 2)), -1).transpose(1, 2)
 
 

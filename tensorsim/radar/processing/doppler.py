@@ -111,8 +111,8 @@ class DopplerFrames(nn.Module):
         self.hop = self.length - math.floor(overlap * self.length)
         self.frame_rate_hz = self.prf_hz / self.hop
         self.bins = 1 << (max(self.length, 256) - 1).bit_length()
-        # Block size: spectra of about 512 kB (complex64) fit in the cache.
-        self.block_size = 2**16
+        # Block size: spectra of about 1 MB (complex64) stay in the cache.
+        self.block_size = 2**17
         window = torch.hann_window(self.length, periodic=True, dtype=torch.float64)
         # A factor (-1)^n shifts the spectrum by PRF / 2, so that bins ascend from -PRF / 2 without an fftshift.
         alternating = 1.0 - 2.0 * (torch.arange(self.length, dtype=torch.float64) % 2)
@@ -142,11 +142,19 @@ class DopplerFrames(nn.Module):
             )
         return flatten_batch(profiles, 2).transpose(1, 2)
 
-    def spectrum(self, frames: Tensor) -> Tensor:
-        """Real and imaginary part (..., F, 2) of the transform of frames (..., L), Doppler ascending."""
-        window = self.shifting_window.to(torch.real(frames).dtype)
+    def spectrum(self, frames: Tensor, padded: Tensor | None = None) -> Tensor:
+        """Real and imaginary part (..., F, 2) of the transform of frames (..., L), Doppler ascending.
+
+        ``padded`` (..., F), which is zero beyond L, takes the windowed frames; it is for blocks without gradients.
+        """
+        window = self.shifting_window.to(frames.dtype)
+        if padded is None:
+            windowed = frames * window
+        else:
+            windowed = padded
+            torch.mul(frames, window, out=padded[..., : self.length])
         # |FFT(conj x)[f]| = |FFT(x)[-f]|, which the inverse transform has at f.
-        spectrum = torch.fft.ifft(frames * window, self.bins, norm="forward")
+        spectrum = torch.fft.ifft(windowed, self.bins, norm="forward")
         return torch.view_as_real(spectrum.resolve_conj())
 
 
@@ -213,25 +221,33 @@ class DopplerTimeMap(DopplerFrames):
         clips = max(1, self.block_size // (columns * self.bins)) if columns == count else 1
         step = max(1, self.block_size // (min(clips, batch) * columns * self.bins))
         # With autograd the blocks are joined at the end; without, each is written to its place while in the cache.
-        # A single block is the map itself.
-        joined = series.requires_grad or (columns == count and clips >= batch)
+        joined = series.requires_grad
         rows: list[Tensor] = []
         doppler_time = torch.real(series).new_empty([0 if joined else batch * count, self.bins])
+        shape = [min(clips, batch), min(step, bins), min(columns, count), self.bins]
+        padded = series.new_zeros([0] if joined else shape)
         for clip in range(0, batch, clips):
             for first in range(0, count, columns):
                 block = frames[clip : clip + clips, :, first : first + columns]
                 power = torch.real(series).new_zeros([])
                 for near in range(0, bins, step):
-                    for part in self.spectrum(block[:, near : near + step]).unbind(1):
-                        power = torch.addcmul(power, part, part)
-                row = safe_sqrt(power[..., 0] + power[..., 1]).flatten(0, 1)
+                    part = block[:, near : near + step]
+                    room = None if joined else padded[: part.shape[0], : part.shape[1], : part.shape[2]]
+                    for spectrum in self.spectrum(part, room).unbind(1):
+                        if power.dim() == 0:
+                            power = spectrum.square()
+                        else:
+                            power.addcmul_(spectrum, spectrum)
+                power = power.flatten(0, 1)
                 if joined:
-                    rows.append(row)
+                    rows.append(safe_sqrt(power[..., 0] + power[..., 1]))
                 else:
                     place = clip * count + first
-                    doppler_time[place : place + row.shape[0]] = row
+                    row = doppler_time[place : place + power.shape[0]]
+                    torch.add(power[..., 0], power[..., 1], out=row)
+                    row.sqrt_()
         if joined:
-            doppler_time = rows[0] if len(rows) == 1 else torch.cat(rows)
+            doppler_time = torch.cat(rows)
         return unflatten_batch(
             doppler_time.unflatten(0, [batch, count]).transpose(1, 2), list(profiles.shape[:-2])
         )

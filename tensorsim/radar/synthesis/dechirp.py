@@ -48,16 +48,17 @@ def phasor(cycles: Tensor) -> Tensor:
     return torch.complex(angle.cos(), angle.sin())
 
 
-def tones(first: Tensor, step: Tensor, index: Tensor) -> Tensor:
-    """``first exp(j 2 pi step n)`` for n of ``index``: (...) complex, (...) cycles, (N,) 0, 1, ... -> (..., N).
+def tones(step: Tensor, count: int, first: Tensor | None = None) -> Tensor:
+    """``first exp(j 2 pi step n)`` for n = 0, ..., count - 1: (...) cycles and (...) complex, or 1 -> (count, ...).
 
-    The exponential factors over ``n = Q n1 + n2``: about ``2 sqrt(N)`` sines and cosines and N products.
+    Products instead of exponentials: with the first Q and ``exp(j 2 pi step Q)`` come the next Q.
     """
-    fine = math.ceil(math.sqrt(index.shape[0]))
-    step = step.unsqueeze(-1)
-    outer = first.unsqueeze(-1) * phasor(step * index[::fine])
-    inner = phasor(step * index[:fine])
-    return (outer.unsqueeze(-1) * inner.unsqueeze(-2)).flatten(-2)[..., : index.shape[0]]
+    turn = phasor(step)
+    table = (torch.ones_like(turn) if first is None else first).unsqueeze(0)
+    while table.shape[0] < count:
+        table = torch.cat((table, table[: count - table.shape[0]] * turn))
+        turn = turn * turn
+    return table
 
 
 def tone_sum(first: Tensor, step: Tensor, coarse: Tensor, fine: Tensor) -> Tensor:
@@ -78,9 +79,9 @@ def tone_sum(first: Tensor, step: Tensor, coarse: Tensor, fine: Tensor) -> Tenso
     stride = step * fine.shape[0]
     step = (step - step.round()).to(fine.dtype)
     stride = (stride - stride.round()).to(fine.dtype)
-    right = tones(torch.ones_like(first), step, fine)  # (L, P, Q)
-    left = tones(first, stride, coarse)  # (L, P, N1)
-    return torch.matmul(left.transpose(-1, -2), right).flatten(-2)
+    right = tones(step, fine.shape[0])  # (Q, L, P)
+    left = tones(stride, coarse.shape[0], first)  # (N1, L, P)
+    return torch.matmul(left.movedim(0, -2), right.movedim(0, -1)).flatten(-2)
 
 
 def beat_sum(

@@ -116,7 +116,7 @@ class EchoSynthesizer(nn.Module):
         self.samples = radar.samples_per_chirp
         self.pulse_chunk = pulse_chunk
         # Block size: tones of about this many paths times pulses fit in the cache.
-        self.tone_block = 2**15
+        self.tone_block = 2**13
         fine = math.isqrt(self.samples - 1) + 1
         self.register_buffer("fine", torch.arange(fine).float(), persistent=False)
         self.register_buffer("coarse", torch.arange(-(-self.samples // fine)).float(), persistent=False)

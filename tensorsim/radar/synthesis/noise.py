@@ -65,12 +65,13 @@ class ProfileNoise(nn.Module):
         shape = [like.shape[0], bins + 2 * reach, like.shape[2]]
         white = torch.randn(shape, dtype=like.dtype, device=like.device)
         parts = torch.view_as_real(white)
-        noise = parts[:, reach : reach + bins] * self.taps[0]
+        noise = parts[:, reach : reach + bins]
         for lag in range(1, reach + 1):
             pair = parts[:, reach - lag : reach - lag + bins] + parts[:, reach + lag : reach + lag + bins]
-            noise = torch.add(noise, pair, alpha=self.taps[lag])
+            noise = torch.add(noise, pair, alpha=self.taps[lag] / self.taps[0])
         drawn = energy(white).to(power.dtype) * power * (self.samples / shape[1])
-        return torch.view_as_complex(noise * power.to(noise.dtype).sqrt()[:, None, None, None]), drawn
+        deviation = self.taps[0] * power.to(noise.dtype).sqrt()[:, None, None, None]
+        return torch.view_as_complex(noise * deviation), drawn
 
 
 class ReceiverNoise(nn.Module):

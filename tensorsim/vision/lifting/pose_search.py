@@ -70,10 +70,36 @@ def cosine_table(moment: Tensor, weights: Tensor, seen: Tensor) -> tuple[Tensor,
         norms (N, L).
     """
     x, v = seen[:, :14].t(), seen[:, 14:].t()
-    power = torch.mm(weights, x.square() + v.square())
-    spread = power - torch.mm(weights, x).square() - torch.mm(weights, v).square()
-    norm = (spread - 1e-6 * power).clamp(min=1e-9).sqrt()
-    return torch.mm(moment, seen.t()) / norm + 1e-6, norm
+    x_mean, v_mean = torch.mm(weights, x), torch.mm(weights, v)
+    spread = torch.mm((1.0 - 1e-6) * weights, x.square() + v.square())
+    norm = (
+        spread.addcmul_(x_mean, x_mean, value=-1.0)
+        .addcmul_(v_mean, v_mean, value=-1.0)
+        .clamp_(min=1e-9)
+        .sqrt_()
+    )
+    return torch.mm(moment, seen.t()).div_(norm).add_(1e-6), norm
+
+
+def reach_table(moment: Tensor, weights: Tensor, seen: Tensor, least: Tensor, slack: float) -> Tensor:
+    """Not negative where the :func:`cosine_table` of a frame and a pose may reach ``least`` (N,) >= 0 of the frame.
+
+    A cosine is a product over a norm, whose square is ``power - x^2 - v^2``. Both sides of
+    ``product >= least norm`` are squared, which takes neither root nor quotient::
+
+        max(product, 0)^2 + (least x)^2 + (least v)^2 - (least^2 - slack) power >= 0
+
+    Rounding in float32 changes that by less than ``slack``, 1e-5, of the power.
+    """
+    x, v = seen[:, :14].t(), seen[:, 14:].t()
+    least = least.to(seen.dtype)[:, None]
+    score = torch.mm((slack - least.square()) * weights, x.square() + v.square())
+    product = torch.mm(moment, seen.t()).clamp_(min=0.0)
+    score.addcmul_(product, product)
+    for axis in [x, v]:
+        mean = torch.mm(least * weights, axis)
+        score.addcmul_(mean, mean)
+    return score
 
 
 def blocks_of_similar(points: Tensor, block: int) -> tuple[Tensor, list[int]]:
@@ -101,19 +127,35 @@ def blocks_of_similar(points: Tensor, block: int) -> tuple[Tensor, list[int]]:
     return torch.cat(done), starts
 
 
+def groups_of(score: Tensor) -> Tensor:
+    """Scores (N, L) in groups of 64 neighbours, or of a smaller power of two that L has: (N, G, every)."""
+    every = 64
+    while score.shape[1] % every != 0:
+        every = every // 2
+    return score.reshape(score.shape[0], -1, every)
+
+
 def at_least(score: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
     """Rows (P,) and columns (P,) of the scores (N, L) that reach the threshold (N,) of their row."""
-    # Few do: the largest of every 64 rule the others out, faster than a comparison of all would.
-    largest, every = score, 1
-    while every < 64 and largest.shape[1] % 2 == 0:
-        half = largest.shape[1] // 2
-        largest, every = torch.maximum(largest[:, :half], largest[:, half:]), 2 * every
-    groups = score.unflatten(1, (every, -1))
-    place = torch.nonzero(largest >= threshold[:, None])
+    # Few do: the largest of every group rule the others out, faster than a comparison of all would.
+    groups = groups_of(score)
+    place = torch.nonzero(groups.amax(dim=-1) >= threshold[:, None])
     row, group = place[:, 0], place[:, 1]
-    hit = torch.nonzero(groups[row, :, group] >= threshold[row][:, None])
+    hit = torch.nonzero(groups[row, group] >= threshold[row][:, None])
     found = hit[:, 0]
-    return row[found], hit[:, 1] * groups.shape[2] + group[found]
+    return row[found], group[found] * groups.shape[2] + hit[:, 1]
+
+
+def columns_of_largest(score: Tensor, count: int) -> Tensor:
+    """Columns (N, count) of the largest scores (N, L) of each row, in any order."""
+    groups = groups_of(score)
+    if groups.shape[1] < 2 * count:
+        return score.topk(count, dim=-1, sorted=False)[1]
+    # They lie in the groups with the largest maxima.
+    group = groups.amax(dim=-1).topk(count, dim=-1, sorted=False)[1]
+    every = groups.shape[2]
+    column = (group[..., None] * every + torch.arange(every, device=score.device)).flatten(1)
+    return column.gather(1, score.gather(1, column).topk(count, dim=-1, sorted=False)[1])
 
 
 def best_per_frame(frame: Tensor, pose: Tensor, cosine: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -165,6 +207,7 @@ class PoseSearch(nn.Module):
 
     library: Tensor
     order: Tensor
+    seen: Tensor
     centres: Tensor
     radius: Tensor
     rounding: Tensor
@@ -192,9 +235,10 @@ class PoseSearch(nn.Module):
         self.block = max(BLOCK, 3 * neighbours)
         order, self.starts = blocks_of_similar(seen, self.block) if blocks is None else blocks
         centres, radius, rounding = [], [], []
+        seen = seen[order]
         coarse = torch.empty(len(seen), 32, dtype=torch.bfloat16)
         for start, stop in zip(self.starts[:-1], self.starts[1:], strict=True):
-            points = seen[order[start:stop]]
+            points = seen[start:stop]
             centre = points.mean(dim=0)
             offset = points - centre
             aside = offset @ centre
@@ -208,6 +252,7 @@ class PoseSearch(nn.Module):
             rounding.append((offset - offset.bfloat16()).norm(dim=-1).max())
         self.register_buffer("library", library, persistent=False)
         self.register_buffer("order", order, persistent=False)
+        self.register_buffer("seen", seen, persistent=False)
         self.register_buffer("centres", torch.stack(centres), persistent=False)
         self.register_buffer("radius", torch.stack(radius), persistent=False)
         self.register_buffer("rounding", torch.stack(rounding), persistent=False)
@@ -259,8 +304,11 @@ class PoseSearch(nn.Module):
         homes: list[int] = torch.nonzero(torch.bincount(home))[:, 0].tolist()
         for block in homes:
             rows = torch.nonzero(home == block)[:, 0]
-            score, _ = self._scores(block, moment[rows], weights[rows], uniform)
-            guess[rows] = self.order[self.starts[block] + score.topk(self.neighbours, dim=-1)[1]]
+            if uniform:
+                score, _ = self._coarse_scores(block, moment[rows])
+            else:
+                score, _ = cosine_table(moment[rows], weights[rows], self._seen(block))
+            guess[rows] = self.order[self.starts[block] + columns_of_largest(score, self.neighbours)]
         first_fit = weighted_cosine(keypoints[:, None], weights[:, None], self.poses(guess))
         least = first_fit.amin(dim=-1)
 
@@ -273,9 +321,14 @@ class PoseSearch(nn.Module):
         for i in range(len(blocks)):
             block = blocks[i]
             rows = torch.nonzero(alive[:, block])[:, 0]
-            score, slack = self._scores(block, moment[rows], weights[rows], uniform)
-            # Scores are cosines less one; they and the threshold are rounded by 2^-8 of themselves at most.
-            threshold = ((least[rows] - 1.0 - slack) * (1.0 + 2.0**-6)).to(score.dtype)
+            if uniform:
+                score, slack = self._coarse_scores(block, moment[rows])
+                # Scores are cosines less one; they and the threshold are rounded by 2^-8 of themselves at most.
+                threshold = ((least[rows] - 1.0 - slack) * (1.0 + 2.0**-6)).to(score.dtype)
+            else:
+                floor = least[rows].clamp(min=0.0)
+                score = reach_table(moment[rows], weights[rows], self._seen(block), floor, self.margin)
+                threshold = torch.zeros_like(score[:, 0])
             row, column = at_least(score, threshold)
             found, candidate = rows[row], self.order[self.starts[block] + column]
             fresh = (guess[found] != candidate[:, None]).all(dim=-1)
@@ -301,13 +354,13 @@ class PoseSearch(nn.Module):
                 new_frames, new_poses, waiting = [frame[:0]], [pose[:0]], 0
         return pose.reshape(frames, self.neighbours)
 
-    def _scores(self, block: int, moment: Tensor, weights: Tensor, uniform: bool) -> tuple[Tensor, Tensor]:
-        """Cosines less one of frames with the poses of a block, and by how much they may be too low."""
+    def _seen(self, block: int) -> Tensor:
+        """The poses of a block along depth: (L, 28)."""
+        return self.seen[self.starts[block] : self.starts[block + 1]]
+
+    def _coarse_scores(self, block: int, moment: Tensor) -> tuple[Tensor, Tensor]:
+        """Cosines less one of frames of equal weights with a block's poses, and by how much they may be too low."""
         rows = slice(self.starts[block], self.starts[block + 1])
-        if not uniform:
-            seen = seen_along_depth(self.poses(self.order[rows])).to(moment.dtype)
-            # Rounding of float32, as in the bound of a whole block.
-            return cosine_table(moment, weights, seen)[0] - 1.0, torch.full_like(moment[:, 0], self.margin)
         centre = self.centres[block]
         point = math.sqrt(14.0) * moment
         offset = point - centre
@@ -318,7 +371,7 @@ class PoseSearch(nn.Module):
         parts = torch.stack([one, one, high, (aside - high).to(torch.bfloat16)], dim=-1)
         # A module cast to another precision has cast what is stored too; the numbers are the same.
         rounded = torch.cat([short, parts], dim=-1).to(self.coarse.dtype)
-        score = torch.mm(rounded, self.coarse[rows].t())
+        score = torch.mm(rounded, self.coarse[rows].t()).to(moment.dtype)
         slack = torch.linalg.vector_norm(offset - short, dim=-1) * self.radius[block]
         slack = slack + torch.linalg.vector_norm(short.to(offset.dtype), dim=-1) * self.rounding[block]
         # What is left of a number in two parts, and float32 sums.
@@ -331,7 +384,7 @@ class PoseSearch(nn.Module):
         index = torch.zeros((moment.shape[0], self.neighbours), dtype=torch.int64, device=moment.device)
         for block in range(len(self.starts) - 1):
             pose = self.order[self.starts[block] : self.starts[block + 1]]
-            seen = seen_along_depth(self.poses(pose)).to(moment.dtype)
-            best, at = torch.cat([best, cosine_table(moment, weights, seen)[0]], dim=-1).topk(self.neighbours)
+            cosine = cosine_table(moment, weights, self._seen(block))[0]
+            best, at = torch.cat([best, cosine], dim=-1).topk(self.neighbours)
             index = torch.cat([index, pose.expand(moment.shape[0], -1)], dim=-1).gather(-1, at)
         return index
