@@ -2,13 +2,14 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import Any
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from tensorsim.config import SimulationConfig
-from tensorsim.data.sets.outputs import SIGNALS, Stored
+from tensorsim.data.sets.outputs import SIGNALS, Stored, stored_joints
 from tensorsim.data.sets.pair_outputs import maps_of, scatterers, stored_maps
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.scene import Scene
@@ -21,7 +22,8 @@ from tensorsim.radar.processing.range_profile import gate_bins
 from tensorsim.radar.recorder import receiver_noise
 from tensorsim.radar.simulator import RadarSimulator
 
-Arrays = dict[str, npt.NDArray[object]]
+#: Arrays of a sample by name, ``RADAR.OUTPUT``.
+Arrays = dict[str, npt.NDArray[Any]]
 
 
 @torch.no_grad()
@@ -83,8 +85,9 @@ def _outputs(recipe: DatasetRecipe, views: Sequence[View], device: torch.device)
     maps = {name: map_.cpu() for name, map_ in maps_of(stage, profiles, points, rcs, wanted).items()}
     simulator = stage.simulator.cpu()
     return [
-        stored_maps(simulator, {name: map_[k] for name, map_ in maps.items()}, wanted, recipe.duration_s)
-        for k in range(len(views))
+        {"joints": stored_joints(view.scene.joints, view.scene.valid)}
+        | stored_maps(simulator, {name: map_[k] for name, map_ in maps.items()}, wanted, recipe.duration_s)
+        for k, view in enumerate(views)
     ]
 
 
@@ -99,25 +102,31 @@ def _config_of_all(views: Sequence[View]) -> SimulationConfig:
 
 
 def _profiles(simulator: RadarSimulator, points: Tensor, rcs: Tensor, views: Sequence[View]) -> Tensor:
-    """Profiles (B, M, R) with the noise of each sample, 0 in range bins that are not its own."""
-    recorder, axis = simulator.recorder, simulator.range_profile
+    """Profiles (B, M, R) with the noise of each sample: its own range bins, then 0 where others have more."""
+    recorder = simulator.recorder
     echoes, levels = recorder.echoes(points, rcs, simulator.span(points))
-    clean = torch.cat(echoes, 1)
-    received = torch.zeros_like(clean)
+    clean = torch.cat([echo.mT for echo in echoes], -1)
+    bins = [_own_bins(simulator, view) for view in views]
+    width = max(own.stop - own.start for own in bins)
+    received = clean.new_zeros([len(views), width, clean.shape[2]])
     span = simulator.span(points[:1])
-    for k, view in enumerate(views):
-        gate, first, last = view.config.processing.range_gate_m, axis.first_bin, axis.last_bin
-        if isinstance(gate, tuple):
-            first, last = gate_bins(gate, simulator.radar.range_resolution_m, axis.samples // 2)
-        own = slice(first - axis.first_bin, last + 1 - axis.first_bin)
-        received[k, :, own] = clean[k, :, own]
+    for k, (view, own) in enumerate(zip(views, bins, strict=True)):
+        mine = received[k : k + 1, : own.stop - own.start].mT
+        mine.copy_(clean[k : k + 1, own].mT)
         if recorder.noise.noiseless:
             continue
         power = receiver_noise(view.config.scene, simulator.echo).noise_power(levels.signal[k : k + 1].cpu())
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(view.noise_seed)
-            for start in range(0, clean.shape[1], span):
-                piece = received[k : k + 1, start : start + span, own]
-                noise = recorder.drawn(torch.empty_like(piece, device="cpu"), power)[0]
-                received[k : k + 1, start : start + span, own] = piece + noise.to(piece.device)
-    return received
+            for piece in mine.split(span, 1):
+                piece += recorder.drawn(torch.empty_like(piece, device="cpu"), power)[0].to(piece.device)
+    return received.mT
+
+
+def _own_bins(simulator: RadarSimulator, view: View) -> slice:
+    """The range bins of a sample among those of all."""
+    axis, gate = simulator.range_profile, view.config.processing.range_gate_m
+    if not isinstance(gate, tuple):
+        return slice(0, axis.last_bin + 1 - axis.first_bin)
+    first, last = gate_bins(gate, simulator.radar.range_resolution_m, axis.samples // 2)
+    return slice(first - axis.first_bin, last + 1 - axis.first_bin)

@@ -49,7 +49,9 @@ def pair_outputs(
     else:
         profiles = stage.simulator.profiles(points, rcs)
     maps = maps_of(stage, profiles, points, rcs, wanted)
-    return found | stored_maps(stage.simulator, {name: map_[0] for name, map_ in maps.items()}, wanted, duration_s)
+    return found | stored_maps(
+        stage.simulator, {name: map_[0] for name, map_ in maps.items()}, wanted, duration_s
+    )
 
 
 def scatterers(stage: PoseToDoppler, joints: Tensor, valid: Tensor, fps: float) -> tuple[Tensor, Tensor]:

@@ -34,8 +34,8 @@ class VariationConfig:
         snr_db: signal-to-noise ratio per IF sample; None takes that of the scene.
         sway, vital_signs: probability that people sway, and that they breathe.
         wall_permittivity, wall_thickness_m: of the walls that radars have.
-        phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db: of the receivers, see
-            :class:`~tensorsim.config.ReceiverConfig`. Samples with such effects are computed by the engine ``"time"``.
+        phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db: of the receivers,
+            see :class:`~tensorsim.config.ReceiverConfig`. Samples with such effects take the engine ``"time"``.
         real_receiver: probability that receivers have one channel in place of I and Q.
         denoisers: to choose from, see :class:`~tensorsim.config.ProcessingConfig`; none leaves that of the recipe.
 
@@ -120,8 +120,8 @@ class Variation:
         start: beginning of the part of a long clip, as a share of what there is to choose from.
         companions: seeds of further people, by comma.
         body, snr_db, sway, vital_signs, wall_permittivity, wall_thickness_m: of the scene.
-        phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db, real_receiver: of the
-            receivers.
+        phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db, real_receiver: of
+            the receivers.
         denoiser: of the maps.
     """
 
