@@ -338,7 +338,9 @@ def test_the_denoiser_of_a_sample_cleans_its_maps() -> None:
     variation = replace(plan.variation(0, 0), snr_db=-20.0)
     scene = plan.scene(0, "train", variation)
     plain, none, cleaned = (
-        synthesize(recipe, scene, replace(variation, denoiser=name)).arrays["front.doppler_time"].astype(float)
+        synthesize(recipe, scene, replace(variation, denoiser=name))
+        .arrays["front.doppler_time"]
+        .astype(float)
         for name in (None, "none", "perona-malik")
     )
     assert (plain == none).all()
