@@ -46,9 +46,8 @@ def onnx_suppression(
     of_class = op.Equal(op.Unsqueeze(labels, [1]), op.Unsqueeze(classes, [0, 2]))  # (B, C, n)
     by_class = op.Where(of_class, op.Unsqueeze(scores, [1]), nothing)
     most = op.Constant(value_ints=[max_detections])
-    chosen = op.NonMaxSuppression(
-        boxes, by_class, most, [iou_threshold], [0.0]
-    )  # (found, 3): clip, class, box
+    # (found, 3): picture, class, box
+    chosen = op.NonMaxSuppression(boxes, by_class, most, [iou_threshold], [0.0])
     place = op.Gather(chosen, [0, 2], axis=1)
     kept = op.ScatterND(op.Expand(nothing, op.Shape(scores)), place, op.GatherND(scores, place))
     best, index = op.TopK(kept, most)
