@@ -38,8 +38,9 @@ def onnx_suppression(
     boxes: Any, scores: Any, labels: Any, valid: Any, iou_threshold: float, max_detections: int
 ) -> tuple[Any, Any]:
     """The same by ONNX's NonMaxSuppression, which lists boxes of each class in no order over the classes."""
-    from onnxscript import opset18 as op
+    from onnxscript import opset18
 
+    op: Any = opset18  # whose annotations know no constants
     nothing = op.Constant(value_float=-1.0)
     scores = op.Where(valid, scores, nothing)
     classes = op.Range(0, op.Add(op.ReduceMax(labels, keepdims=0), 1), 1)
