@@ -94,6 +94,8 @@ VISION: dict[str, tuple[Callable[[], nn.Module], Callable[[int], tuple[Tensor, .
     "nearest poses": (lambda: ts.vision.NearestPoseLifter(load_pose_library()[::7]), placed_poses),
     "VideoPose3D": (ts.vision.VideoPose3D, lambda n: (torch.rand(n, 50, 17, 2),)),
 }
+#: Shares of candidates are exponentials of some hundred times the errors of their fits, which are rounded.
+TOLERANCE = {"nearest poses": 5e-4}
 
 
 def run(path: Path, *inputs: Tensor) -> list[np.ndarray]:
@@ -115,10 +117,11 @@ def test_networks_of_the_vision_part(name: str, tmp_path: Path, monkeypatch: pyt
         with torch.no_grad():
             expected = stage(*inputs)
         expected = (expected,) if isinstance(expected, Tensor) else expected
+        assert expected[0].any(), "something to compare"
         for one, truth in zip(run(tmp_path / "m.onnx", *inputs), expected, strict=True):
-            assert one.any(), "something to compare"
             apart = np.abs(one.astype(np.float64) - truth.double().numpy()).max()
-            assert apart < 1e-5 * max(1.0, float(truth.double().abs().max()))
+            bound = TOLERANCE.get(name, 1e-5) * max(1.0, float(truth.double().abs().max()))
+            assert apart < (bound if truth.is_floating_point() else 1e-9)
 
 
 @pytest.mark.slow
