@@ -151,6 +151,13 @@ def is_exporting() -> bool:
     return False
 
 
+def is_writing_onnx() -> bool:
+    """Whether the exporter to ONNX is tracing, which has no complex numbers and few operations."""
+    if not torch.jit.is_scripting():
+        return torch.onnx.is_in_onnx_export()
+    return False
+
+
 def check_finite(x: Tensor, name: str) -> None:
     """Refuse NaN and infinity; skipped while torch.export traces, where values are unknown."""
     if is_exporting():

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
+from tensorsim.onnx_operations import translations
 
 
 def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
@@ -88,6 +89,7 @@ def to_onnx(
                 dynamo=True,
                 dynamic_shapes=shapes,
                 output_names=list(outputs) or None,
+                custom_translation_table=translations(),
                 verbose=False,
             )
         except Exception as error:  # the exporter's errors share no base class

@@ -1,10 +1,13 @@
 """The denoisers of radar maps by name."""
 
+from pathlib import Path
+
 from torch import nn
 
 from tensorsim.enhance.dncnn import MapDenoiser
 from tensorsim.enhance.ksvd import KSVD
 from tensorsim.enhance.perona_malik import PeronaMalik
+from tensorsim.errors import TensorsimError
 
 #: Names that stand for a method; any other is a name or file of DnCNN weights.
 DENOISERS = ("none", "perona-malik", "ksvd", "dncnn")
@@ -27,3 +30,18 @@ def map_denoiser(choice: str | None) -> nn.Module | None:
     if choice == "ksvd":
         return KSVD().eval()
     return MapDenoiser.from_pretrained(None if choice == "dncnn" else choice)
+
+
+def check_denoiser(choice: str | None) -> None:
+    """Refuse, before any work, what :func:`map_denoiser` would not find; nothing is loaded.
+
+    Raises:
+        TensorsimError: neither a method nor a name or file of weights.
+    """
+    from tensorsim.registry import find
+
+    if choice is None or choice in DENOISERS or Path(choice).is_file():
+        return
+    if Path(choice).suffix:
+        raise TensorsimError(f"denoiser: got {choice!r}, which is no file, expected weights or a name")
+    find(choice, "DnCNN")

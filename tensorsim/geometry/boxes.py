@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tensorsim.errors import is_exporting
+from tensorsim.errors import is_exporting, is_writing_onnx
 
 
 def resize_8bit(images: Tensor, height: int, width: int) -> Tensor:
@@ -150,6 +150,10 @@ def non_maximum_suppression(
         Indices (B, k) into the n boxes, best first, and whether each was found (B, k). Not differentiable.
     """
     # kornia.geometry.bbox.nms takes one image, one class and no limit, and does not export.
+    if not torch.jit.is_scripting() and is_writing_onnx():
+        from tensorsim.onnx_operations import suppression
+
+        return suppression()(boxes, scores, labels, valid, iou_threshold, max_detections)
     batch, count = scores.shape
     picked = torch.zeros((batch, max_detections), dtype=torch.int64, device=scores.device)
     found = torch.zeros((batch, max_detections), dtype=torch.bool, device=scores.device)

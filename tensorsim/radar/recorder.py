@@ -15,6 +15,18 @@ from tensorsim.radar.synthesis.front_end import FrontEnd, Levels
 from tensorsim.radar.synthesis.noise import ProfileNoise, ReceiverNoise, energy
 
 
+def receiver_noise(scene: SceneConfig, echo: EchoSynthesizer) -> ReceiverNoise:
+    """The thermal noise of a scene; one without echo gets that of a target of 1 m^2 at 3 m in free space."""
+    return ReceiverNoise(
+        scene.snr_db,
+        scene.noise_reference,
+        empty_power=(echo.paths.scale / 3.0**2) ** 2,
+        bandwidth_hz=scene.radar.sample_rate_hz,
+        noise_figure_db=scene.noise_figure_db,
+        transmit_power_w=scene.transmit_power_w,
+    )
+
+
 class Recorder(nn.Module):
     """Scatterers to range profiles as they are received, a piece of the clip at a time.
 
@@ -47,14 +59,7 @@ class Recorder(nn.Module):
     ) -> None:
         super().__init__()
         radar = scene.radar
-        self.noise = ReceiverNoise(
-            scene.snr_db,
-            scene.noise_reference,
-            empty_power=(echo.paths.scale / 3.0**2) ** 2,
-            bandwidth_hz=radar.sample_rate_hz,
-            noise_figure_db=scene.noise_figure_db,
-            transmit_power_w=scene.transmit_power_w,
-        )
+        self.noise = receiver_noise(scene, echo)
         total, clutter = scene.noise_reference == "total", None
         if scene.clutter is not None:
             clutter = RoomClutter(scene.clutter.reflectors, jitter_m=scene.clutter.jitter_m, seed=seed)
@@ -150,12 +155,16 @@ class Recorder(nn.Module):
         clean = echoes.pop(0) if len(echoes) > 0 else self.survey(positions, rcs, first, ahead)[0]
         if self.noise.noiseless:
             return clean, torch.zeros_like(levels.signal)
+        noise, drawn = self.drawn(clean, self.noise.noise_power(levels.signal))
+        return noise.add_(clean), drawn
+
+    def drawn(self, clean: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+        """Noise in the shape of profiles (B, m, V R), of a power (B,) per sample, and its energy (B,)."""
         # Every antenna has noise of its own.
         like = clean.transpose(1, 2).reshape([clean.shape[0] * self.channels, -1, clean.shape[1]])
-        power = self.noise.noise_power(levels.signal).repeat_interleave(self.channels)
-        noise, drawn = self.profile_noise(like, power)
+        noise, energies = self.profile_noise(like, power.repeat_interleave(self.channels))
         noise = noise.reshape([clean.shape[0], -1, clean.shape[1]]).transpose(1, 2)
-        return noise.add_(clean), drawn.reshape([-1, self.channels]).mean(-1)
+        return noise, energies.reshape([-1, self.channels]).mean(-1)
 
     def step(self, positions: Tensor) -> int:
         """Pulses of every clip to work on at a time."""

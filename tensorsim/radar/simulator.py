@@ -165,13 +165,13 @@ class RadarSimulator(nn.Module):
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
         pulses = positions.shape[1]
-        echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
+        echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         noise = torch.zeros_like(levels.signal)
         pending = self._nothing_pending(positions)
         range_time: list[Tensor] = []
         range_time_mti: list[Tensor] = []
         doppler_times: list[Tensor] = []
-        ahead, span = self.echo.displacements(positions), self._span(positions)
+        ahead, span = self.echo.displacements(positions), self.span(positions)
         for start in range(0, pulses, span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
             way = None if ahead is None else ahead[:, start : start + span]
@@ -200,10 +200,10 @@ class RadarSimulator(nn.Module):
         """Only the Doppler-time map (..., F, K) of :meth:`forward`; with one seed the same."""
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
-        echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
+        echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         pending = self._nothing_pending(positions)
         parts: list[Tensor] = []
-        ahead, span = self.echo.displacements(positions), self._span(positions)
+        ahead, span = self.echo.displacements(positions), self.span(positions)
         for start in range(0, positions.shape[1], span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
             way = None if ahead is None else ahead[:, start : start + span]
@@ -222,9 +222,9 @@ class RadarSimulator(nn.Module):
         """
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
-        echoes, levels = self.recorder.echoes(positions, rcs, self._span(positions))
+        echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         parts: list[Tensor] = []
-        ahead, span = self.echo.displacements(positions), self._span(positions)
+        ahead, span = self.echo.displacements(positions), self.span(positions)
         for start in range(0, positions.shape[1], span):
             points, sections = positions[:, start : start + span], rcs[:, start : start + span]
             way = None if ahead is None else ahead[:, start : start + span]
@@ -242,8 +242,8 @@ class RadarSimulator(nn.Module):
             check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m)
         return flatten_batch(positions, 3), flatten_batch(rcs, 2)
 
-    def _span(self, positions: Tensor) -> int:
-        """Pulses in a piece."""
+    def span(self, positions: Tensor) -> int:
+        """Pulses that are worked on, and for which noise is drawn, at a time; for positions (B, M, S, 3)."""
         if self.mti.whole_clip:
             return positions.shape[1]
         return max(self.piece_chunks * self.recorder.step(positions), self.mti.lost_pulses + 1)

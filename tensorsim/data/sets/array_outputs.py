@@ -8,22 +8,24 @@ from torch import Tensor
 
 from tensorsim.config import RadarConfig, SimulationConfig
 from tensorsim.data.sets.outputs import OutputConfig, Stored, in_decibels
+from tensorsim.data.sets.pair_outputs import of_samples
 from tensorsim.data.sets.scene import Scene
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.radar.options import echo_of
-from tensorsim.radar.processing.array import align_transmitters, steering_vectors
+from tensorsim.radar.processing.array import align_transmitters, steering_vectors, virtual_elements
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.radar.processing.point_cloud import PointCloud
 from tensorsim.radar.processing.range_profile import RangeProfile
-from tensorsim.radar.synthesis.noise import ReceiverNoise, mean_power
+from tensorsim.radar.recorder import Recorder
+from tensorsim.radar.synthesis.front_end import Levels
 from tensorsim.recognition.map_image import area_weights
 
 #: Detection of points: guard and training cells in range and Doppler, and the share of false alarms.
 _GUARD, _TRAINING, _FALSE_ALARM = (2, 2), (6, 6), 1e-5
-#: Pulses in the estimate of the echo's power that the noise refers to.
+#: Pulses in the estimate of the powers that noise and converters refer to.
 _POWER_PULSES = 256
 
 
@@ -31,7 +33,8 @@ def array_outputs(config: SimulationConfig, wanted: OutputConfig, scene: Scene) 
     """``range_doppler_angle`` and ``point_cloud`` as :class:`~tensorsim.data.sets.outputs.OutputConfig` says.
 
     Each frame is a Doppler window of ``processing.window_s``; transmitters that fire in turn are aligned, echoes that
-    stand still are removed by the moving target indicator of the configuration.
+    stand still are removed by the moving target indicator of the configuration. The powers that noise and converters
+    refer to are means over some of the pulses.
 
     Raises:
         TensorsimError: a point cloud of antennas that are no even line along x.
@@ -71,33 +74,29 @@ def _cubes(
     pulses = stage.resampler.pulses(joints.shape[2], scene.fps)
     points, rcs = stage.scene(coefficients, valid, scene.fps, 0, pulses)
     echo = echo_of(config.scene, config.processing.pulse_chunk, None, ())
-    every = max(1, pulses // _POWER_PULSES)
-    signal = mean_power(echo.target_echo(points[:, ::every], rcs[:, ::every])).mean()
-    noise = ReceiverNoise(
-        config.scene.snr_db,
-        config.scene.noise_reference,
-        empty_power=(echo.paths.scale / 3.0**2) ** 2,
-        bandwidth_hz=radar.sample_rate_hz,
-        noise_figure_db=config.scene.noise_figure_db,
-        transmit_power_w=config.scene.transmit_power_w,
-    )
+    recorder = Recorder(config.scene, of_samples(config.processing), echo, profile, config.seed)
+    ahead = echo.displacements(points)
+    some = slice(None, None, max(1, pulses // _POWER_PULSES))
+    few, nothing = points[:, some], torch.zeros(1, dtype=torch.float64)
+    _, energies = recorder.survey(few, rcs[:, some], 0, None if ahead is None else ahead[:, some])
+    levels = recorder.add(Levels(nothing, nothing), energies, few.shape[1])
     mti = MovingTargetIndicator(config.processing.mti)
     length = frames.length + mti.lost_pulses
     hop = max(1, round(radar.prf_hz / wanted.frames_per_s))
     window = frames.shifting_window.float()
     for first in range(0, pulses - length + 1, hop):
-        clean = echo(points[:, first : first + length], rcs[:, first : first + length])[0]
-        if not noise.noiseless:
-            clean = clean + noise.draw(clean, noise.noise_power(signal).expand(clean.shape[0]))
-        profiles = align_transmitters(profile(clean), len(radar.tx_positions_m))
-        moving = mti(profiles).transpose(-2, -1)
-        yield torch.fft.ifft(moving * window, frames.bins, norm="forward")
+        own = slice(first, first + length)
+        way = None if ahead is None else ahead[:, own]
+        received, _ = recorder.received(points[:, own], rcs[:, own], first, way, levels, [])
+        channels = received[0].unflatten(-1, [recorder.channels, -1]).transpose(0, 1)
+        moving = mti(align_transmitters(channels, len(radar.tx_positions_m)))
+        yield torch.fft.ifft(moving.transpose(-2, -1) * window, frames.bins, norm="forward")
 
 
 def _beams(cube: Tensor, radar: RadarConfig, wanted: OutputConfig) -> Tensor:
     """Power (R', F', D) of D beams in steps of equal sine, mean over cells of range and Doppler."""
     sines = (torch.arange(wanted.beams, dtype=torch.float64) + 0.5) * (2 / wanted.beams) - 1
-    cycles = steering_vectors(_virtual_m(radar), sines.asin(), 0.0, radar.doppler_wavelength_m)
+    cycles = steering_vectors(virtual_elements(radar), sines.asin(), 0.0, radar.doppler_wavelength_m)
     weights = torch.polar(torch.ones_like(cycles), 2 * torch.pi * cycles).to(cube.dtype) / cycles.shape[1]
     power = torch.einsum("dv,vrf->rfd", weights.conj(), cube).abs().square()
     rows, columns = wanted.cube_size
@@ -109,18 +108,11 @@ def _beams(cube: Tensor, radar: RadarConfig, wanted: OutputConfig) -> Tensor:
     return power
 
 
-def _virtual_m(radar: RadarConfig) -> Tensor:
-    """Virtual elements (V, 3): sums of the places of transmitter and receiver, transmitter by transmitter."""
-    tx = torch.tensor(radar.tx_positions_m, dtype=torch.float64)
-    rx = torch.tensor(radar.rx_positions_m, dtype=torch.float64)
-    return (tx[:, None] + rx).flatten(0, 1)
-
-
 def _points(
     cubes: Tensor, radar: RadarConfig, profile: RangeProfile, frames: DopplerFrames, wanted: OutputConfig
 ) -> Stored:
     """Points (frames, points, 4) of cubes (frames, V, R, F)."""
-    steps = _virtual_m(radar).diff(dim=0)
+    steps = virtual_elements(radar).diff(dim=0)
     if not torch.allclose(steps, steps[:1] * torch.tensor([1.0, 0, 0]).double(), atol=1e-6):
         raise TensorsimError("point_cloud: got other antennas, expected an even line along x")
     cfar = CfarDetector(_GUARD, _TRAINING, _FALSE_ALARM, edges=("reflect", "circular"))

@@ -22,6 +22,8 @@ variations:          # of every clip; ranges are drawn uniformly
   mirror: 0.5        # probability
   speed: [0.9, 1.1]
   snr_db: [10.0, 50.0]
+  # adc_bits: [8, 12]                     # also phase_noise_dbc_hz, iq_imbalance_db, dc_offset_db, ... of receivers
+  # denoisers: [none, perona-malik]       # one of them for each sample; also dncnn, or a file of its weights
 
 radars:              # all see the same motion
   - name: front

@@ -11,13 +11,16 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from tensorsim.data.sets.batches import Arrays, synthesize_batch
 from tensorsim.data.sets.manifest import recipe_of, rows_of
 from tensorsim.data.sets.outputs import MAPS, OutputConfig
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import PARTS, DatasetRecipe
 from tensorsim.data.sets.samples import sample_id
+from tensorsim.data.sets.scene import Scene
 from tensorsim.data.sets.stored import StoredArrays
-from tensorsim.data.sets.synthesis import synthesize
+from tensorsim.data.sets.variations import Variation
+from tensorsim.device import usable_device
 from tensorsim.errors import TensorsimError
 
 #: Outputs that a classifier can look at.
@@ -191,18 +194,24 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
     """The samples of a recipe, simulated while they are asked for, with new variations in every round.
 
     Nothing is stored. The first round has the very samples of the data set that the recipe describes; use several
-    workers of a ``DataLoader`` to simulate while the network trains.
+    workers of a ``DataLoader`` to simulate on the CPU while the network trains, or a ``device`` and a ``batch`` to
+    simulate in the process that trains.
 
     Args:
         recipe: as for :class:`MapDataset`.
         split: part of it; None takes all.
         rounds: number of rounds through its samples; None goes on for ever.
         output, radars: see :class:`MapDataset`.
+        device: where the radar chain runs, and where the maps are. People are generated or read on the CPU. A GPU needs
+            a ``DataLoader`` without workers.
+        batch: samples in one pass of the radar chain, see
+            :func:`~tensorsim.data.sets.batches.synthesize_batch`; the maps are the same for any.
 
     Samples: as those of :class:`MapDataset`. Clips that fail are left out.
 
     Raises:
-        TensorsimError: an unknown part, output or radar, or a source that is not there.
+        TensorsimError: an unknown part, output or radar, a source that is not there, a batch below 1, or a device that
+            cannot be used.
     """
 
     def __init__(
@@ -212,31 +221,50 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
         rounds: int | None = None,
         output: str | None = None,
         radars: Sequence[str] | None = None,
+        device: str | torch.device = "cpu",
+        batch: int = 1,
     ) -> None:
+        if batch < 1:
+            raise TensorsimError(f"SimulatedMaps.batch: got {batch}, expected at least 1")
         if split not in (None, *PARTS):
             raise TensorsimError(f"SimulatedMaps.split: got {split!r}, expected one of {', '.join(PARTS)}")
         self.plan, self.split, self.rounds = Plan(recipe), split, rounds
         self.names = chosen_names(recipe, output, radars)
         self.labels = self.plan.labels
+        self.device, self.batch = usable_device(str(device)), batch
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         number, count = share_of_worker()
         numbers = [n for n in range(len(self.plan)) if self.split in (None, self.plan.clip_of_sample(n)[0])]
         done = 0
         while numbers and (self.rounds is None or done < self.rounds):
-            for place in numbers[number::count]:
-                try:
-                    sample = self._sample(place, done)
-                except (TensorsimError, OSError):
-                    continue
-                yield sample
+            own = numbers[number::count]
+            for first in range(0, len(own), self.batch):
+                yield from self._samples(own[first : first + self.batch], done)
             done += 1
 
-    def _sample(self, number: int, done: int) -> dict[str, Any]:
-        recipe = self.plan.recipe
-        part, clip, variation = self.plan.clip_of_sample(number)
-        drawn = self.plan.variation(clip, done * recipe.variations.count + variation)
-        made = synthesize(recipe, self.plan.scene(clip, part, drawn), drawn)
-        label = self.plan.labels.index(self.plan.clip(clip)[1].label)
-        maps = [as_picture(made.arrays[name], recipe.outputs) for name in self.names]
-        return {"map": stacked(maps, self.names), "label": label, "id": f"{sample_id(number)}-{done}"}
+    def _samples(self, numbers: Sequence[int], done: int) -> Iterator[dict[str, Any]]:
+        """Those of some samples that do not fail, in a round."""
+        recipe, clips, drawn = self.plan.recipe, [], []
+        for number in numbers:
+            part, clip, count = self.plan.clip_of_sample(number)
+            variation = self.plan.variation(clip, done * recipe.variations.count + count)
+            try:
+                drawn.append((self.plan.scene(clip, part, variation), variation))
+            except (TensorsimError, OSError):
+                continue
+            clips.append((number, clip))
+        for (number, clip), arrays in zip(clips, self._arrays(drawn), strict=True):
+            if arrays is not None:
+                label = self.plan.labels.index(self.plan.clip(clip)[1].label)
+                maps = [as_picture(arrays[name], recipe.outputs) for name in self.names]
+                map_ = stacked(maps, self.names).to(self.device)
+                yield {"map": map_, "label": label, "id": f"{sample_id(number)}-{done}"}
+
+    def _arrays(self, drawn: Sequence[tuple[Scene, Variation]]) -> list[Arrays | None]:
+        """The arrays of samples, None for those that fail."""
+        try:
+            return list(synthesize_batch(self.plan.recipe, drawn, self.device))
+        except TensorsimError:
+            # One of them: the others are made without it.
+            return [None] if len(drawn) == 1 else [self._arrays([one])[0] for one in drawn]

@@ -13,6 +13,7 @@ from tensorsim.config.documents import from_document, to_document
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.data.sets.outputs import OutputConfig
 from tensorsim.data.sets.variations import VariationConfig
+from tensorsim.enhance.choice import check_denoiser
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.motion.activities import activity_index
@@ -234,6 +235,15 @@ class DatasetRecipe:
             raise TensorsimError(f"DatasetRecipe.radars: got the names {names}, expected different ones")
         if self.scene != replace(self.scene, radar=SceneConfig().radar, wall=None):
             raise TensorsimError("DatasetRecipe.scene: got a radar or a wall, expected them in radars")
+        usual = SceneConfig()
+        for name in ("body", "sway", "vital_signs"):
+            if getattr(self.scene, name) != getattr(usual, name):
+                raise TensorsimError(f"DatasetRecipe.scene: got {name}, expected it in variations")
+        check_denoiser(self.processing.denoiser)
+        if self.outputs.needs_array and (self.processing.denoiser or self.variations.denoisers):
+            raise TensorsimError(
+                f"DatasetRecipe: got a denoiser of maps for {', '.join(self.outputs.kinds)}, expected none"
+            )
         if self.storage.format == "png" and set(self.outputs.kinds) - {"picture"}:
             raise TensorsimError(
                 f"DatasetRecipe.outputs: got {', '.join(self.outputs.kinds)} for the format png, expected picture"

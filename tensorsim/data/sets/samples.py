@@ -34,7 +34,9 @@ LAST_COLUMNS: dict[str, type] = {"people": int, "warnings": str, "sha256": str}
 VARIATION_COLUMNS: dict[str, type] = {
     "seed": int, "height_m": float, "distance_m": float, "side_m": float, "heading_deg": float, "mirrored": bool,
     "speed": float, "start": float, "companions": str, "body": str, "snr_db": float, "sway": bool, "vital_signs": bool,
-    "wall_permittivity": float, "wall_thickness_m": float,
+    "wall_permittivity": float, "wall_thickness_m": float, "phase_noise_dbc_hz": float, "iq_imbalance_db": float,
+    "iq_phase_rad": float, "dc_offset_db": float, "adc_bits": int, "adc_headroom_db": float, "real_receiver": bool,
+    "denoiser": str,
 }  # fmt: skip
 
 

@@ -6,20 +6,17 @@ from typing import Any, NamedTuple, cast
 
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from tensorsim.config import SimulationConfig
 from tensorsim.config.scene import Body
-from tensorsim.data.sets import outputs
 from tensorsim.data.sets.array_outputs import array_outputs
-from tensorsim.data.sets.outputs import OutputConfig, Stored
+from tensorsim.data.sets.outputs import OF_PAIR, Stored, stored_joints
+from tensorsim.data.sets.pair_outputs import of_samples, pair_outputs
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView
 from tensorsim.data.sets.scene import Scene, seen_from
 from tensorsim.data.sets.variations import Variation, seed_of
 from tensorsim.errors import collected_warnings
-from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.radar.processing.ambiguity import gate_around
-from tensorsim.recognition.map_image import MapToImage
 
 #: How far a body reaches beyond its joints, range bins beside it, and what bounces inside a wall add to the range.
 _BODY_M, _MARGIN_BINS, _WALL_M = 0.2, 5, 2.0
@@ -55,7 +52,13 @@ def view_config(recipe: DatasetRecipe, view: RadarView, variation: Variation) ->
             (x, y, z), (width, before, height) = wall.center_m, wall.size_m
             wall = replace(wall, center_m=(x, y + (thick - before) / 2, z), size_m=(width, thick, height))
         scene = replace(scene, wall=wall)
-    return config.replace(scene=scene, seed=variation.seed % 2**32)
+    scene = replace(scene, receiver=variation.receiver(scene.receiver))
+    processing = config.processing
+    if variation.denoiser is not None:
+        processing = replace(processing, denoiser=variation.denoiser)
+    if scene.sampled_effects:
+        processing = of_samples(processing)
+    return config.replace(processing=processing, scene=scene, seed=variation.seed % 2**32)
 
 
 def people_gate(config: SimulationConfig, scene: Scene) -> tuple[float, float] | float | None:
@@ -79,74 +82,47 @@ def synthesize(recipe: DatasetRecipe, scene: Scene, variation: Variation) -> Syn
         TensorsimError: motion that a radar cannot follow.
     """
     arrays, peaks = {}, {}
-    with collected_warnings() as warnings, torch.random.fork_rng(devices=[]):
+    with collected_warnings() as warnings:
         for view in recipe.radars:
-            joints = seen_from(scene.joints, view.x_m, view.y_m, view.yaw_deg)
-            torch.manual_seed(seed_of(variation.seed, view.name, "noise"))
-            found = _outputs(recipe, view, scene._replace(joints=joints), variation)
+            found = alone(recipe, view_of(recipe, view, scene, variation))
             for kind in recipe.outputs.kinds:
                 arrays[f"{view.name}.{kind}"] = found[kind].array
                 peaks[f"{view.name}.{kind}"] = found[kind].peak
     return Synthesized(arrays, peaks, warnings)
 
 
-def _outputs(recipe: DatasetRecipe, view: RadarView, scene: Scene, variation: Variation) -> dict[str, Stored]:
-    """All outputs of one radar; joints in its axes."""
+class View(NamedTuple):
+    """What one radar is to make of one sample.
+
+    Attributes:
+        config: of the simulation.
+        scene: in the axes of the radar.
+        noise_seed: of the receiver noise.
+    """
+
+    config: SimulationConfig
+    scene: Scene
+    noise_seed: int
+
+
+def view_of(recipe: DatasetRecipe, view: RadarView, scene: Scene, variation: Variation) -> View:
+    """A radar of a recipe and a sample, whose people are in the world."""
+    seen = scene._replace(joints=seen_from(scene.joints, view.x_m, view.y_m, view.yaw_deg))
     config = view_config(recipe, view, variation)
     if recipe.gate_people and not recipe.outputs.has_range:
-        config = config.replace(processing__range_gate_m=people_gate(config, scene))
-    found = {"joints": outputs.stored_joints(scene.joints, scene.valid)}
-    if recipe.outputs.needs_array:
-        return found | array_outputs(config, recipe.outputs, scene)
-    if set(recipe.outputs.kinds) & set(outputs.OF_PAIR):
-        found |= _pair_outputs(config, recipe.outputs, scene, recipe.duration_s)
-    return found
+        config = config.replace(processing__range_gate_m=people_gate(config, seen))
+    return View(config, seen, seed_of(variation.seed, view.name, "noise"))
 
 
-def _pair_outputs(
-    config: SimulationConfig, wanted: OutputConfig, scene: Scene, duration_s: float
-) -> dict[str, Stored]:
-    """Outputs of one transmitter and receiver."""
-    stage = PoseToDoppler.from_config(config)
-    simulator = stage.simulator
-    joints, valid = scene.joints[None], scene.valid[None]
-    coefficients = stage.resampler.coefficients(joints, scene.fps)
-    pulses = stage.resampler.pulses(joints.shape[2], scene.fps)
-    points, rcs = stage.scene(coefficients, valid, scene.fps, 0, pulses)
-    kinds, found = set(wanted.kinds), {}
-    magnitudes: dict[str, Tensor] = {}
-    if kinds & set(outputs.SIGNALS):
-        target = simulator.echo.target_echo(points, rcs)
-        noise: Any = simulator.recorder.noise
-        signal = noise(simulator.echo(points, rcs), target)
-        profiles = simulator.range_profile(signal)
-        moving = simulator.mti(profiles)
-        found["if_signal"] = outputs.stored_signal(signal[0])
-        found["profiles"] = outputs.stored_signal(profiles[0])
-        magnitudes["range_time"] = profiles[0].abs().mT
-        magnitudes["range_time_mti"] = moving[0].abs().mT
-        magnitudes["doppler_time"] = simulator.doppler(moving)[0]
-    elif kinds & {"range_time", "range_time_mti"}:
-        maps = stage.denoise(simulator(points, rcs))
-        magnitudes = {name: getattr(maps, name)[0] for name in outputs.MAPS}
-    else:
-        doppler_time = simulator.doppler_time(points, rcs)
-        magnitudes["doppler_time"] = (stage.denoiser(doppler_time) if stage.denoises else doppler_time)[0]
-    for name in kinds & set(outputs.MAPS):
-        found[name] = outputs.stored_map(magnitudes[name], wanted, duration_s)
-    doppler = magnitudes["doppler_time"]
-    if "ridges" in kinds:
-        ridges = simulator.ridges(doppler)
-        found["ridges"] = Stored(simulator.doppler.doppler_hz.float()[ridges.indices].numpy(), 1.0)
-    if "picture" in kinds:
-        picture = MapToImage.doppler(
-            simulator.radar,
-            simulator.doppler.bins,
-            wanted.picture_speed_m_s,
-            wanted.picture_size,
-            range_db=wanted.picture_range_db,
-        )
-        found["picture"] = outputs.stored_picture(picture(doppler))
+def alone(recipe: DatasetRecipe, view: View) -> dict[str, Stored]:
+    """All outputs of one radar for one sample."""
+    found = {"joints": stored_joints(view.scene.joints, view.scene.valid)}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(view.noise_seed)
+        if recipe.outputs.needs_array:
+            found |= array_outputs(view.config, recipe.outputs, view.scene)
+        elif set(recipe.outputs.kinds) & set(OF_PAIR):
+            found |= pair_outputs(view.config, recipe.outputs, view.scene, recipe.duration_s)
     return found
 
 

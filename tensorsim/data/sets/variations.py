@@ -1,13 +1,15 @@
 """What differs between the samples that are made of one clip, and how it is drawn."""
 
 import hashlib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from tensorsim.config import ReceiverConfig
 from tensorsim.config.checks import is_finite, require_counts
 from tensorsim.config.scene import Body
+from tensorsim.enhance.choice import check_denoiser
 from tensorsim.errors import TensorsimError
 
 Range = tuple[float, float]
@@ -32,9 +34,14 @@ class VariationConfig:
         snr_db: signal-to-noise ratio per IF sample; None takes that of the scene.
         sway, vital_signs: probability that people sway, and that they breathe.
         wall_permittivity, wall_thickness_m: of the walls that radars have.
+        phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db: of the receivers,
+            see :class:`~tensorsim.config.ReceiverConfig`. Samples with such effects take the engine ``"time"``.
+        real_receiver: probability that receivers have one channel in place of I and Q.
+        denoisers: to choose from, see :class:`~tensorsim.config.ProcessingConfig`; none leaves that of the recipe.
 
     Raises:
-        TensorsimError: a range that does not ascend or is out of bounds, a probability outside of 0 to 1.
+        TensorsimError: a range that does not ascend or is out of bounds, a probability outside of 0 to 1, an unknown
+            kind of scatterers or denoiser.
     """
 
     count: int = 1
@@ -53,6 +60,14 @@ class VariationConfig:
     vital_signs: float = 0.0
     wall_permittivity: Range | None = None
     wall_thickness_m: Range | None = None
+    phase_noise_dbc_hz: Range | None = None
+    iq_imbalance_db: Range | None = None
+    iq_phase_rad: Range | None = None
+    dc_offset_db: Range | None = None
+    adc_bits: tuple[int, int] | None = None
+    adc_headroom_db: Range | None = None
+    real_receiver: float = 0.0
+    denoisers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         require_counts(self, "count")
@@ -67,6 +82,12 @@ class VariationConfig:
             ("snr_db", -200.0, 300.0),
             ("wall_permittivity", 1.0, 1000.0),
             ("wall_thickness_m", 0.0, 10.0),
+            ("phase_noise_dbc_hz", -200.0, 0.0),
+            ("iq_imbalance_db", -20.0, 20.0),
+            ("iq_phase_rad", -1.5, 1.5),
+            ("dc_offset_db", -200.0, 300.0),
+            ("adc_bits", 1, 24),
+            ("adc_headroom_db", -100.0, 100.0),
         ):
             value = getattr(self, name)
             if value is not None and not (len(value) == 2 and least <= value[0] <= value[1] <= most):
@@ -74,7 +95,7 @@ class VariationConfig:
                     f"VariationConfig.{name}: got {list(value)}, expected two numbers that ascend within {least} to "
                     f"{most}"
                 )
-        for name in ("mirror", "sway", "vital_signs"):
+        for name in ("mirror", "sway", "vital_signs", "real_receiver"):
             value = getattr(self, name)
             if not (is_finite(value) and 0 <= value <= 1):
                 raise TensorsimError(
@@ -85,6 +106,8 @@ class VariationConfig:
             raise TensorsimError(
                 f"VariationConfig.bodies: got {list(self.bodies)}, expected some of {', '.join(known)}"
             )
+        for name in self.denoisers:
+            check_denoiser(name)
 
 
 @dataclass(frozen=True)
@@ -97,6 +120,9 @@ class Variation:
         start: beginning of the part of a long clip, as a share of what there is to choose from.
         companions: seeds of further people, by comma.
         body, snr_db, sway, vital_signs, wall_permittivity, wall_thickness_m: of the scene.
+        phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db, real_receiver: of
+            the receivers.
+        denoiser: of the maps.
     """
 
     seed: int
@@ -114,6 +140,14 @@ class Variation:
     vital_signs: bool
     wall_permittivity: float | None
     wall_thickness_m: float | None
+    phase_noise_dbc_hz: float | None
+    iq_imbalance_db: float | None
+    iq_phase_rad: float | None
+    dc_offset_db: float | None
+    adc_bits: int | None
+    adc_headroom_db: float | None
+    real_receiver: bool
+    denoiser: str | None
 
     def row(self) -> dict[str, Any]:
         """As columns of the manifest."""
@@ -123,6 +157,12 @@ class Variation:
     def of_row(cls, row: dict[str, Any]) -> "Variation":
         """The inverse of :meth:`row`; other columns are left aside."""
         return cls(**{field.name: row[field.name] for field in fields(cls)})
+
+    def receiver(self, usual: ReceiverConfig) -> ReceiverConfig:
+        """A receiver with what was drawn; the rest is as usual."""
+        names = [field.name for field in fields(ReceiverConfig) if field.name != "real"]
+        drawn = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return replace(usual, real=usual.real or self.real_receiver, **drawn)
 
 
 def seed_of(*words: object) -> int:
@@ -143,8 +183,15 @@ def draw(config: VariationConfig, seed: int) -> Variation:
     def some(limits: Range) -> float:
         return limits[0] + (limits[1] - limits[0]) * next(place)
 
-    least, most = config.people
-    others = least - 1 + int((most - least + 1) * next(place))
+    def whole(limits: tuple[int, int] | None) -> int | None:
+        share = next(place)
+        return None if limits is None else limits[0] + int((limits[1] - limits[0] + 1) * share)
+
+    def one_of(choices: tuple[str, ...]) -> str | None:
+        share = next(place)
+        return choices[int(len(choices) * share)] if choices else None
+
+    others = (whole(config.people) or 1) - 1
     return Variation(
         seed=seed,
         companions=",".join(str(seed_of(seed, "companion", k)) for k in range(others)),
@@ -155,10 +202,18 @@ def draw(config: VariationConfig, seed: int) -> Variation:
         mirrored=next(place) < config.mirror,
         speed=some(config.speed),
         start=next(place),
-        body=config.bodies[int(len(config.bodies) * next(place))],
+        body=one_of(config.bodies) or "joints",
         snr_db=between(config.snr_db),
         sway=next(place) < config.sway,
         vital_signs=next(place) < config.vital_signs,
         wall_permittivity=between(config.wall_permittivity),
         wall_thickness_m=between(config.wall_thickness_m),
+        phase_noise_dbc_hz=between(config.phase_noise_dbc_hz),
+        iq_imbalance_db=between(config.iq_imbalance_db),
+        iq_phase_rad=between(config.iq_phase_rad),
+        dc_offset_db=between(config.dc_offset_db),
+        adc_bits=whole(config.adc_bits),
+        adc_headroom_db=between(config.adc_headroom_db),
+        real_receiver=next(place) < config.real_receiver,
+        denoiser=one_of(config.denoisers),
     )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map, check_tensor
+from tensorsim.errors import TensorsimError, check_complex_map, check_tensor, is_writing_onnx
 from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.range_profile import gate_bins
 
@@ -213,6 +213,8 @@ class DopplerTimeMap(DopplerFrames):
             series = series.abs().sum(1, keepdim=True)
         elif self.integration == "coherent":
             series = coherent_sum(series.transpose(1, 2), self.samples).transpose(1, 2)
+        if is_writing_onnx():
+            return unflatten_batch(self._of_real_numbers(series), list(profiles.shape[:-2]))
         frames = series.unfold(-1, self.length, self.hop)  # (B, R, K, L), a view
         batch, bins, count = frames.shape[0], frames.shape[1], frames.shape[2]
         # Neighbouring frames share most of their pulses, so a block is filled with frames first, then with clips,
@@ -251,6 +253,19 @@ class DopplerTimeMap(DopplerFrames):
         return unflatten_batch(
             doppler_time.unflatten(0, [batch, count]).transpose(1, 2), list(profiles.shape[:-2])
         )
+
+    def _of_real_numbers(self, series: Tensor) -> Tensor:
+        """The map (B, F, K) of series (B, R, M) by products with cosines and sines, for ONNX."""
+        cycles = torch.arange(self.length)[:, None] * torch.arange(self.bins) % self.bins / self.bins
+        angle = 2 * math.pi * cycles.double()
+        paper = not series.is_complex()
+        parts = torch.stack([series, torch.zeros_like(series)], -1) if paper else torch.view_as_real(series)
+        frames = parts.unfold(2, self.length, self.hop)  # (B, R, K, 2, L)
+        window = self.shifting_window.to(frames)
+        real, imaginary = (frames * window).unbind(3)
+        cos, sin = angle.cos().to(frames), angle.sin().to(frames)
+        power = (real @ cos - imaginary @ sin).square() + (real @ sin + imaginary @ cos).square()
+        return safe_sqrt(power.sum(1)).transpose(1, 2)
 
 
 class RangeDopplerVideo(DopplerFrames):

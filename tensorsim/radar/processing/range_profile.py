@@ -18,19 +18,23 @@ _WINDOWS = {
 }
 
 
-def range_profile(intermediate: Tensor, window: Tensor) -> Tensor:
-    r"""Pulse compression: the first N // 2 bins of the Fourier transform over fast time, not normalised.
+def range_profile(
+    intermediate: Tensor, window: Tensor, first_bin: int = 0, last_bin: int | None = None
+) -> Tensor:
+    r"""Pulse compression: bins of the Fourier transform over fast time, not normalised.
 
     $$ X_m[k] = \sum_{n=0}^{N-1} w[n] \, \mathrm{IF}_m[n] \, e^{-j 2 \pi k n / N} $$
 
     Args:
         intermediate: (..., M, N) complex IF samples of M pulses.
         window: (N,) real.
+        first_bin, last_bin: the bins; None is the last of the first N // 2.
 
     Returns:
-        (..., M, N // 2) complex; bin $k$ is at range $k c / (2 B)$.
+        (..., M, last_bin + 1 - first_bin) complex; bin $k$ is at range $k c / (2 B)$.
     """
-    return torch.fft.fft(intermediate * window)[..., : intermediate.shape[-1] // 2]
+    stop = intermediate.shape[-1] // 2 if last_bin is None else last_bin + 1
+    return torch.fft.fft(intermediate * window)[..., first_bin:stop]
 
 
 def gate_bins(gate_m: tuple[float, float], spacing_m: float, bins: int) -> tuple[int, int]:
@@ -104,8 +108,8 @@ class RangeProfile(nn.Module):
             raise TensorsimError(
                 f"IF: got shape {list(intermediate.shape)}, expected (..., pulses, {self.samples} samples)"
             )
-        profiles = range_profile(intermediate, self.window.to(torch.view_as_real(intermediate).dtype))
-        return profiles[..., self.first_bin : self.last_bin + 1]
+        window = self.window.to(torch.view_as_real(intermediate).dtype)
+        return range_profile(intermediate, window, self.first_bin, self.last_bin)
 
 
 class FollowingGate(nn.Module):

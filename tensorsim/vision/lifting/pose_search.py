@@ -15,6 +15,8 @@ from tensorsim.vision.lifting.pose_library import all_headings, seen_from, turn
 
 #: Poses of a block at most; half as many at least, in a pool that needs more than one.
 BLOCK = 8192
+#: Poses that an exported graph compares at once.
+EXPORTED = 2**17
 #: Cosines in float32 may be this much too low.
 ROUNDING = 1e-5
 #: Blocks but the last hold a multiple of this many.
@@ -382,9 +384,9 @@ class PoseSearch(nn.Module):
         """Full search without data-dependent control flow, for exported graphs: every frame with every pose."""
         best = torch.full((moment.shape[0], self.neighbours), -2.0, dtype=moment.dtype, device=moment.device)
         index = torch.zeros((moment.shape[0], self.neighbours), dtype=torch.int64, device=moment.device)
-        for block in range(len(self.starts) - 1):
-            pose = self.order[self.starts[block] : self.starts[block + 1]]
-            cosine = cosine_table(moment, weights, self._seen(block))[0]
-            best, at = torch.cat([best, cosine], dim=-1).topk(self.neighbours)
+        # Few and large parts, since each becomes operations of the graph.
+        for pose in self.order.split(EXPORTED):
+            seen = seen_along_depth(self.poses(pose)).to(moment.dtype)
+            best, at = torch.cat([best, cosine_table(moment, weights, seen)[0]], dim=-1).topk(self.neighbours)
             index = torch.cat([index, pose.expand(moment.shape[0], -1)], dim=-1).gather(-1, at)
         return index

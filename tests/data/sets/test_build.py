@@ -21,10 +21,11 @@ from tensorsim.data.sets.build import build_dataset, plan_of
 from tensorsim.data.sets.engines import Processes, RayCluster
 from tensorsim.data.sets.manifest import recipe_of, rows_of
 from tensorsim.data.sets.outputs import OutputConfig
-from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, StorageConfig
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, StorageConfig
 from tensorsim.data.sets.samples import content_hash, make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.data.sets.stored import StoredArrays
+from tensorsim.data.sets.variations import VariationConfig
 from tensorsim.errors import TensorsimError
 from tests.data.sets.recipes import small_recipe
 
@@ -204,9 +205,39 @@ def test_three_radars_in_one_sample(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_processes_make_the_same_bytes(built: Path, recipe: DatasetRecipe, tmp_path: Path) -> None:
-    build_dataset(recipe, tmp_path / "set", Processes(2), quiet=True)
-    assert contents(tmp_path / "set") == contents(built)
+@pytest.mark.parametrize("workers", [2, 8])
+def test_processes_make_the_same_bytes(workers: int, tmp_path: Path) -> None:
+    # As many shards as workers: each of them does some.
+    recipe = small_recipe(
+        sources=(SourceConfig(classes=("walking", "sitting down"), people=4),),
+        storage=StorageConfig(shard_samples=1),
+    )
+    build_dataset(recipe, tmp_path / "one", quiet=True)
+    build_dataset(recipe, tmp_path / "set", Processes(workers), quiet=True)
+    assert contents(tmp_path / "set") == contents(tmp_path / "one")
+    assert len(list((tmp_path / "set" / "shards").iterdir())) == 8
+
+
+def test_receiver_and_denoiser_are_in_the_manifest_and_are_made_again(tmp_path: Path) -> None:
+    variations = VariationConfig(
+        count=2,
+        phase_noise_dbc_hz=(-95.0, -85.0),
+        iq_imbalance_db=(0.1, 0.5),
+        dc_offset_db=(-10.0, 0.0),
+        adc_bits=(4, 12),
+        real_receiver=0.5,
+        denoisers=("none", "perona-malik"),
+    )
+    build_dataset(small_recipe(variations=variations), tmp_path / "set", quiet=True)
+    rows = list(rows_of(tmp_path / "set"))
+    assert {row["denoiser"] for row in rows} == {"none", "perona-malik"}
+    assert all(isinstance(row["adc_bits"], int) and 4 <= row["adc_bits"] <= 12 for row in rows)
+    assert all(row["iq_phase_rad"] is None and -95 <= row["phase_noise_dbc_hz"] <= -85 for row in rows)
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    (alone / "manifest.parquet").write_bytes((tmp_path / "set" / "manifest.parquet").read_bytes())
+    for row in rows:
+        assert sample_again(alone, row["id"]).row == row
 
 
 def die_once(marker: str) -> int:
