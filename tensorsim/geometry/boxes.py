@@ -129,6 +129,21 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
     return intersection / union.clamp(min=1e-12)
 
 
+@torch.jit.unused
+def _onnx_suppression(
+    boxes: Tensor,
+    scores: Tensor,
+    labels: Tensor,
+    valid: Tensor,
+    iou_threshold: float,
+    max_detections: int,
+) -> tuple[Tensor, Tensor]:
+    """The suppression as one operation, which ONNX has."""
+    from tensorsim.onnx_operations import suppression
+
+    return suppression()(boxes, scores, labels, valid, iou_threshold, max_detections)
+
+
 def non_maximum_suppression(
     boxes: Tensor, scores: Tensor, labels: Tensor, valid: Tensor, iou_threshold: float, max_detections: int
 ) -> tuple[Tensor, Tensor]:
@@ -150,10 +165,8 @@ def non_maximum_suppression(
         Indices (B, k) into the n boxes, best first, and whether each was found (B, k). Not differentiable.
     """
     # kornia.geometry.bbox.nms takes one image, one class and no limit, and does not export.
-    if not torch.jit.is_scripting() and is_writing_onnx():
-        from tensorsim.onnx_operations import suppression
-
-        return suppression()(boxes, scores, labels, valid, iou_threshold, max_detections)
+    if is_writing_onnx():
+        return _onnx_suppression(boxes, scores, labels, valid, iou_threshold, max_detections)
     batch, count = scores.shape
     picked = torch.zeros((batch, max_detections), dtype=torch.int64, device=scores.device)
     found = torch.zeros((batch, max_detections), dtype=torch.bool, device=scores.device)

@@ -226,6 +226,7 @@ class PoseSearch(nn.Module):
     ) -> None:
         super().__init__()
         self.yaws, self.neighbours, self.chunk = yaws, neighbours, chunk
+        self.exported = EXPORTED
         self.pitch_rad = float(pitch_rad)
         self.margin = ROUNDING
         seen = torch.cat(
@@ -385,7 +386,7 @@ class PoseSearch(nn.Module):
         best = torch.full((moment.shape[0], self.neighbours), -2.0, dtype=moment.dtype, device=moment.device)
         index = torch.zeros((moment.shape[0], self.neighbours), dtype=torch.int64, device=moment.device)
         # Few and large parts, since each becomes operations of the graph.
-        for pose in self.order.split(EXPORTED):
+        for pose in self.order.split(self.exported):
             seen = seen_along_depth(self.poses(pose)).to(moment.dtype)
             best, at = torch.cat([best, cosine_table(moment, weights, seen)[0]], dim=-1).topk(self.neighbours)
             index = torch.cat([index, pose.expand(moment.shape[0], -1)], dim=-1).gather(-1, at)
