@@ -157,11 +157,13 @@ def smooth_constant_velocity(
     )
     predicted: list[KalmanState] = []
     filtered: list[KalmanState] = []
+    measurements, noises, there = z.unbind(-2), r.unbind(-2), seen.unbind(-2)
+    densities = q.unbind(-2)
     for t in range(frames):
         if t > 0:
-            state = constant_velocity_predict(state, q[..., t, :], dt)
+            state = constant_velocity_predict(state, densities[t], dt)
         predicted.append(state)
-        state = kalman_update(state, z[..., t, :], r[..., t, :], seen[..., t, :])
+        state = kalman_update(state, measurements[t], noises[t], there[t])
         filtered.append(state)
 
     estimates = [state.position for state in filtered]
