@@ -155,6 +155,7 @@ class _Log:
     """``metrics.csv`` (step, name, value) and TensorBoard events; removes lines of an older run after ``step``."""
 
     def __init__(self, out: Path, step: int, events: bool) -> None:
+        self.events = _events(out, step) if events else None
         self.path = out / "metrics.csv"
         rows: list[list[str]] = []
         if self.path.is_file():
@@ -162,7 +163,6 @@ class _Log:
                 rows = [row for row in list(csv.reader(file))[1:] if len(row) == 3 and int(row[0]) <= step]
         with complete_file(self.path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([["step", "name", "value"], *rows])
-        self.events = _events(out, step) if events else None
 
     def write(self, step: int, values: dict[str, float]) -> None:
         with self.path.open("a", newline="", encoding="utf-8") as file:

@@ -1,6 +1,7 @@
 """The training loop: resume, best weights, logs, refusals."""
 
 import csv
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,13 @@ def test_logs_are_there(tmp_path: Path) -> None:
         "validation/error",
     }
     assert list(tmp_path.glob("events.out.tfevents*"))
+
+
+def test_without_tensorboard_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(TensorsimError, match=r"install tensorsim\[train\]"):
+        fit(Line(), config(tmp_path / "out"))
+    assert list((tmp_path / "out").glob("*")) == []
 
 
 def test_another_run_is_refused(tmp_path: Path) -> None:
