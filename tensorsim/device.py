@@ -28,6 +28,17 @@ def usable_device(name: str) -> torch.device:
     return device
 
 
+def multiplies_bfloat16(device: torch.device) -> bool:
+    """Whether products in bfloat16 have instructions of their own there; without them they are slower than in float32.
+
+    GPUs have them; processors have them by AMX or AVX-512 (x86) or by its extension (ARM).
+    """
+    if device.type != "cpu":
+        return True
+    found = torch.cpu.get_capabilities()
+    return any(bool(found.get(name)) for name in ("amx_bf16", "avx512_bf16", "bf16"))
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """In the block torch computes on one thread.

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tensorsim.commands.options import check_seed
 
@@ -28,21 +28,26 @@ class TrainOptions:
     """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
     workers: int = 1
     """Processes that prepare samples."""
+    precision: Literal["auto", "bfloat16", "float32"] = "auto"
+    """Of convolutions and products; auto takes bfloat16 where the device has instructions for it."""
     quiet: bool = False
     """No progress bar."""
 
     def loop(self, **settings: Any) -> "LoopConfig":
         """The loop with these options; refuses what cannot work before anything is read or made."""
-        from tensorsim.device import usable_device
+        from tensorsim.device import multiplies_bfloat16, usable_device
         from tensorsim.training.loop import LoopConfig
 
         check_seed(self.seed)
-        usable_device(self.device)
+        device, precision = usable_device(self.device), self.precision
+        if precision == "auto":
+            precision = "bfloat16" if multiplies_bfloat16(device) else "float32"
         return LoopConfig(
             out=self.out,
             seed=self.seed,
             device=self.device,
             workers=self.workers,
+            precision=precision,
             quiet=self.quiet,
             **settings,
         )

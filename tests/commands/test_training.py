@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from tensorsim.commands.training import TrainOptions
 from tensorsim.training import loop
@@ -17,3 +18,20 @@ def test_the_first_process_tells_the_figures(
         monkeypatch.setenv("RANK", rank)
         assert options.train(None, None) == tmp_path / "best.safetensors"  # type: ignore[arg-type]
         assert capsys.readouterr().out == printed
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "precision"),
+    [
+        ({"avx512_f": True, "amx_bf16": False}, "float32"),
+        ({"avx512_bf16": True}, "bfloat16"),
+        ({"bf16": True, "neon": True}, "bfloat16"),
+    ],
+)
+def test_bfloat16_where_the_processor_has_instructions_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], precision: str
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    assert TrainOptions(out=tmp_path, device="cpu").loop(steps=1, batch=1).precision == precision
+    told = TrainOptions(out=tmp_path, device="cpu", precision="bfloat16")
+    assert told.loop(steps=1, batch=1).precision == "bfloat16"
