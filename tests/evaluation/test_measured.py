@@ -289,5 +289,7 @@ def test_sensors_have_the_axes_of_the_measured_sets():
     wavelength = 299_792_458 / (scene.carrier_hz + scene.bandwidth_hz / 2)
     assert wavelength * scene.prf_hz / (2 * 16) == pytest.approx(0.6147)
     glasgow_radar = MEASURED_SENSORS["glasgow-ancortek"].radar
+    for radar in (scene, glasgow_radar):  # ranges count from between the antennas, which is at x = 0
+        assert np.add(radar.tx_m, radar.rx_m).tolist() == [0.0, 0.0, 2.0]
     assert glasgow_radar.range_resolution_m == pytest.approx(0.375, rel=1e-3)
     assert glasgow_radar.prf_hz == 2 * glasgow.RADAR.prf_hz == 1000

@@ -412,6 +412,23 @@ def test_people_config_refuses(arguments: dict[str, Any], message: str) -> None:
         PeopleConfig(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        ("height_m", 0.5, 2.5),
+        ("speed_m_s", 0.2, 2.0),
+        ("tempo", 0.3, 1.5),
+        ("start_range_m", 0.0, 1e6),
+        ("keep_range_m", 0.0, 1e6),
+    ],
+)
+def test_people_config_takes_the_whole_range_that_it_names(name: str, least: float, most: float) -> None:
+    assert getattr(PeopleConfig(**{name: (least, most)}), name) == (least, most)
+    for beyond in ((least - 1e-6, most), (least, most * (1 + 1e-6))):
+        with pytest.raises(TensorsimError, match=f"{name}: got .* within {least} to {most}"):
+            PeopleConfig(**{name: beyond})
+
+
 def test_nobody_walks_faster_than_the_gait_is_known() -> None:
     dashing = nominal_people(1, height_m=0.8, speed_m_s=2.0)
     with pytest.raises(TensorsimError, match="at most 3 leg lengths per second"):

@@ -72,6 +72,14 @@ def test_segment_distance_equals_a_search() -> None:
         assert float(actual) == pytest.approx(np.sqrt(found), abs=1e-5)
 
 
+def test_distance_of_a_long_segment_from_what_is_behind_its_start() -> None:
+    """From the origin along y to (0, 100): of the line y = x - 0.4 the origin itself is nearest, to (0.2, -0.2)."""
+    points = [[0.0, 100.0, 0.0], [-1.0, -1.4, 0.0], [0.3, -0.1, 0.0]]
+    end, start, stop = torch.tensor(points, dtype=torch.float64).split(1)
+    found = segment_distance(torch.zeros(3, dtype=torch.float64), end, start, stop)
+    assert float(found) == pytest.approx(0.2 * 2**0.5, abs=1e-9)
+
+
 def test_segments_that_are_points_or_parallel() -> None:
     origin = torch.zeros(3)
     ends = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])

@@ -105,6 +105,15 @@ def test_translations_are_the_published_ones() -> None:
         np.testing.assert_allclose(actual[:, 2], -a + a * np.sin(tau * (2 * t - 0.35)), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("speed", "bow_deg"), [(0.3, 8 * 0.3 * 0.7), (0.1, 8 * 0.1 * 0.9), (0.5, 2.0), (1.0, 2.0)]
+)
+def test_trunk_bows_as_published(speed: float, bow_deg: float) -> None:
+    t = np.linspace(0, 1, 50)
+    expected = bow_deg * (1 - np.sin(2 * math.pi * (2 * t - 0.1)))
+    np.testing.assert_allclose(gait(speed, list(t))["trunk"][:, 0].numpy(), expected, atol=1e-6)
+
+
 def test_a_cycle_of_walking_takes_its_time() -> None:
     """At 1.1 m/s and 1.75 m of height: 1.19 s, 1.31 m, feet on the floor for 63 % of it."""
     speed = torch.tensor(1.1 / (0.491 * 1.75), dtype=torch.float64)

@@ -13,7 +13,7 @@ from tensorsim.recognition.ccln import CCLN
 from tensorsim.recognition.diat_radharnet import DIATRadHARNet
 from tensorsim.recognition.fourier_net import FourierBlock, FourierNet, GlobalFilterBlock, GlobalFilterNet
 from tensorsim.recognition.mc_gclu import MCGCLU
-from tensorsim.recognition.mrw_cn import MRWCN
+from tensorsim.recognition.mrw_cn import MRWCN, ResidualLayer
 from tensorsim.recognition.networks import CLASSIFIERS, find_classifier
 from tensorsim.recognition.spnet_dense import SPNetDense
 from tests.networks import settled
@@ -225,6 +225,18 @@ def test_global_filter_without_weights_leaves_the_bias_of_its_layers() -> None:
     x = torch.randn(2, 3, 3, 4)
     bias = block.narrow(nn.functional.gelu(block.wide(block.norm2(torch.zeros(4)))))
     assert_same(block(x), x + bias, atol=1e-6)
+
+
+def test_shortcut_of_a_residual_layer_of_stride_two_is_a_product_at_every_second_place() -> None:
+    torch.manual_seed(0)
+    layer = ResidualLayer(4, 4, 3, 2).eval()
+    norm = next(m for m in layer.second.modules() if isinstance(m, nn.BatchNorm2d))
+    nn.init.zeros_(norm.weight)  # the shortcut alone is left
+    x = torch.randn(2, 4, 9, 6)
+    product = next(layer.skip.parameters())[..., 0, 0]
+    expected = torch.relu(torch.einsum("oi,bihw->bohw", product, x[..., ::2, ::2]))
+    with torch.no_grad():
+        assert_same(layer(x), expected, atol=1e-4)
 
 
 def test_masks_in_training_alone() -> None:

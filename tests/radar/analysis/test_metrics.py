@@ -46,6 +46,19 @@ def test_figures_equal_their_formulas(scale):
         assert float(metrics.ssim(x, y, scale)[k]) == pytest.approx(expected.mean(), rel=1e-9)
 
 
+def test_ssim_of_the_smallest_map_is_that_of_one_window():
+    rng = np.random.default_rng(1)
+    u, v = rng.random((2, 11, 11))
+    u, v = u / u.max(), v / v.max()
+    bell = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    weight = np.outer(bell, bell) / bell.sum() ** 2
+    mu, mv = (weight * u).sum(), (weight * v).sum()
+    su, sv, suv = ((weight * x).sum() for x in ((u - mu) ** 2, (v - mv) ** 2, (u - mu) * (v - mv)))
+    expected = (2 * mu * mv + 1e-4) * (2 * suv + 9e-4) / ((mu**2 + mv**2 + 1e-4) * (su + sv + 9e-4))
+    found = metrics.ssim(torch.as_tensor(u), torch.as_tensor(v), "linear")
+    assert float(found) == pytest.approx(expected, rel=1e-9)
+
+
 def test_equal_maps_and_gain():
     """Every map is set against its own peak, so gain does not count."""
     x = torch.as_tensor(pair()[0])

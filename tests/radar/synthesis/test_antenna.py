@@ -294,13 +294,15 @@ def test_angle_maps_equal_the_beamformer_written_out():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(6, 4, 5)) + 1j * rng.normal(size=(6, 4, 5))
     azimuth = np.linspace(-1, 1, 7)
-    maps = AngleMapper(ARRAY, torch.as_tensor(azimuth), 0.2)(torch.as_tensor(x))
+    # Two receivers stand before and behind the others.
+    receivers = ((0.1, 0.0, 1.5), (0.15, 0.02, 1.5), (0.1, -0.01, 1.6))
+    maps = AngleMapper(replace(ARRAY, rx_m=receivers), torch.as_tensor(azimuth), 0.2)(torch.as_tensor(x))
     wavelength = C / (ARRAY.carrier_hz + ARRAY.bandwidth_hz / 2)
     beams = np.zeros((7, 4, 5), dtype=complex)
     for d, a in enumerate(azimuth):
         u = np.array([np.sin(a) * np.cos(0.2), np.cos(a) * np.cos(0.2), np.sin(0.2)])
         for k, tx in enumerate(TX):
-            for r, rx in enumerate(RX):
+            for r, rx in enumerate(receivers):
                 phase = 2 * np.pi * u @ (np.array(tx) + np.array(rx)) / wavelength
                 beams[d] += np.exp(1j * phase) * x[k * 3 + r] / 6
     np.testing.assert_allclose(maps.range_angle.T, np.sqrt((np.abs(beams) ** 2).mean(1)), rtol=1e-9)

@@ -115,7 +115,8 @@ def test_levels_of_the_pyramid() -> None:
     assert scales == pytest.approx([2 ** (-k / 8) for k in range(9)])
     assert [level.shape[-1] for level in levels][:3] == [64, 59, 54]
     assert levels[-1].shape[-2:] == (32, 32)
-    assert pyramid(scenery(100, 256), ROWS, COLUMNS) == ([], [])
+    for height, width in ((100, 256), (4 * ROWS - 2, 256), (256, 4 * COLUMNS - 2)):
+        assert pyramid(torch.rand(1, 3, height, width), ROWS, COLUMNS) == ([], [])
     assert max(pyramid(scenery(100, 256), ROWS, COLUMNS, octaves_up=1)[1]) == 2.0
 
 

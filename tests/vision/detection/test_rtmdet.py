@@ -127,6 +127,16 @@ class TestRTMDet(StageTester):
         with torch.no_grad():
             assert_same(self.make()(images), self.make()(images / 255))
 
+    def test_takes_values_up_to_half_a_range_outside(self) -> None:
+        """Interpolation overshoots; what goes further is no RGB in [0, 1]."""
+        module, images = self.make(), torch.zeros(1, 3, 8, 8)
+        for value, refused in ((1.5, 1.5625), (-0.5, -0.5625)):
+            images[0, 0, 0, 0] = value
+            assert module.preprocess(images).shape == (1, 3, 64, 64)
+            images[0, 0, 0, 0] = refused
+            with pytest.raises(TensorsimError, match=f"got values from .*{refused}.* expected RGB"):
+                module.preprocess(images)
+
     def test_dense_is_differentiable(self) -> None:
         module = self.make().double()
         x = torch.randn(1, 3, 32, 32, dtype=torch.float64, requires_grad=True)

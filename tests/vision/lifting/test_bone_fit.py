@@ -330,6 +330,19 @@ def test_settings_are_checked() -> None:
             BoneFit(**options)
 
 
+def test_deviations_from_what_is_given_cost_as_in_numpy() -> None:
+    """As of Cauchy's distribution: distances relative to the hips, and that of the hips."""
+    rng = np.random.default_rng(0)
+    given, off = rng.uniform(3, 5, (2, 4, 13)), 0.1 * rng.standard_normal((2, 4, 13))
+    hips = (off[..., FREE.index(8)] + off[..., FREE.index(11)]) / 2
+    expected = np.log1p((hips / 0.3) ** 2).sum(1)
+    expected += np.log1p(((off - hips[..., None]) / 0.05) ** 2).sum((1, 2))
+    empty = torch.zeros(0)
+    clip = BoneClip(empty, torch.from_numpy(given), empty, empty, empty, empty, empty)
+    cost = BoneCost(0.025, 0.05, 0.3, 0.3, 0.005, False).double()
+    np.testing.assert_allclose(cost.given(clip, torch.from_numpy(given + off))[2], 0.3 * expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("frames", [3, 6, 7])
 @pytest.mark.parametrize("floor", [False, True])
 def test_a_step_is_that_of_the_dense_normal_equations(frames: int, floor: bool) -> None:

@@ -205,6 +205,25 @@ def test_deviations_follow_the_line_of_sight() -> None:
     )
 
 
+def test_deviations_are_those_of_laplaces_distribution() -> None:
+    """sqrt(2) of the mean absolute error, which is in body heights for joints and a share of the distance for hips."""
+    torch.manual_seed(0)
+    net = TemporalNet(16)
+    with torch.no_grad():  # the network subtracts 3
+        net.leave.bias[43:71:2], net.leave.bias[44:71:2] = math.log(0.02) + 3, math.log(0.05) + 3
+        net.leave.bias[71] = math.log(0.04) + 3
+    _, *seen = filmed()
+    with torch.no_grad():
+        found = TemporalLifter(net, CAMERA, (1.7,)).double()(*seen, HEIGHT, WIDTH, 30.0)
+    square = found.deviation.numpy() ** 2
+    np.testing.assert_allclose(square[..., 2], 2 * (0.02 * 1.7) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(square[..., :2].sum(-1), 2 * (0.02**2 + 0.05**2) * 1.7**2, rtol=1e-6)
+    distance = np.linalg.norm((found.root.numpy() - np.array(CAMERA.position_m))[..., :2], axis=-1)
+    square = found.root_deviation.numpy() ** 2
+    np.testing.assert_allclose(square[..., 2], 2 * (0.3 * 0.04 * distance) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(square[..., :2].sum(-1), 2 * (1 + 0.3**2) * (0.04 * distance) ** 2, rtol=1e-6)
+
+
 def test_windowed_mean_is_that_of_numpy() -> None:
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(1, 40, 1, generator=generator, dtype=torch.float64)

@@ -41,6 +41,7 @@ class TestQuarter(StageTester):
         return [
             ((torch.zeros(48),), r"expected \(..., h, w\)"),
             ((torch.zeros(2, 17, 0, 48),), "with pixels"),
+            ((torch.zeros(2, 17, 64, 0),), "with pixels"),
             ((torch.zeros(2, 17, 64, 48, dtype=torch.int64),), "floating"),
         ]
 
@@ -120,6 +121,17 @@ def test_map_pixel_u_v_is_crop_pixel_4u_4v() -> None:
     # (20.325, 30.725) -> (20, 31) moved right and up; (24, 32) has equal neighbours; (10, 50.1) moves down.
     expected = torch.tensor([[81.0, 123.0], [96.0, 128.0], [40.0, 201.0]], dtype=torch.float64)
     torch.testing.assert_close(points, expected)
+
+
+@pytest.mark.parametrize("method", ["quarter", "dark"])
+@pytest.mark.parametrize("across", [False, True])
+def test_maps_of_a_single_row_or_column(method: str, across: bool) -> None:
+    """Their edges have no neighbours: the point is the highest pixel itself."""
+    line = torch.zeros(9)
+    line[6] = 1.0
+    points, scores = HeatmapDecoder(method)(line[None] if across else line[:, None])
+    assert float(scores) == 1.0
+    assert points.tolist() == ([24.0, 0.0] if across else [0.0, 24.0])
 
 
 def test_another_stride() -> None:

@@ -79,6 +79,10 @@ def test_running_quantile_is_numpys_nearest_rank() -> None:
         expected[:, t] = inside[:, round(0.3 * (inside.shape[1] - 1))]
     np.testing.assert_array_equal(running_quantile(torch.tensor(x), 9, 0.3).numpy(), expected)
     np.testing.assert_array_equal(running_quantile(torch.tensor(x), 200, 0.0)[:, 3].numpy(), x.min(axis=1))
+    for shape in ((30,), (2, 1, 30), (1, 2, 1, 30)):
+        several = torch.tensor(x[: int(np.prod(shape[:-1]))]).reshape(shape)
+        found = running_quantile(several, 9, 0.3).reshape(-1, 30)
+        np.testing.assert_array_equal(found.numpy(), expected[: len(found)])
 
 
 def test_median_and_gaps_look_at_valid_frames_only() -> None:

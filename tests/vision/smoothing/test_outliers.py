@@ -55,6 +55,14 @@ def test_the_chain_is_the_longest_of_all() -> None:
     assert not bool((chain & ~valid).any())
 
 
+def test_a_point_at_just_the_top_speed_is_believed() -> None:
+    positions = torch.zeros(1, 12, 3)
+    positions[..., 1] = 2.0 * torch.arange(12)  # exactly 2 m a frame
+    valid = torch.ones(1, 12, dtype=torch.bool)
+    assert reachable_chain(positions, valid, 1.0, 2.0, reach_s=20.0).all()
+    assert reachable_chain(positions, valid, 1.0, 1.99, reach_s=20.0).sum() == 1
+
+
 def test_nobody_and_nothing_seen() -> None:
     assert (
         without_jumps(torch.zeros(0, 5, 14, 3), torch.zeros(0, 5, 14, dtype=torch.bool), FPS, 12.0).shape[0]

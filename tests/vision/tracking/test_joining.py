@@ -63,6 +63,20 @@ def test_the_better_detection_stands_for_both() -> None:
     assert joined[0].tolist() == [0] * 30 + [1] * 10
 
 
+def test_others_keep_their_places_when_two_are_joined() -> None:
+    tracks = (
+        (slice(0, 15), STANDING, 0.8),
+        (slice(0, 40), ELSEWHERE, 0.8),
+        (slice(5, 40), (700.0, 100.0, 780.0, 300.0), 0.8),
+        (slice(17, 40), LYING, 0.6),
+        (slice(8, 40), (900.0, 100.0, 980.0, 300.0), 0.8),
+    )
+    table, boxes, scores = clip(*tracks)
+    joined = join_tracks(table, boxes, scores, torch.ones(40, dtype=torch.bool), 0.5, 23)
+    assert joined[0].tolist() == [0] * 15 + [-1] * 2 + [3] * 23
+    assert torch.equal(joined[1:], table[[1, 2, 4]])
+
+
 @pytest.mark.parametrize("lying_score", [0.25, 0.35])
 def test_who_lies_down_is_followed_although_found_badly(lying_score: float) -> None:
     table, boxes, scores = clip(

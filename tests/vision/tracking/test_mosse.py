@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import map_coordinates
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
@@ -122,8 +123,11 @@ def test_a_target_that_disappears_is_lost() -> None:
 
 def test_who_starts() -> None:
     start = detections([[START, [0, 0, 40, 40], START, [5, 5, 5, 60]]], [[0.6, 0.4, 0.9, 0.9]])
+    start.boxes[0, 2] += 20.0
     tracks = MosseTracker()(moving(PATH[:2])[None], start)
     assert tracks.boxes.shape == (1, 2, 2, 4)  # not the weak one, not the one without width
+    assert torch.equal(tracks.boxes[0, :, 0], start.boxes[0, [2, 0]])  # best first
+    assert tracks.valid[0, :, 0].all()
     nobody = MosseTracker()(moving(PATH[:2])[None], detections([[START]], [[0.1]]))
     assert nobody.boxes.shape == (1, 0, 2, 4)
 
@@ -135,6 +139,48 @@ def test_filter_is_the_closed_form_of_one_picture() -> None:
     top, bottom = tracker._learned(spectrum)
     response = torch.fft.ifft2(spectrum * top / (bottom + 1e-12)).real
     torch.testing.assert_close(response[0], tracker.goal.double(), rtol=0, atol=1e-3)
+
+
+def mosse_in_numpy(film: np.ndarray, box: list[float], size: int, rate: float) -> list[tuple[float, float]]:
+    """Centres of a box (xyxy) in grey frames (T, H, W) in [0, 1]: MOSSE as published, with nine first pictures."""
+    x, y, wide, high = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2, box[2] - box[0], box[3] - box[1]
+    steps = np.arange(size) - size // 2
+    window = np.outer(*[0.5 - 0.5 * np.cos(2 * np.pi * np.arange(1, size + 1) / (size + 1))] * 2)
+    goal = np.fft.fft2(np.exp(-(steps[:, None] ** 2 + steps**2) / (2 * 2.0**2)))
+
+    def spectrum(frame: np.ndarray, turn: float = 0.0, growth: float = 1.0) -> np.ndarray:
+        down, right = np.meshgrid(steps / size * growth, steps / size * growth, indexing="ij")
+        u = x + (np.cos(turn) * right - np.sin(turn) * down) * wide
+        v = y + (np.sin(turn) * right + np.cos(turn) * down) * high
+        patch = np.log1p(255 * map_coordinates(frame, [v - 0.5, u - 0.5], order=1, mode="nearest"))
+        patch = patch - patch.mean()
+        return np.fft.fft2(patch / (np.linalg.norm(patch) + 1e-5) * window)
+
+    warps = [(0.0, 1.0), *((turn, 1.0) for turn in (0.05, -0.05, 0.1, -0.1)), (0.0, 0.95), (0.0, 1.05)]
+    first = [spectrum(film[0], *warp) for warp in (*warps, (0.05, 1.03), (-0.05, 0.97))]
+    top = np.mean([goal * f.conj() for f in first], axis=0)
+    bottom = np.mean([f * f.conj() for f in first], axis=0)
+    centres = [(x, y)]
+    for frame in film[1:]:
+        response = np.fft.ifft2(spectrum(frame) * top / (bottom + 1e-5)).real
+        row, column = np.unravel_index(response.argmax(), response.shape)
+        for axis, line, at in ((0, response[row], column), (1, response[:, column], row)):
+            left, middle, right = line[at - 1 : at + 2]
+            shift = at - size // 2 + (right - left) / 2 / (2 * middle - left - right)
+            x, y = (x + shift * wide / size, y) if axis == 0 else (x, y + shift * high / size)
+        f = spectrum(frame)
+        top, bottom = rate * goal * f.conj() + (1 - rate) * top, rate * f * f.conj() + (1 - rate) * bottom
+        centres.append((x, y))
+    return centres
+
+
+def test_boxes_are_those_of_the_published_filter_in_numpy() -> None:
+    film = 0.6 * moving(PATH[:5]) + 0.4 * moving(PATH[:5], seed=1).roll(1, 0)  # what is followed changes
+    tracks = MosseTracker(learning_rate=0.3, size=32).double()(film[None].double(), detections([[START]]))
+    assert bool(tracks.matched.all())
+    expected = mosse_in_numpy(film.double().mean(1).numpy(), START, 32, 0.3)
+    middle = (tracks.boxes[0, 0, :, :2] + tracks.boxes[0, 0, :, 2:]) / 2
+    np.testing.assert_allclose(middle.numpy(), expected, atol=1e-4)
 
 
 def test_ratio_of_a_known_response() -> None:

@@ -253,6 +253,13 @@ def test_weak_detections_continue_a_track() -> None:
     assert GNNTracker()(detections).matched.all()
 
 
+def test_a_detection_of_just_the_faint_score_continues_a_track() -> None:
+    detections = film([walker(300, 500, 40)])
+    detections.scores[:, 10:] = 0.25
+    assert GNNTracker(faint_score=0.25)(detections).matched.all()
+    assert not GNNTracker(faint_score=0.26)(detections).matched[..., 10:].any()
+
+
 def test_one_person_detected_twice_is_one_person() -> None:
     person = walker(200, 500, 40)
     upper = person.clone()
