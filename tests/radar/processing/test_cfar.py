@@ -127,6 +127,7 @@ def test_the_threshold_is_differentiable():
         ({"guard": (-1, 0), "training": (1, 1)}, "guard"),
         ({"guard": (1, 1), "training": (0, 0)}, "at least one training cell"),
         ({"guard": (0, 0), "training": (1, 1), "false_alarm": 1.0}, "false_alarm 1.0"),
+        ({"guard": (0, 0), "training": (1, 1), "false_alarm": 0.0}, "false_alarm 0.0"),
         ({"guard": (0, 0), "training": (1, 1), "rank": 1.0}, "rank 1.0, expected both between 0 and 1"),
         ({"guard": (0, 0), "training": (1, 1), "rank": 0.0}, "rank 0.0, expected both between 0 and 1"),
         ({"guard": (0, 0), "training": (1, 1), "method": "greatest-of"}, "greatest-of"),
