@@ -15,11 +15,12 @@ WIDTH, HEIGHT = 320, 240
 FOCAL_PX = WIDTH / 2 / math.tan(math.pi / 6)  # the default field of view of 60 degrees
 BODY_M = 1.75
 #: u (to the image's right) and v (down from the crown), in body heights, of the COCO-17 keypoints of someone
-#: who stands and faces the camera: their left is on the image's right.
+#: who stands and faces the camera: their left is on the image's right. The joints themselves are at heights of 0.37
+#: (elbows), 0.47 (hips), 0.715 (knees) and 0.96 (ankles).
 STANDING = (
     (0.00, 0.07), (0.02, 0.06), (-0.02, 0.06), (0.04, 0.07), (-0.04, 0.07),
-    (0.13, 0.18), (-0.13, 0.18), (0.15, 0.37), (-0.15, 0.37), (0.16, 0.52), (-0.16, 0.52),
-    (0.053, 0.47), (-0.053, 0.47), (0.053, 0.715), (-0.053, 0.715), (0.053, 0.96), (-0.053, 0.96),
+    (0.13, 0.18), (-0.13, 0.18), (0.15, 0.359), (-0.15, 0.359), (0.16, 0.52), (-0.16, 0.52),
+    (0.053, 0.475), (-0.053, 0.475), (0.053, 0.724), (-0.053, 0.724), (0.053, 0.948), (-0.053, 0.948),
 )  # fmt: skip
 
 

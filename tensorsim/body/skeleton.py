@@ -1,6 +1,7 @@
 """The 14 joints of the radar body and the 17 key points of COCO: each from the other, roots and mirror images."""
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -51,8 +52,30 @@ def mirror(joints: Tensor) -> Tensor:
     return torch.cat([-flipped[..., :1], flipped[..., 1:]], dim=-1)
 
 
+class Marks(NamedTuple):
+    """Where people mark joints in pictures, and networks that learn from them, beside the centres of the joints.
+
+    Hips, knees, ankles and elbows of COCO are not where the bones turn. As shares of the segment, the mean of two
+    networks that learnt from people's marks (``python -m tests.benchmarks.eval_key_points``).
+
+    Attributes:
+        elbow: above the joint, of the upper arm.
+        hip: below the joint, of the trunk, from the middle of the shoulders to that of the hips.
+        knee: below the joint, of the shank.
+        ankle: above the joint, of the shank.
+    """
+
+    elbow: float = 0.06
+    hip: float = 0.017
+    knee: float = 0.038
+    ankle: float = 0.048
+
+
 def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> tuple[Tensor, Tensor]:
     """The 14 joints of ``tensorsim.JOINTS`` from the 17 key points of COCO.
+
+    Elbows, hips, knees and ankles move from where COCO marks them to the joints (:class:`Marks`), as far as the
+    scores of the other key points that this takes reach ``threshold``.
 
     The head is the nose. From behind, the nose is hidden and its score low: as the score falls below
     ``threshold``, the head moves to the score-weighted mean of eyes and ears, which from behind lies where
@@ -92,9 +115,24 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
     neck = keypoints[..., 5:7, :].mean(dim=-2, keepdim=True)
     neck_score = scores[..., 5:7].amin(dim=-1, keepdim=True)
 
-    # COCO alternates left and right from shoulders (5, 6) to ankles (15, 16); the body goes limb by limb.
-    joints = [head, neck, keypoints[..., 6:11:2, :], keypoints[..., 5:10:2, :]]
-    joints += [keypoints[..., 12:17:2, :], keypoints[..., 11:16:2, :]]
+    # COCO alternates left and right from shoulders (5, 6) to ankles (15, 16).
+    marks = Marks()
+    trust = (scores / threshold).clamp(0.0, 1.0)[..., None]
+    shoulders, elbows, wrists = keypoints[..., 5:7, :], keypoints[..., 7:9, :], keypoints[..., 9:11, :]
+    hips, knees, ankles = keypoints[..., 11:13, :], keypoints[..., 13:15, :], keypoints[..., 15:17, :]
+    upper_arms = (elbows - shoulders) / (1.0 - marks.elbow)
+    trunk = (hips.mean(dim=-2, keepdim=True) - neck) / (1.0 + marks.hip)
+    shanks = (ankles - knees) / (1.0 - marks.knee - marks.ankle)
+    trunk_trust = torch.cat([trust[..., 5:7, :], trust[..., 11:13, :]], dim=-2).amin(dim=-2, keepdim=True)
+    elbows = elbows + marks.elbow * trust[..., 5:7, :] * upper_arms
+    hips = hips - marks.hip * trunk_trust * trunk
+    knees = knees - marks.knee * trust[..., 15:17, :] * shanks
+    ankles = ankles + marks.ankle * trust[..., 13:15, :] * shanks
+
+    # The body goes limb by limb, right before left.
+    arms = torch.stack([shoulders, elbows, wrists], dim=-2)
+    legs = torch.stack([hips, knees, ankles], dim=-2)
+    joints = [head, neck, arms[..., 1, :, :], arms[..., 0, :, :], legs[..., 1, :, :], legs[..., 0, :, :]]
     joint_scores = [head_score, neck_score, scores[..., 6:11:2], scores[..., 5:10:2]]
     joint_scores += [scores[..., 12:17:2], scores[..., 11:16:2]]
     return torch.cat(joints, dim=-2), torch.cat(joint_scores, dim=-1)
@@ -115,8 +153,9 @@ def body_to_coco(joints: Tensor) -> Tensor:
         joints: (..., 14, 3) metres, order of ``tensorsim.JOINTS``, any frame with right-handed axes.
 
     Returns:
-        (..., 17, 3) in the order of ``tensorsim.COCO_KEYPOINTS``; body joints and nose are kept as they are. Where nose
-        and neck coincide, eyes and ears are at the nose.
+        (..., 17, 3) in the order of ``tensorsim.COCO_KEYPOINTS``. Shoulders, wrists and nose are kept as they are;
+        elbows, hips, knees and ankles are where COCO marks them (:class:`Marks`), which :func:`coco_to_body` undoes.
+        Where nose and neck coincide, eyes and ears are at the nose.
 
     Raises:
         TensorsimError: joints of another shape, or integers.
@@ -139,5 +178,17 @@ def body_to_coco(joints: Tensor) -> Tensor:
         return nose + height * (side * sideways * right - back * forward + above * up)
 
     points = [nose, face(-1.0, _EYE), face(1.0, _EYE), face(-1.0, _EAR), face(1.0, _EAR)]
-    points += [joints[..., JOINTS.index(name), :] for name in COCO_KEYPOINTS[5:]]
+    marks = Marks()
+    trunk = mid_hips(joints) - 0.5 * (joints[..., 2, :] + joints[..., 5, :])
+    place = {name: joints[..., JOINTS.index(name), :] for name in COCO_KEYPOINTS[5:]}
+    marked = dict(place)
+    for side in ("left", "right"):
+        shoulder, elbow, hip, knee, ankle = (
+            place[f"{side}_{name}"] for name in ("shoulder", "elbow", "hip", "knee", "ankle")
+        )
+        marked[f"{side}_elbow"] = elbow + marks.elbow * (shoulder - elbow)
+        marked[f"{side}_hip"] = hip + marks.hip * trunk
+        marked[f"{side}_knee"] = knee + marks.knee * (ankle - knee)
+        marked[f"{side}_ankle"] = ankle + marks.ankle * (knee - ankle)
+    points += [marked[name] for name in COCO_KEYPOINTS[5:]]
     return torch.stack(points, dim=-2)

@@ -329,7 +329,9 @@ class VideoToPose(nn.Module):
             assert self.lifter is not None
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)
-        joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
+        # The box of somebody who enters reaches the edge before the network places a joint there.
+        cut_off = (tracks.boxes[..., 0] <= 1.0) | (tracks.boxes[..., 2] >= width - 2.0)
+        joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps, None, cut_off)
         if self.temporal is None:
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tensorsim.body import proportions
-from tensorsim.body.skeleton import body_height, mid_hips
+from tensorsim.body.skeleton import body_height, body_to_coco, mid_hips
 from tensorsim.render.cast import Volumes
 
 REFERENCE_HEIGHT_M = 1.75
@@ -116,9 +116,7 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
     rows = build.rows + head_build.rows
     volumes = Volumes(*(torch.stack(column, dim=1) for column in zip(*rows, strict=True)))
     part = torch.tensor(build.parts + head_build.parts, device=joints.device)
-    # COCO alternates left and right from the shoulders to the ankles; the body goes limb by limb.
-    order = [5, 2, 6, 3, 7, 4, 11, 8, 12, 9, 13, 10]
-    return Body(volumes, part, torch.cat([face, joints[:, order]], dim=1), height)
+    return Body(volumes, part, torch.cat([face, body_to_coco(joints)[:, 5:]], dim=1), height)
 
 
 def _add_trunk(build: _Builder, joints: Tensor, chest: Tensor) -> None:

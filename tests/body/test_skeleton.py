@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body
+from tensorsim.body.skeleton import body_to_coco, coco_to_body
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
 from tensorsim.errors import TensorsimError
 from tests.stage import StageTester
@@ -53,12 +53,66 @@ def place(name: str) -> Tensor:
     return torch.tensor([index, 10 * index])
 
 
-def test_every_joint_of_a_limb_is_the_key_point_of_its_name() -> None:
+def test_scores_keep_their_names_and_shoulders_and_wrists_their_places() -> None:
     joints, scores = coco_to_body(*named(left_knee=0.4))
-    for i, name in enumerate(JOINTS[2:], start=2):
-        torch.testing.assert_close(joints[i], place(name))
+    for i, name in enumerate(JOINTS):
+        if "shoulder" in name or "wrist" in name:
+            torch.testing.assert_close(joints[i], place(name))
     assert float(scores[JOINTS.index("left_knee")]) == float(torch.tensor(0.4))
     assert int((scores < 0.5).sum()) == 1
+
+
+def standing() -> Tensor:
+    """Joints (14, 3) of somebody whose arms and legs hang straight down."""
+    heights = {"head": 1.6, "neck": 1.4, "shoulder": 1.4, "elbow": 1.1, "wrist": 0.8, "hip": 0.9, "knee": 0.5}
+    rows = []
+    for name in JOINTS:
+        side, _, part = name.partition("_")
+        across = {"right": 0.2, "left": -0.2}.get(side, 0.0)
+        rows.append([across, 0.0, heights.get(part or side, 0.1)])
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def test_marks_of_somebody_who_stands() -> None:
+    """Elbows and ankles of COCO are higher than the joints, hips and knees lower, by shares of 0.3, 0.4 and 0.5 m."""
+    points = body_to_coco(standing())
+    for side in ("left", "right"):
+        heights = {
+            part: float(points[COCO_KEYPOINTS.index(f"{side}_{part}"), 2])
+            for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        }
+        assert heights == pytest.approx(
+            {
+                "shoulder": 1.4,
+                "elbow": 1.1 + 0.06 * 0.3,
+                "wrist": 0.8,
+                "hip": 0.9 - 0.017 * 0.5,
+                "knee": 0.5 - 0.038 * 0.4,
+                "ankle": 0.1 + 0.048 * 0.4,
+            }
+        )
+
+
+def test_joints_of_marks_are_the_joints() -> None:
+    generator = torch.Generator().manual_seed(1)
+    joints = torch.randn(6, 14, 3, generator=generator, dtype=torch.float64)
+    joints[:, 1] = 0.5 * (joints[:, 2] + joints[:, 5])
+    points = body_to_coco(joints)[..., :2]
+    back, _ = coco_to_body(points, torch.full((6, 17), 0.5, dtype=torch.float64))
+    torch.testing.assert_close(back, joints[..., :2])
+
+
+def test_a_key_point_that_is_not_seen_moves_no_joint() -> None:
+    """Files of key points have zeros for what was not found."""
+    points = body_to_coco(standing())[:, [0, 2]]
+    scores = torch.ones(17, dtype=torch.float64)
+    wanted = points.clone()
+    for name in ("left_ankle", "right_shoulder", "left_shoulder"):
+        points[COCO_KEYPOINTS.index(name)] = 1e4
+        scores[COCO_KEYPOINTS.index(name)] = 0.0
+    joints, _ = coco_to_body(points, scores)
+    for name in ("left_knee", "left_elbow", "right_elbow", "left_hip", "right_hip"):
+        torch.testing.assert_close(joints[JOINTS.index(name)], wanted[COCO_KEYPOINTS.index(name)])
 
 
 def test_head_is_the_nose_where_it_is_seen() -> None:

@@ -188,8 +188,12 @@ def test_body_carries_the_keypoints_of_its_joints() -> None:
     coco = body.keypoints
     assert body_height(joints).tolist() == pytest.approx([1.75] * len(joints), abs=1e-6)
     torch.testing.assert_close(coco[:, 0], joints[:, 0])
-    for keypoint, joint in ((5, 5), (6, 2), (9, 7), (10, 4), (11, 11), (12, 8), (15, 13), (16, 10)):
+    for keypoint, joint in ((5, 5), (6, 2), (9, 7), (10, 4)):
         torch.testing.assert_close(coco[:, keypoint], joints[:, joint])
+    # Knees are marked below the joint, ankles above it.
+    for keypoint, joint, end, share in ((13, 12, 13, 0.038), (15, 13, 12, 0.048), (16, 10, 9, 0.048)):
+        offset = share * (joints[:, end] - joints[:, joint])
+        torch.testing.assert_close(coco[:, keypoint], joints[:, joint] + offset)
     # It faces the camera: its left eye and ear are to the right of its right ones, eyes before ears.
     assert (coco[:, 1, 0] > coco[:, 2, 0]).all()
     assert (coco[:, 3, 0] > coco[:, 4, 0]).all()

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from tensorsim.body.skeleton import coco_to_body
 from tensorsim.vision.smoothing.along_time import local_linear
 
 #: Heights of the ankles' and the shoulders' middle over the standing height: of somebody who stands, and the mean over
@@ -16,10 +17,9 @@ PACE, PACE_SPREAD = 0.7, 0.2
 
 
 def ends_of_body(keypoints: Tensor) -> Tensor:
-    """Middle of the ankles and middle of the shoulders of COCO key points: (..., 17, 2) -> (..., 2, 2)."""
-    ankles = (keypoints[..., 15, :] + keypoints[..., 16, :]) / 2
-    shoulders = (keypoints[..., 5, :] + keypoints[..., 6, :]) / 2
-    return torch.stack([ankles, shoulders], dim=-2)
+    """Middle of the ankle joints and of the shoulders from COCO key points: (..., 17, 2) -> (..., 2, 2)."""
+    joints, _ = coco_to_body(keypoints, torch.ones_like(keypoints[..., 0]))
+    return torch.stack([(joints[..., 10, :] + joints[..., 13, :]) / 2, joints[..., 1, :]], dim=-2)
 
 
 def is_upright(keypoints: Tensor, scores: Tensor, threshold: float) -> Tensor:

@@ -114,8 +114,9 @@ class MetricPose(nn.Module):
 
     Shape:
         joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
-        (..., P, T) bool, image height and width in pixels, frames per second and, where the camera moves, its
-        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward) -> world joints
+        (..., P, T) bool, image height and width in pixels, frames per second, where the camera moves its
+        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward), and where it is known whom the left
+        or right edge of the picture cuts off (..., P, T) bool, whose size does not count -> world joints
         (..., P, T, 14, 3) in metres and whether each was seen (..., P, T, 14). What was not seen is filled: a
         hidden joint from the pose that the lifter found, an invalid or discarded frame from the nearest other one;
         people without any are zeros. Differentiable.
@@ -189,8 +190,9 @@ class MetricPose(nn.Module):
         image_width: int,
         fps: float,
         camera_pose: Tensor | None = None,
+        cut_off: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Joints, scores, Lifted, valid, image size, fps, camera poses -> world joints and what was seen."""
+        """Joints, scores, Lifted, valid, image size, fps, camera poses, cut off -> world joints and what was seen."""
         _check(keypoints, scores, lifted, valid, image_height, image_width, fps)
         seen = (scores >= self.keypoint_threshold) & valid[..., None]
         height = self._of_each(self.heights, keypoints)
@@ -216,6 +218,8 @@ class MetricPose(nn.Module):
             # Of who is cut off by the left or right edge of the picture, the network puts what is beyond at the edge.
             across = keypoints[..., 0] / max(image_width - 1, 1)
             beyond = (seen & ((across < 0.01) | (across > 0.99))).any(dim=-1)
+            if cut_off is not None:
+                beyond = beyond | cut_off
             whole = valid & many & (lifted.distance < self.poor_fit)
             whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid & many)
@@ -229,6 +233,7 @@ class MetricPose(nn.Module):
             hips_range, whole, stands, precision = self._on_floor(
                 hips_range, image, depth, focal, center, pose, height, inside, whole, fps
             )
+            whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
             body_px = focal / (hips_range / height + offset).clamp(min=1e-3)

@@ -339,10 +339,13 @@ def test_hidden_joints_and_absent_people_are_filled_and_marked() -> None:
     assert torch.equal(seen, expected)
 
 
-def place_seen(module: MetricPose, image: Tensor, scores: Tensor, lifted: Lifted) -> tuple[Tensor, Tensor]:
+def place_seen(
+    module: MetricPose, image: Tensor, scores: Tensor, lifted: Lifted, cut_off: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     lifted = Lifted(*(field[None] for field in lifted))
     valid = torch.ones(1, len(image), dtype=torch.bool)
-    joints, seen = module(image[None], scores[None], lifted, valid, HEIGHT, WIDTH, FPS)
+    told = None if cut_off is None else cut_off[None]
+    joints, seen = module(image[None], scores[None], lifted, valid, HEIGHT, WIDTH, FPS, None, told)
     return joints[0], seen[0]
 
 
@@ -400,6 +403,20 @@ def test_size_does_not_count_where_the_left_or_right_edge_cuts_somebody_off() ->
     joints, _ = place_seen(MetricPose(person_height_m=(TALL,)), cut, torch.ones(90, 14).double(), found)
     off = (joints[:, [8, 11], 1].mean(-1) - world[:, [8, 11], 1].mean(-1)).abs()
     assert float(off.max()) < 0.15
+
+
+def test_size_does_not_count_where_somebody_is_said_to_be_cut_off() -> None:
+    """Entering: the box touches the edge, the network places all joints inside, too close together."""
+    world = walker((0.0, 4.0), (0.0, -0.3))
+    image, lifted = film(world)
+    found = misread(image, lifted, slice(0, 8), list(range(14)), 0.6)
+    entering = torch.arange(90) < 8
+    scores = torch.ones(90, 14, dtype=torch.float64)
+    module = MetricPose(person_height_m=(TALL,))
+    for cut_off, furthest in ((entering, 0.1), (None, 3.0)):
+        joints, _ = place_seen(module, image, scores, found, cut_off)
+        off = (joints[:, [8, 11], 1].mean(-1) - world[:, [8, 11], 1].mean(-1)).abs()
+        assert (float(off.max()) < 0.1) == (furthest == 0.1), off.max()
 
 
 def test_a_lifted_walker_recedes_at_its_speed() -> None:
