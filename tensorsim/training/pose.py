@@ -189,7 +189,7 @@ class PoseRecipe(Recipe):
         sigma: float = 1.5,
         first_size: tuple[int, int] = (96, 64),
         first_samples: int = 0,
-        shares: tuple[float, float, float, float] = (0.55, 0.2, 0.25, 0.1),
+        shares: tuple[float, float, float, float] = (0.5, 0.15, 0.3, 0.12),
         augmentation: Augmentation | None = None,
     ) -> None:
         self.augmentation = Augmentation() if augmentation is None else augmentation
