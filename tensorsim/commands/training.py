@@ -88,7 +88,7 @@ class PeopleOptions(TrainOptions):
     cutouts: Path | None = None
     """Folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given."""
     rendered: int = 0
-    """Number of rendered people: 3000 take hours."""
+    """Number of rendered people; a core renders about five a second."""
     rendered_seed: int = 0
     """Of their poses, looks and cameras."""
 
