@@ -55,8 +55,8 @@ def mirror(joints: Tensor) -> Tensor:
 class Marks(NamedTuple):
     """Where people mark joints in pictures, and networks that learn from them, beside the centres of the joints.
 
-    Hips, knees, ankles and elbows of COCO are not where the bones turn. As shares of the segment, the mean of two
-    networks that learnt from people's marks (``python -m tests.benchmarks.eval_key_points``).
+    Hips, knees, ankles and elbows of COCO are not where the bones turn. Shares of the segment, to half a percent of it
+    the means of two networks that learnt from people's marks (``python -m tests.benchmarks.eval_key_points``).
 
     Attributes:
         elbow: above the joint, of the upper arm.
