@@ -232,6 +232,33 @@ def test_a_track_that_shows_no_joint_is_nobody() -> None:
     assert people_of(whole, FPS)[0]["last_frame"] == 19
 
 
+class FlatPose(nn.Module):
+    """A metric pose that is no MetricPose: everybody stands in a plane 4 m away."""
+
+    def forward(
+        self,
+        keypoints: Tensor,
+        scores: Tensor,
+        lifted: ts.types.Lifted,
+        valid: Tensor,
+        image_height: int,
+        image_width: int,
+        fps: float,
+    ) -> tuple[Tensor, Tensor]:
+        u, v = (keypoints / image_height).unbind(-1)
+        return torch.stack([u, torch.full_like(u, 4.0), 2.0 - v], dim=-1), valid[..., None].expand_as(scores)
+
+
+def test_a_metric_pose_of_ones_own_replaces_the_default() -> None:
+    clip = two_clips()[:1]
+    stage = VideoToPose(RectangleDetector(), StandingPose(), metric_pose=FlatPose()).eval()
+    found = stage(clip, FPS)
+    torch.testing.assert_close(
+        found.joints[0, 0, :, :, 1], torch.full((20, 14), 4.0).to(found.joints), atol=1e-6, rtol=0
+    )
+    assert_same(torch.jit.script(stage)(clip, FPS).joints, found.joints)
+
+
 def test_padded_frames_do_not_count() -> None:
     stage, clips = pipeline(), two_clips()
     padded = clips.clone()

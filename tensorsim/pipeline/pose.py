@@ -1,6 +1,7 @@
 """Video -> people with smooth 3D joints: detection, tracking, 2D pose, lifting, position, smoothing."""
 
 import copy
+from typing import Final
 
 import torch
 from torch import Tensor, nn
@@ -52,6 +53,8 @@ class VideoToPose(nn.Module):
             distances or a camera; parts that are not such stages.
     """
 
+    asks_for_edges: Final[bool]
+
     def __init__(
         self,
         detector: nn.Module,
@@ -96,6 +99,8 @@ class VideoToPose(nn.Module):
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
         self.metric_pose = metric_pose
+        # A replacement is called with what every metric pose takes. TorchScript compiles one of both calls.
+        self.asks_for_edges = isinstance(metric_pose, MetricPose)
         self.camera_m = _camera_position(metric_pose)
         self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
@@ -329,9 +334,14 @@ class VideoToPose(nn.Module):
             assert self.lifter is not None
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)
-        # The box of somebody who enters reaches the edge before the network places a joint there.
-        cut_off = (tracks.boxes[..., 0] <= 1.0) | (tracks.boxes[..., 2] >= width - 2.0)
-        joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps, None, cut_off)
+        if self.asks_for_edges:
+            # The box of somebody who enters reaches the edge before the network places a joint there.
+            cut_off = (tracks.boxes[..., 0] <= 1.0) | (tracks.boxes[..., 2] >= width - 2.0)
+            joints, seen = self.metric_pose(
+                body, body_scores, lifted, usable, height, width, fps, None, cut_off
+            )
+        else:
+            joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
         if self.temporal is None:
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible

@@ -210,14 +210,7 @@ def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
 
         page.get_by_label("through-wall").check()
         page.get_by_role("button", name=re.compile("^Wall ")).click()
-        permittivity = page.locator("#wall-permittivity").locator("input, textarea")
-        page.wait_for_timeout(
-            1000
-        )  # Gradio builds the group when it is opened, and again when the page has settled
-        permittivity.fill("4")
-        permittivity.press("Tab")
-        page.wait_for_timeout(1000)
-        assert permittivity.input_value() == "4"
+        type_into(page, page.locator("#wall-permittivity").locator("input, textarea"), "4")
         page.click("#compare")
         page.locator("#result section").nth(1).wait_for()
         sources = [frame.get_attribute("src") for frame in page.locator("#result iframe").all()]
@@ -254,16 +247,30 @@ def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
     assert status_of(f"{server}/runs/{token}/all.zip") == 200
 
 
+def type_into(page: Any, field: Any, value: str) -> None:
+    """Type a value; once more where Gradio, which builds a group when it is opened, builds it again and forgets it."""
+    for _ in range(5):
+        field.fill(value)
+        field.press("Tab")
+        page.wait_for_timeout(1500)
+        if field.input_value() == value:
+            return
+    raise AssertionError(f"{value} was not kept in five attempts")
+
+
 def choose_film(page: Any, film: Path) -> None:
-    """Upload a film; once more where Gradio, on a busy machine, forgets it while it lays out the page anew."""
+    """Open the page anew and upload a film; again where Gradio, on a busy machine, loses the upload."""
     from playwright.sync_api import TimeoutError as NotYet
 
     for _ in range(5):
-        page.locator("input[type=file]").first.set_input_files(film)
+        page.reload()
+        page.get_by_role("button", name="Simulate").wait_for()
+        page.wait_for_timeout(1000)
         try:
+            page.locator("input[type=file]").first.set_input_files(film, timeout=30_000)
             return page.get_by_text(film.name).first.wait_for(timeout=30_000)
         except NotYet:
-            page.wait_for_timeout(1000)
+            continue
     raise AssertionError(f"{film.name} was not taken in five attempts")
 
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import Marks, coco_to_body
 from tensorsim.commands.networks import default_networks, load_networks
-from tensorsim.config import JOINTS
+from tensorsim.config import COCO_KEYPOINTS, JOINTS
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.training.cutouts import Cutout, render_cutout
 
@@ -83,9 +83,9 @@ def marked(pose: nn.Module, cutout: Cutout, level: float) -> Marked:
     wanted = joints_of(torch.from_numpy(cutout.keypoints[:, :2]))
     named = found[0, 0].double() - MARGIN_PX
     # As marked: elbows to ankles are not moved to the joints.
-    order = [0, 0, 6, 8, 10, 5, 7, 9, 12, 14, 16, 11, 13, 15]
-    marks = named[order].numpy()
-    marks[1] = named[5:7].mean(0).numpy()
+    places = dict(zip(COCO_KEYPOINTS, named, strict=True))
+    places |= {"head": places["nose"], "neck": named[5:7].mean(0)}
+    marks = torch.stack([places[name] for name in JOINTS]).numpy()
     return Marked(wanted, marks, float(height))
 
 
