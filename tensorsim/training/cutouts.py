@@ -25,6 +25,7 @@ from tensorsim.files import complete_file
 from tensorsim.geometry.camera import camera_to_world
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.render.renderer import PersonRenderer
+from tensorsim.training.pose_pool import everyday_poses
 
 #: Rendered this many times larger than kept, so that outlines have soft edges.
 OVERSAMPLING = 2
@@ -129,12 +130,15 @@ def _shrink(picture: Tensor) -> Tensor:
 
 
 def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bool = False) -> list[Path]:
-    """Render people in sampled poses into shards ``cutouts-NNN.tar``; existing shards are kept.
+    """Render people into shards ``cutouts-NNN.tar``; existing shards are kept.
+
+    Half of them are in sampled poses, half in moments of everyday movements, such as picking up (see
+    :func:`~tensorsim.training.pose_pool.everyday_poses`).
 
     ``cutouts.json`` beside them tells number and seed. A folder of shards without one is taken as it is.
 
     Args:
-        count: number of people, at least 13.
+        count: number of people, at least 25.
         seed: the same seed gives the same people.
         out: folder, made if it is not there.
         quiet: no progress bar.
@@ -147,7 +151,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     """
     from tqdm import tqdm
 
-    poses = sample_poses(count, seed)
+    poses = torch.cat([sample_poses(count - count // 2, seed), everyday_poses(count // 2, seed)])
     poses = poses[torch.randperm(count, generator=torch.Generator().manual_seed(seed))]
     folder = Path(out)
     settings = {"people": count, "seed": seed}

@@ -10,8 +10,9 @@ from torch import Tensor
 from tensorsim.body.skeleton import mirror
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_positive
-from tensorsim.motion.activities import ActivityGenerator
-from tensorsim.motion.people import PeopleConfig
+from tensorsim.motion import everyday, exercises
+from tensorsim.motion.activities import ActivityGenerator, perform
+from tensorsim.motion.people import PeopleConfig, draw_people
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.vision.lifting.pose_library import standardise_poses, turn
 
@@ -20,6 +21,19 @@ from tensorsim.vision.lifting.pose_library import standardise_poses, turn
 LIMB_DEVIATION = 0.05
 #: Frames taken of a generated clip of 4 s.
 _MOMENTS = 20
+#: What people do near the floor or far from upright, and what few clips of the activities show.
+_EVERYDAY = (
+    exercises.pick_up,
+    exercises.bend,
+    exercises.squat,
+    exercises.lie_down,
+    exercises.get_up,
+    exercises.crawl,
+    everyday.fall_any_way,
+    everyday.fall_on_knees,
+    everyday.swing_fist,
+    everyday.kick_ball,
+)
 
 
 def facing_away(poses: Tensor) -> Tensor:
@@ -35,30 +49,57 @@ def facing_away(poses: Tensor) -> Tensor:
     return turn(poses, -torch.atan2(line[:, 1], line[:, 0]))
 
 
-def generated_poses(count: int, seed: int) -> Tensor:
-    """Poses of tensorsim's own: a third from the eleven activities that show somebody, the rest sampled.
+def everyday_poses(count: int, seed: int) -> Tensor:
+    """Moments of people who pick up, bend, squat, lie down, get up, crawl, fall, swing fists and kick balls.
 
     Args:
-        count: number of poses, at least 330.
+        count: number of poses.
+        seed: the same seed gives the same poses.
+
+    Returns:
+        (count, 14, 3) float64, standardised, facing +y, of bodies of many proportions.
+    """
+    people = PeopleConfig(limb_deviation=LIMB_DEVIATION, variation=0.2, heading_rad=0.0)
+    generator = torch.Generator().manual_seed(seed)
+    clips = math.ceil(count / len(_EVERYDAY) / _MOMENTS)
+    acted = []
+    for script in _EVERYDAY:
+        who = draw_people(clips, people, generator)
+        time = 4 * torch.rand(clips, _MOMENTS, generator=generator, dtype=torch.float64).sort(dim=1).values
+        acted.append(perform(script, time, who).flatten(0, 1))
+    chosen = torch.cat(acted)
+    chosen = chosen[torch.randperm(len(chosen), generator=generator)[:count]]
+    return facing_away(standardise_poses(chosen))
+
+
+def generated_poses(count: int, seed: int) -> Tensor:
+    """Poses of tensorsim's own: a sixth of :func:`everyday_poses`, of the rest a third from the activities.
+
+    The others are drawn by :func:`~tensorsim.motion.pose_sampler.sample_poses`.
+
+    Args:
+        count: number of poses, at least 396.
         seed: the same seed gives the same poses.
 
     Returns:
         (count, 14, 3) float64, standardised, facing +y, of bodies of many proportions, both sides alike.
     """
-    if count < 330:
-        raise TensorsimError(f"generated poses: got a count of {count}, expected at least 330")
+    if count < 396:
+        raise TensorsimError(f"generated poses: got a count of {count}, expected at least 396")
+    others = count - count // 6
     people = PeopleConfig(limb_deviation=LIMB_DEVIATION, variation=0.2, heading_rad=0.0)
     actors = ActivityGenerator(people)
     generator = torch.Generator().manual_seed(seed)
-    clips = math.ceil(count / 3 / 11 / _MOMENTS)
+    clips = math.ceil(others / 3 / 11 / _MOMENTS)
     acted = []
     for activity in range(1, 12):
         motion = actors.generate(activity, clips, generator, rate_hz=_MOMENTS / 4)
         acted.append(motion.joints.flatten(0, 1))
     chosen = torch.cat(acted)
-    chosen = chosen[torch.randperm(len(chosen), generator=generator)[: count // 3]]
-    sampled = sample_poses(count - len(chosen), seed, LIMB_DEVIATION)
-    return facing_away(standardise_poses(torch.cat([chosen, sampled])))
+    chosen = chosen[torch.randperm(len(chosen), generator=generator)[: others // 3]]
+    sampled = sample_poses(others - len(chosen), seed, LIMB_DEVIATION)
+    poses = facing_away(standardise_poses(torch.cat([chosen, sampled])))
+    return torch.cat([poses, everyday_poses(count - others, seed)])
 
 
 def recorded_poses(file: Path) -> Tensor:

@@ -1,4 +1,4 @@
-"""How well poses are lifted: motion capture and generated people, filmed from 8 sides.
+"""How well poses are lifted: motion capture, generated activities and everyday movements, filmed from 8 sides.
 
 python -m tests.benchmarks.eval_lifting [--tune] [LIBRARY.safetensors]
 
@@ -17,7 +17,9 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.skeleton import body_height, mid_hips
-from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.motion.activities import ActivityGenerator, perform
+from tensorsim.motion.exercises import EXERCISES
+from tensorsim.motion.people import PeopleConfig, draw_people
 from tensorsim.training.pose_pool import facing_away, with_mirror_images, without_near_duplicates
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.pose_library import load_pose_library, standardise_poses, turn
@@ -25,6 +27,7 @@ from tests.conftest import SHARED_DATA
 
 FRAMES, SIDES = 45, 8
 HEIGHT_M, RANGE_M, FOCAL_PX, NOISE_PX = 1.75, 4.0, 685.7, 2.0
+EVERYDAY = ("picking up", "bending", "squats", "lying down", "getting up", "crawling")
 LIFTINGS: dict[str, dict[str, float]] = {
     "nearest": {"neighbours": 1},
     "k nearest": {"temporal": 0.0},
@@ -51,6 +54,16 @@ def generated_clips(seed: int) -> dict[str, Tensor]:
     actors = ActivityGenerator()
     names = range(1, 12)
     return {f"activity {i + 1}": actors.generate(i, 1, seed + i).joints[0].float() for i in names}
+
+
+def everyday_clips(seed: int) -> dict[str, Tensor]:
+    """A clip (T, 14, 3) of each movement near the floor or far from upright, by people of their own."""
+    time = (torch.arange(FRAMES, dtype=torch.float64) / 30 + 0.2)[None]
+    clips = {}
+    for i, name in enumerate(EVERYDAY):
+        who = draw_people(1, PeopleConfig(heading_rad=0.0), torch.Generator().manual_seed(seed + i))
+        clips[name] = perform(EXERCISES[name], time, who)[0].float()
+    return clips
 
 
 def film(joints: Tensor, side: int) -> tuple[Tensor, Tensor]:
@@ -97,6 +110,7 @@ def main() -> None:
     library = load_pose_library(files[0] if files else None)
     judged = {name: clip for i, (name, clip) in enumerate(every.items()) if (i % 2 == 0) == tune}
     acted = generated_clips(700 if tune else 800)
+    near_floor = everyday_clips(700 if tune else 900)
     print(f"library of {len(library)} poses; joints, depth, change of depth, in cm")
     by_clip: dict[str, np.ndarray] = {}
 
@@ -105,7 +119,7 @@ def main() -> None:
 
     for name, options in LIFTINGS.items():
         lifter = NearestPoseLifter(library, **options)  # type: ignore[arg-type]
-        for kind, clips in (("mocap", judged), ("generated", acted)):
+        for kind, clips in (("mocap", judged), ("generated", acted), ("everyday", near_floor)):
             by_clip = {**by_clip, **{clip: judge(lifter, joints) for clip, joints in clips.items()}}
             show(name, "library", kind, [by_clip[clip] for clip in clips])
         pools = {clip: other_clips(every, clip) for clip in judged}

@@ -32,32 +32,32 @@ def test_points_lie_on_the_person(index: int) -> None:
 
 
 def test_shards_are_repeatable_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PER_SHARD", 8)
+    monkeypatch.setattr(module, "PER_SHARD", 16)
     small = render_cutout
     monkeypatch.setattr(module, "render_cutout", lambda pose, seed: small(pose, seed, side=40))
-    paths = render_cutouts(13, 3, tmp_path, quiet=True)
+    paths = render_cutouts(26, 3, tmp_path, quiet=True)
     assert [p.name for p in paths] == ["cutouts-000.tar", "cutouts-001.tar"]
     people = Cutouts(paths)
-    assert len(people) == 13
+    assert len(people) == 26
     data = [p.read_bytes() for p in paths]
     paths[1].unlink()
-    render_cutouts(13, 3, tmp_path, quiet=True)
+    render_cutouts(26, 3, tmp_path, quiet=True)
     assert [p.read_bytes() for p in paths] == data
     assert sorted(tmp_path.iterdir()) == [*paths, tmp_path / "cutouts.json"]
     with pytest.raises(
         TensorsimError, match=r"it holds rendered people of .*'seed': 3.*, expected .*'seed': 4"
     ):
-        render_cutouts(13, 4, tmp_path, quiet=True)
-    with pytest.raises(TensorsimError, match=r"'people': 13.*, expected .*'people': 14"):
-        render_cutouts(14, 3, tmp_path, quiet=True)
+        render_cutouts(26, 4, tmp_path, quiet=True)
+    with pytest.raises(TensorsimError, match=r"'people': 26.*, expected .*'people': 27"):
+        render_cutouts(27, 3, tmp_path, quiet=True)
     # Shards of which nothing is told are taken as they are.
     (tmp_path / "cutouts.json").unlink()
-    assert render_cutouts(13, 4, tmp_path, quiet=True) == paths
+    assert render_cutouts(26, 4, tmp_path, quiet=True) == paths
     assert [p.read_bytes() for p in paths] == data
     (tmp_path / "cutouts.json").write_text("{")
     with pytest.raises(TensorsimError, match=r"cutouts\.json: damaged"):
-        render_cutouts(13, 3, tmp_path, quiet=True)
-    other = render_cutouts(13, 4, tmp_path / "other", quiet=True)
+        render_cutouts(26, 3, tmp_path, quiet=True)
+    other = render_cutouts(26, 4, tmp_path / "other", quiet=True)
     assert other[0].read_bytes() != data[0]
 
 

@@ -89,7 +89,8 @@ class NearestPoseLifter(nn.Module):
         yaws: headings at which each pose of the pool is tried; 1 for a pool that has all headings already.
         neighbours: candidates per frame.
         search_joints: a frame with fewer joints takes its candidates from the nearest frame with as many.
-        tolerance: relative error (square root of ``distance``) at which a candidate loses its weight.
+        tolerance: relative error (square root of ``distance``) at which a candidate loses its weight; more where even
+            the nearest pose fits badly.
         temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
             body heights and by 1 % of the size; 0 treats frames alone.
         chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair.
@@ -136,6 +137,7 @@ class NearestPoseLifter(nn.Module):
         # Per frame, at 30 frames a second: a limb that moves at 1.6 m/s, in body heights; somebody 4 m away who
         # walks at 1.2 m/s, in relative size. Sizes that change faster than bodies can move are wrong matches.
         self.change, self.size_change = 0.03, 0.01
+        self.reserve = 0.3  # of the squared error of the nearest pose, added to that of the tolerance
         self.search = PoseSearch(poses, yaws, neighbours, chunk, pitch_rad)
         self.roll_rad = float(roll_rad)
 
@@ -193,7 +195,9 @@ class NearestPoseLifter(nn.Module):
 
     def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:
         """Weight of each candidate, (S, T, K) summing to one; only frames (S, T) that are ``placeable`` count."""
-        emission = -0.5 / self.tolerance**2 * distance
+        # Where even the nearest pose fits badly, such as behind wrong key points, the others are hardly worse.
+        misfit = distance.amin(dim=-1, keepdim=True)
+        emission = -0.5 * distance / (self.tolerance**2 + self.reserve * misfit)
         if self.temporal == 0.0 or self.neighbours == 1:
             return torch.softmax(emission, dim=-1)
         # What changes from frame to frame: the pose (rms over joints) and the logarithm of the size, in one unit.
