@@ -92,7 +92,14 @@ class CausalPose(nn.Module):
         )
 
     def forward(
-        self, state: PoseState, keypoints: Tensor, scores: Tensor, there: Tensor, height: int, width: int
+        self,
+        state: PoseState,
+        keypoints: Tensor,
+        scores: Tensor,
+        boxes: Tensor,
+        there: Tensor,
+        height: int,
+        width: int,
     ) -> PoseState:
         """The state after a frame.
 
@@ -100,6 +107,8 @@ class CausalPose(nn.Module):
             state: of P people.
             keypoints: (P, 17, 2) pixels.
             scores: (P, 17).
+            boxes: (P, 4) pixels, ``xyxy``; the size of a body that the left or right edge of the picture cuts counts
+                little.
             there: (P,) bool, whose key points these are; the others are predicted.
             height, width: of the picture.
         """
@@ -112,11 +121,12 @@ class CausalPose(nn.Module):
         whole = usable & (reliable.sum(dim=-1) >= self.metric_pose.whole_body_joints)
         whole = whole & (lifted.distance[:, 0] < self.metric_pose.poor_fit)
         first = whole & (state.size.p00[:, 0] >= self.unknown)
+        cut_off = (boxes[:, :1] <= 1.0) | (boxes[:, 2:3] >= width - 2.0)
         size = self._filtered(
             state.size,
             lifted.scale.clamp(min=1.0).log(),
             self.size_density,
-            self.size_noise,
+            torch.where(cut_off, 25 * self.size_noise, self.size_noise).double(),
             self.size_speed,
             whole[:, None],
             first[:, None],
@@ -155,7 +165,7 @@ class CausalPose(nn.Module):
             state.joints,
             placed,
             self.joint_density,
-            self.joint_noise,
+            torch.tensor(self.joint_noise, dtype=torch.float64),
             self.initial_speed,
             measured[..., None],
             (newly[:, None] & measured)[..., None],
@@ -182,22 +192,22 @@ class CausalPose(nn.Module):
         state: KalmanState,
         measured: Tensor,
         density: float,
-        noise: float,
+        noise: Tensor,
         speed: float,
         valid: Tensor,
         first: Tensor,
     ) -> KalmanState:
         """Prediction by a frame and update; where ``first``, the filter begins with this measurement."""
-        q, r = (torch.full([1], value, dtype=torch.float64) for value in (density, noise))
+        q = torch.full([1], density, dtype=torch.float64)
         predicted = constant_velocity_predict(state, q, 1 / self.fps)
         begun = _unknown(measured.double(), noise, speed)
         prior = KalmanState(*(torch.where(first, a, b) for a, b in zip(begun, predicted, strict=True)))
-        return kalman_update(prior, measured.double(), r, valid.double())
+        return kalman_update(prior, measured.double(), noise, valid.double())
 
 
-def _unknown(place: Tensor, noise: float, speed: float) -> KalmanState:
+def _unknown(place: Tensor, noise: float | Tensor, speed: float) -> KalmanState:
     """A state (..., D) at a place of which nothing is known, with velocities within ``speed``."""
-    wide = torch.full_like(place[..., :1], _WIDE * noise)
+    wide = torch.zeros_like(place[..., :1]) + _WIDE * noise
     return KalmanState(
         place, torch.zeros_like(place), wide, torch.zeros_like(wide), torch.full_like(wide, speed**2)
     )

@@ -220,9 +220,8 @@ class LiveSimulator:
         people = []
         for row, number in enumerate(numbers):
             stage = self._pose_of(number)
-            state = stage(
-                self.states[number], keypoints[row : row + 1], scores[row : row + 1], there, height, width
-            )
+            one = slice(row, row + 1)
+            state = stage(self.states[number], keypoints[one], scores[one], boxes[one], there, height, width)
             self.states[number] = state
             if int(state.frames) == 0:
                 continue

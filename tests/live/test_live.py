@@ -36,6 +36,8 @@ from tensorsim.vision.smoothing.outliers import limit_speed
 from tests.film import STANDING, RectangleDetector, StandingPose, film, walker
 
 FPS, FRAMES = 10.0, 60
+#: A box that no edge of the picture cuts.
+INSIDE = torch.tensor([[60.0, 30.0, 120.0, 200.0]])
 CONFIG = ts.SimulationConfig.through_wall().replace(scene__snr_db=None, pose__flip_test=False)
 
 
@@ -111,6 +113,26 @@ def test_weak_detections_make_nobody() -> None:
     assert online.people(state)[0] == []
 
 
+@pytest.mark.parametrize(("left_px", "off"), [(0.0, (0.0, 0.03)), (5.0, (0.05, 1.0))])
+def test_sizes_of_who_is_cut_off_by_the_edge_count_little(left_px: float, off: tuple[float, float]) -> None:
+    """Somebody looks larger by half while the edge cuts him off, and is two frames later where he is."""
+    stage = simulator().poses[0]
+    scores = torch.full((1, 17), 0.9)
+
+    def range_m(sizes: list[float]) -> float:
+        state = stage.begin(1)
+        for size in sizes:
+            keypoints = torch.tensor(STANDING)[None] * size + torch.tensor([50.0, 30.0])
+            boxes = torch.tensor([[left_px if size > 150 else 60.0, 30.0, 120.0, 200.0]])
+            state = stage(state, keypoints, scores, boxes, torch.tensor([True]), 240, 320)
+        return float(state.shown[0, [8, 11], 1].mean())
+
+    with torch.no_grad():
+        true = range_m([120.0] * 12)
+        found = range_m([180.0] * 10 + [120.0] * 2)
+    assert off[0] <= abs(found / true - 1) <= off[1]
+
+
 def test_poses_are_those_of_the_causal_stages_on_the_whole_film() -> None:
     """The same stages, each on all frames at once: lifter, forward filter of the size, metric pose, floor, filter."""
     stage = simulator().poses[0]
@@ -124,7 +146,8 @@ def test_poses_are_those_of_the_causal_stages_on_the_whole_film() -> None:
     state, shown = stage.begin(1), []
     with torch.no_grad():
         for t in range(40):
-            state = stage(state, keypoints[t : t + 1], scores[t : t + 1], torch.tensor([True]), 240, 320)
+            frame = slice(t, t + 1)
+            state = stage(state, keypoints[frame], scores[frame], INSIDE, torch.tensor([True]), 240, 320)
             shown.append(state.shown[0])
 
         body, body_scores = coco_to_body(keypoints, scores)
