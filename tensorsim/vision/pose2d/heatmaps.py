@@ -85,6 +85,54 @@ def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([u, v], -1) - step * refined.unsqueeze(-1), score
 
 
+def sides_apart(maps: Tensor, left: Tensor, right: Tensor, share: float = 0.7, radius: float = 4.0) -> Tensor:
+    """Heat maps in which a left and a right point do not take the same place where there are two.
+
+    Of somebody seen from the side a network knows where both ankles are and not which is the left one: both maps have
+    two peaks of nearly the same height, and the higher one may be the same in both. There one of the two maps loses
+    that peak: the one that makes the product of the heights of both points the largest. Points that do share a place,
+    as the ankles of a walker who passes one leg by the other, have maps with one peak, and keep it.
+
+    Args:
+        maps: (..., K, h, w).
+        left, right: (M,) int64, the maps of each pair.
+        share: least height of the second peak over that of the first, mean of both maps: a thing that looks like a
+            foot to one of them is none.
+        radius: pixels of a map around a peak that belong to it.
+
+    Returns:
+        (..., K, h, w).
+    """
+    height, width = maps.shape[-2], maps.shape[-1]
+    found = maps.detach()
+    around = F.max_pool2d(found.reshape(-1, 1, height, width), 3, 1, 1).reshape(found.shape)
+    summits = torch.where(found >= around, found, 0.0)
+    u, v, score = peak(found)
+    row = torch.arange(height, device=maps.device).unsqueeze(-1)
+    column = torch.arange(width, device=maps.device)
+    away = (column - u[..., None, None]).square() + (row - v[..., None, None]).square() > radius**2
+    distance = (u.index_select(-1, left) - u.index_select(-1, right)).square()
+    distance = distance + (v.index_select(-1, left) - v.index_select(-1, right)).square()
+    shared = distance <= (radius - 1.0) ** 2
+    # What each map has beyond the peak of the other one, and what the other has there.
+    left_away, right_away = away.index_select(-3, left), away.index_select(-3, right)
+    left_maps, right_maps = found.index_select(-3, left), found.index_select(-3, right)
+    left_u, left_v, second_left = peak(summits.index_select(-3, left) * right_away)
+    right_u, right_v, second_right = peak(summits.index_select(-3, right) * left_away)
+    tiny = 1e-10
+    first_left = score.index_select(-1, left).clamp(min=tiny)
+    first_right = score.index_select(-1, right).clamp(min=tiny)
+    left_again = (second_left / first_left + pixel(right_maps, left_u, left_v) / first_right) / 2
+    right_again = (second_right / first_right + pixel(left_maps, right_u, right_v) / first_left) / 2
+    moves_left = second_left * first_right > first_left * second_right
+    left_goes = shared & moves_left & (left_again >= share)
+    right_goes = shared & ~moves_left & (right_again >= share)
+    kept = torch.ones_like(away)
+    kept = kept.index_copy(-3, left, ~left_goes[..., None, None] | right_away)
+    kept = kept.index_copy(-3, right, ~right_goes[..., None, None] | left_away)
+    return maps * kept
+
+
 class HeatmapDecoder(nn.Module):
     """Heat maps (..., h, w) to points of the crop, ``uv`` in crop pixels (..., 2), and scores (...).
 
@@ -95,14 +143,24 @@ class HeatmapDecoder(nn.Module):
         kernel_size: k of the Gaussian that DARK smooths with, odd; sigma is 0.3 ((k - 1) / 2 - 1) + 0.8, that
             is 2 for 11.
         stride: how many crop pixels one heat-map pixel is wide.
+        pairs: left and right maps of one body, by number, that are kept apart by :func:`sides_apart`.
 
     Raises:
-        TensorsimError: another method, an even kernel, a stride below 1, integer or empty maps.
+        TensorsimError: another method, an even kernel, a stride below 1, integer or empty maps, fewer maps than
+            ``pairs`` speaks of.
     """
 
     kernel: Tensor
+    left: Tensor
+    right: Tensor
 
-    def __init__(self, method: str = "dark", kernel_size: int = 11, stride: int = 4) -> None:
+    def __init__(
+        self,
+        method: str = "dark",
+        kernel_size: int = 11,
+        stride: int = 4,
+        pairs: tuple[tuple[int, int], ...] = (),
+    ) -> None:
         super().__init__()
         if method not in ("dark", "quarter"):
             raise TensorsimError(f"HeatmapDecoder: got method {method!r}, expected 'dark' or 'quarter'")
@@ -117,6 +175,10 @@ class HeatmapDecoder(nn.Module):
         sigma = 0.3 * ((kernel_size - 1) / 2 - 1) + 0.8
         kernel = torch.signal.windows.gaussian(kernel_size, std=sigma, dtype=torch.float64)
         self.register_buffer("kernel", (kernel / kernel.sum()).float(), persistent=False)
+        self.maps = 1 + max((number for pair in pairs for number in pair), default=-1)
+        left, right = ([pair[side] for pair in pairs] for side in (0, 1))
+        self.register_buffer("left", torch.tensor(left, dtype=torch.int64), persistent=False)
+        self.register_buffer("right", torch.tensor(right, dtype=torch.int64), persistent=False)
 
     def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """(..., h, w) -> points (..., 2) in crop pixels and scores (...)."""
@@ -126,6 +188,14 @@ class HeatmapDecoder(nn.Module):
             raise TensorsimError(
                 f"HeatmapDecoder maps: got shape {list(maps.shape)}, expected (..., h, w) with pixels"
             )
+        if self.maps > 0:
+            check_min_rank(maps, 3, "HeatmapDecoder maps", "(..., K, h, w)")
+            if maps.shape[-3] < self.maps:
+                raise TensorsimError(
+                    f"HeatmapDecoder maps: got shape {list(maps.shape)}, expected (..., K, h, w) with at least "
+                    f"{self.maps} maps"
+                )
+            maps = sides_apart(maps, self.left, self.right)
         if self.method == "dark":
             points, scores = decode_dark(maps, self.kernel.to(maps.dtype))
         else:

@@ -18,6 +18,9 @@ MIRRORED = tuple(
     for name in COCO_KEYPOINTS
 )
 
+#: Left and right shoulders, elbows, wrists, hips, knees and ankles.
+SIDES = tuple((left, left + 1) for left in range(5, 17, 2))
+
 
 class FlipTest(nn.Module):
     """Flip test: a heat-map network runs on the crop and on its mirror image, and the maps are averaged.
@@ -110,7 +113,7 @@ class TopDownPose(nn.Module):
         )  # to be turned by one quarter or three
         self.network = FlipTest(network) if flip_test else network
         if isinstance(decode, str):
-            decode = HeatmapDecoder(decode, stride=getattr(network, "stride", 4))
+            decode = HeatmapDecoder(decode, stride=getattr(network, "stride", 4), pairs=SIDES)
         self.decoder = decode
         self.crops_per_batch = crops_per_batch
         self.stand_up = stand_up

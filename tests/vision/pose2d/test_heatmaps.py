@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
+from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder, sides_apart
 from tests.stage import StageTester
 
 
@@ -48,6 +48,104 @@ class TestQuarter(StageTester):
 
 class TestDark(TestQuarter):
     method = "dark"
+
+
+class TestSidesApart(TestDark):
+    def make(self) -> nn.Module:
+        return HeatmapDecoder(self.method, pairs=((0, 1), (2, 4)))
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        few = (torch.zeros(2, 4, 64, 48),)
+        return [*super().bad_inputs(), (few, r"got shape \[2, 4, 64, 48\], expected .* at least 5 maps")]
+
+
+def two_peaks(first: float, second: float) -> Tensor:
+    """A map of two legs: peaks of these heights at (12, 50) and (30, 48)."""
+    places = gaussians(torch.tensor([[12.0, 50.0], [30.0, 48.0]]))
+    return first * places[0] + second * places[1]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "places"),
+    [
+        # Both legs in both maps: the side whose map has more of the other leg goes there.
+        ((0.75, 0.74), (0.77, 0.72), (30.0, 12.0)),
+        ((0.75, 0.70), (0.77, 0.76), (12.0, 30.0)),
+        # They differ as they are.
+        ((0.75, 0.70), (0.72, 0.77), (12.0, 30.0)),
+        # One leg hides the other.
+        ((0.80, 0.10), (0.80, 0.15), (12.0, 12.0)),
+        # A thing that looks like a foot to one map alone.
+        ((0.55, 0.15), (0.55, 0.43), (12.0, 12.0)),
+    ],
+)
+def test_sides_take_different_places_where_there_are_two(
+    left: tuple[float, float], right: tuple[float, float], places: tuple[float, float]
+) -> None:
+    maps = torch.stack([torch.rand(64, 48), two_peaks(*left), two_peaks(*right)])
+    points, scores = HeatmapDecoder("dark", stride=1, pairs=((1, 2),))(maps)
+    torch.testing.assert_close(points[1:, 0], torch.tensor(places), atol=0.1, rtol=0)
+    heights = [
+        (one[0] if place == 12.0 else one[1]) for one, place in zip((left, right), places, strict=True)
+    ]
+    torch.testing.assert_close(scores[1:], torch.tensor(heights), atol=1e-3, rtol=0)
+    alone, height = HeatmapDecoder("dark", stride=1)(maps)
+    assert torch.equal(points[0], alone[0])
+    assert torch.equal(scores[0], height[0])
+
+
+def reference_apart(left: np.ndarray, right: np.ndarray, share: float, radius: float) -> list[np.ndarray]:
+    """The definition, pixel by pixel."""
+
+    def top(one: np.ndarray) -> tuple[int, int]:
+        v, u = np.unravel_index(int(one.argmax()), one.shape)
+        return int(v), int(u)
+
+    def near(place: tuple[int, int], v: int, u: int) -> bool:
+        return (v - place[0]) ** 2 + (u - place[1]) ** 2 <= radius**2
+
+    def second(one: np.ndarray, beyond: tuple[int, int]) -> tuple[float, tuple[int, int]]:
+        best = (0.0, (0, 0))
+        for v in range(one.shape[0]):
+            for u in range(one.shape[1]):
+                around = one[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
+                if one[v, u] == around.max() and not near(beyond, v, u) and one[v, u] > best[0]:
+                    best = (float(one[v, u]), (v, u))
+        return best
+
+    def without(one: np.ndarray, place: tuple[int, int]) -> np.ndarray:
+        kept = one.copy()
+        for v in range(one.shape[0]):
+            for u in range(one.shape[1]):
+                if near(place, v, u):
+                    kept[v, u] = 0.0
+        return kept
+
+    at_left, at_right = top(left), top(right)
+    if np.hypot(at_left[0] - at_right[0], at_left[1] - at_right[1]) > radius - 1:
+        return [left, right]
+    (height_left, place_left), (height_right, place_right) = second(left, at_right), second(right, at_left)
+    if height_left * right.max() > left.max() * height_right:
+        if (height_left / left.max() + right[place_left] / right.max()) / 2 >= share:
+            return [without(left, at_right), right]
+    elif (height_right / right.max() + left[place_right] / left.max()) / 2 >= share:
+        return [left, without(right, at_left)]
+    return [left, right]
+
+
+def test_sides_apart_equals_the_definition() -> None:
+    generator = torch.Generator().manual_seed(5)
+    places = torch.rand(60, 2, 2, generator=generator, dtype=torch.float64) * torch.tensor([15.0, 19.0])
+    heights = 0.5 + 0.5 * torch.rand(60, 2, 2, generator=generator, dtype=torch.float64)
+    peaks = gaussians(places, 20, 16, 1.5)
+    maps = torch.einsum("nkp,npij->nkij", heights, peaks)
+    apart = sides_apart(maps, torch.tensor([0]), torch.tensor([1]), 0.8, 4.0)
+    changed = 0
+    for one, found in zip(maps.numpy(), apart.numpy(), strict=True):
+        expected = np.stack(reference_apart(one[0], one[1], 0.8, 4.0))
+        np.testing.assert_array_equal(found, expected)
+        changed += not np.array_equal(expected, one)
+    assert 10 < changed < 50
 
 
 @pytest.mark.parametrize("method", ["dark", "quarter"])
