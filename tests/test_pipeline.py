@@ -270,7 +270,7 @@ def test_padded_frames_do_not_count() -> None:
     assert_same(out.joints[:1, :1, :9], alone.joints[:, :, :9], atol=2e-3)
     assert_same(out.joints[:1, :1, :12], alone.joints, atol=6e-3)
     last = int((11 / FPS - 0.1) * RADAR.prf_hz)  # who leaves fades out over 0.1 s; a clip's end is no leaving
-    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.05)
+    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.08)
     assert float(out.range_time[0, :, -40:].abs().max()) < 1e-6 * float(out.range_time[0].max())
 
 
