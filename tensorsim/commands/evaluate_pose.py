@@ -10,6 +10,8 @@ from tensorsim.exceptions import TensorsimError
 class EvaluatePose:
     """Print mean OKS and PCK@0.1 (of the longer side of the box) on held-out people.
 
+    "Body" is without the face, "pairs" the left and right points of the body with each pair either way round.
+
     Then, of the same people with the edge of the picture through them, the shares of keypoints that score 0.3 or more:
     of those in the picture ("seen") and of those beyond ("ghosts").
 
@@ -49,11 +51,10 @@ class EvaluatePose:
             raise TensorsimError("evaluate pose: got no pictures, expected --data or --coco")
 
         pose = pretrained_pose(self.weights, self.flip_test).eval()
-        print(
-            f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s} {'body':>7s} {'seen':>7s} {'ghosts':>7s}"
-        )
+        heads = "".join(f"{head:>8s}" for head in ("body", "pairs", "seen", "ghosts"))
+        print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s}{heads}")
         for name, persons in groups.items():
             figure = evaluate_pose(pose, persons) | evaluate_cut(pose, persons)
             row = f"{figure['oks']:7.3f} {figure['pck']:8.3f} {figure['pck_body']:7.3f}"
-            row += f" {figure['seen']:7.3f} {figure['ghosts']:7.3f}"
+            row += f" {figure['pck_pairs']:7.3f} {figure['seen']:7.3f} {figure['ghosts']:7.3f}"
             print(f"{name:40s} {len(persons):5d} {row}")

@@ -12,7 +12,7 @@ from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.loop import LoopConfig, fit
 from tensorsim.training.pose import PosePeople, PoseRecipe, covered, gaussian_maps, heatmap_loss, person_loss
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
-from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck
+from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck, pck_either_way
 from tensorsim.training.shards import Sample
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
@@ -167,6 +167,22 @@ def test_evaluation_goes_through_the_pipeline(tmp_path: Path) -> None:
     assert wrong["oks"] == pytest.approx(right["oks"] / 2, abs=0.02)
     with pytest.raises(TensorsimError, match="no people"):
         evaluate_pose(Brightness(), [])
+
+
+def test_pairs_count_either_way_round() -> None:
+    """Knees exchanged cost nothing, both ankles at the left one a half; pairs of which one is labelled are left out."""
+    points = torch.arange(2 * 17 * 2, dtype=torch.float32).view(2, 17, 2) * 40
+    known = torch.zeros(2, 17, dtype=torch.bool)
+    known[:, 13:17] = True
+    known[0, 9] = True
+    found = points.clone()
+    found[0, [13, 14]] = points[0, [14, 13]]
+    found[1, 16] = points[1, 15]
+    found[0, 9] = -500.0
+    share = pck_either_way(found + 1.0, points, known, torch.tensor([100.0, 100.0]))
+    assert float(share) == 7 / 8
+    assert float(pck_either_way(found + 8.0, points, known, torch.tensor([100.0, 100.0]))) == 0
+    assert float(pck_either_way(found + 8.0, points, known, torch.tensor([100.0, 200.0]))) == 3 / 8
 
 
 class Channels(nn.Module):
