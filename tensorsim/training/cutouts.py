@@ -138,7 +138,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     ``cutouts.json`` beside them tells number and seed. A folder of shards without one is taken as it is.
 
     Args:
-        count: number of people, at least 25.
+        count: number of people, at least 13.
         seed: the same seed gives the same people.
         out: folder, made if it is not there.
         quiet: no progress bar.
@@ -151,7 +151,10 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     """
     from tqdm import tqdm
 
-    poses = torch.cat([sample_poses(count - count // 2, seed), everyday_poses(count // 2, seed)])
+    near_floor = max(min(count // 2, count - 13), 0)  # of few people, each family is drawn once
+    poses = sample_poses(count - near_floor, seed)
+    if near_floor:
+        poses = torch.cat([poses, everyday_poses(near_floor, seed)])
     poses = poses[torch.randperm(count, generator=torch.Generator().manual_seed(seed))]
     folder = Path(out)
     settings = {"people": count, "seed": seed}

@@ -41,8 +41,8 @@ def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert len(rows) == 1 + len(held_out)
     for row, (name, count) in zip(rows[1:], held_out.items(), strict=True):
         assert row.startswith(f"{name}, held out   ")
-        assert int(row.split()[-6]) == count
-        assert all(0 <= float(figure) <= 1 for figure in row.split()[-5:])
+        assert int(row.split()[-7]) == count
+        assert all(0 <= float(figure) <= 1 for figure in row.split()[-6:])
     # Training goes on from those weights.
     more = TrainPose(
         data,
