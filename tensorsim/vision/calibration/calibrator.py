@@ -97,7 +97,7 @@ class CameraCalibrator(nn.Module):
 
     People are upright bodies of known or typical height on a level floor (see
     :mod:`tensorsim.vision.calibration.camera_fit`). Where they tell little, the estimate stays near what is assumed
-    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 20
+    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15
     degrees); somebody who walks through the scene tells everything. The height of the camera goes with that of the
     people. However long somebody stays at one place, that is one observation: errors of key points there do not average
     out.
@@ -148,7 +148,7 @@ class CameraCalibrator(nn.Module):
         self.smoothing_s = 0.15
         self.path = 0.5  # body heights in the image after which somebody is seen anew
         mean = [0.0, 0.0, math.log(1.5), 60 * degree]
-        deviation = [20 * degree, 3 * degree, 0.45, 20 * degree]
+        deviation = [20 * degree, 3 * degree, 0.45, 15 * degree]
         self.register_buffer("standing", torch.tensor(STANDING, dtype=torch.float64), persistent=False)
         self.register_buffer("walking", torch.tensor(WALKING, dtype=torch.float64), persistent=False)
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float64), persistent=False)
