@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import coco_to_body
-from tensorsim.vision.lifting.metric_pose import MetricPose, lowered, lowest_ankle
+from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside, lowered, lowest_ankle
 from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict, kalman_update
 
 #: Variance of a position of which nothing is known, in variances of a measurement.
@@ -121,7 +121,7 @@ class CausalPose(nn.Module):
         whole = usable & (reliable.sum(dim=-1) >= self.metric_pose.whole_body_joints)
         whole = whole & (lifted.distance[:, 0] < self.metric_pose.poor_fit)
         first = whole & (state.size.p00[:, 0] >= self.unknown)
-        cut_off = (boxes[:, :1] <= 1.0) | (boxes[:, 2:3] >= width - 2.0)
+        cut_off = cut_off_beside(boxes, width)[:, None]
         size = self._filtered(
             state.size,
             lifted.scale.clamp(min=1.0).log(),

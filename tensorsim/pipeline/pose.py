@@ -13,7 +13,7 @@ from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, 
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
-from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps
 from tensorsim.vision.smoothing.even_time import to_even_time
@@ -335,8 +335,7 @@ class VideoToPose(nn.Module):
             lifted = self.lifter(body, body_scores)
             noise = keypoint_noise(body_scores, lifted.scale)
         if self.asks_for_edges:
-            # The box of somebody who enters reaches the edge before the network places a joint there.
-            cut_off = (tracks.boxes[..., 0] <= 1.0) | (tracks.boxes[..., 2] >= width - 2.0)
+            cut_off = cut_off_beside(tracks.boxes, width)
             joints, seen = self.metric_pose(
                 body, body_scores, lifted, usable, height, width, fps, None, cut_off
             )

@@ -23,7 +23,7 @@ from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.geometry.camera import camera_to_world
-from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.motion.pose_sampler import FAMILIES, sample_poses
 from tensorsim.render.renderer import PersonRenderer
 from tensorsim.training.pose_pool import everyday_poses
 
@@ -151,7 +151,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     """
     from tqdm import tqdm
 
-    near_floor = max(min(count // 2, count - 13), 0)  # of few people, each family is drawn once
+    near_floor = max(min(count // 2, count - FAMILIES), 0)  # of few people, each family is drawn once
     poses = sample_poses(count - near_floor, seed)
     if near_floor:
         poses = torch.cat([poses, everyday_poses(near_floor, seed)])

@@ -329,6 +329,14 @@ class MetricPose(nn.Module):
         return fused, whole | (seen.any(dim=-1) & (share > 0.5)), stands, precision
 
 
+def cut_off_beside(boxes: Tensor, width: int) -> Tensor:
+    """Whether boxes (..., 4), ``xyxy`` pixels, reach the left or right edge of a picture of this width, (...) bool.
+
+    The box of somebody who enters reaches the edge before the network places a joint there.
+    """
+    return (boxes[..., 0] <= 1.0) | (boxes[..., 2] >= width - 2.0)
+
+
 def _check(
     keypoints: Tensor,
     scores: Tensor,
