@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tensorsim.body.proportions import NOSE_FORWARD, NOSE_UP, SHANK, THIGH, TRUNK
+from tensorsim.body.proportions import NOSE_FORWARD, NOSE_UP
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
 from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, check_tensor
 
@@ -33,13 +33,13 @@ def body_height(joints: Tensor) -> Tensor:
     Returns:
         (...) in the same unit.
     """
-
-    def bone(a: str, b: str) -> Tensor:
-        return (joints[..., JOINTS.index(a), :] - joints[..., JOINTS.index(b), :]).norm(dim=-1)
-
-    legs = sum(bone(f"{s}_hip", f"{s}_knee") + bone(f"{s}_knee", f"{s}_ankle") for s in ("right", "left"))
-    trunk = (joints[..., JOINTS.index("neck"), :] - mid_hips(joints)).norm(dim=-1)
-    return (0.5 * legs + trunk) / (SHANK + THIGH + TRUNK)
+    upper = joints[..., 8:13:3, :] - joints[..., 9:14:3, :]  # hips to knees, right and left
+    lower = joints[..., 9:14:3, :] - joints[..., 10:14:3, :]
+    legs = 0.5 * (torch.linalg.vector_norm(upper, dim=-1) + torch.linalg.vector_norm(lower, dim=-1)).sum(
+        dim=-1
+    )
+    trunk = torch.linalg.vector_norm(joints[..., 1, :] - mid_hips(joints), dim=-1)
+    return (legs + trunk) / 0.779  # SHANK + THIGH + TRUNK of the proportions, as a literal for TorchScript
 
 
 def mirror(joints: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
-"""``tensorsim train lifter``: train the temporal lifter on motion before random cameras."""
+"""``tensorsim train lifter``: train a lifter on motion before random cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
@@ -10,9 +11,10 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class TrainLifter(TrainOptions):
-    """Train the lifter; run again with the same arguments, it goes on where it stopped.
+    """Train a lifter; run again with the same arguments, it goes on where it stopped.
 
     Attributes:
+        network: TemporalLifter, or VideoPose3D with a window of 27 frames.
         motion: motion capture files (.npz, .bvh) beside the generated motion; every second sequence is held out.
         motions: motions of all kinds; they are made first, in OUT/motion.pt.
         steps: optimiser steps.
@@ -23,6 +25,7 @@ class TrainLifter(TrainOptions):
         motion_seed: of the motions.
     """
 
+    network: Literal["temporal", "videopose3d"] = "temporal"
     motion: tuple[Path, ...] = ()
     motions: int = 12_000
     steps: int = 7000
@@ -36,9 +39,10 @@ class TrainLifter(TrainOptions):
         """Do it."""
         import torch
 
-        from tensorsim.training.lifter import LifterRecipe
+        from tensorsim.training.lifter import LifterRecipe, VideoPoseRecipe
         from tensorsim.training.lifter_motion import FRAMES, build_pool
         from tensorsim.vision.lifting.temporal_net import TemporalNet
+        from tensorsim.vision.lifting.videopose3d import VideoPose3D
 
         check_seed(self.motion_seed, "--motion-seed")
         if self.motions < 100:
@@ -54,7 +58,8 @@ class TrainLifter(TrainOptions):
             validate_every=min(500, self.steps),
         )
         torch.manual_seed(self.seed)
-        net = TemporalNet(self.channels)
+        video_pose = self.network == "videopose3d"
+        net = VideoPose3D((3, 3, 3), self.channels) if video_pose else TemporalNet(self.channels)
         self.begin(net)
         pool = build_pool(
             self.out / "motion.pt", self.motions, self.motion, self.motion_seed, quiet=self.quiet
@@ -67,4 +72,5 @@ class TrainLifter(TrainOptions):
             True,
             self.quiet,
         )
-        self.train(LifterRecipe(net, pool, judged, self.frames, self.learning_rate, self.seed), loop)
+        recipe = VideoPoseRecipe if video_pose else LifterRecipe
+        self.train(recipe(net, pool, judged, self.frames, self.learning_rate, self.seed), loop)

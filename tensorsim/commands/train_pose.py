@@ -1,9 +1,9 @@
-"""``tensorsim train pose``: train the small pose network on labelled and rendered people."""
+"""``tensorsim train pose``: train a small pose network on labelled and rendered people."""
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tensorsim.commands.training import PeopleOptions
 from tensorsim.exceptions import TensorsimError, check_positive
@@ -14,25 +14,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainPose(PeopleOptions):
-    """Train HRNet, small, on tar shards of people; run again with the same arguments, it goes on where it stopped.
+    """Train a small HRNet or CPM on tar shards of people; run again with the same arguments, it goes on where it was.
 
     Attributes:
         data: folder of the shards coco_small, coco_more, coco_extra, films_teacher, lspet and, for rendered people,
             backgrounds (NAME-*.tar).
+        network: HRNet, or CPM with three stages.
         size: height and width of the crops.
         first_size: height and width of smaller crops to begin with.
         first_steps: steps with those.
-        width: channels of the branch of highest resolution.
+        width: channels of HRNet's branch of highest resolution (24 if not given), or of most layers of CPM (32).
         steps: optimiser steps.
         batch: crops per step.
         learning_rate: highest learning rate.
     """
 
     data: Path
+    network: Literal["hrnet", "cpm"] = "hrnet"
     size: tuple[int, int] = (128, 96)
     first_size: tuple[int, int] = (96, 64)
     first_steps: int = 6000
-    width: int = 24
+    width: int | None = None
     steps: int = 12000
     batch: int = 32
     learning_rate: float = 2e-3
@@ -41,7 +43,7 @@ class TrainPose(PeopleOptions):
         """Do it."""
         import torch
 
-        from tensorsim.training.pose import PoseRecipe, held_out_people, read_people
+        from tensorsim.training.pose import PoseRecipe, TrainedCPM, held_out_people, read_people
         from tensorsim.training.pose_data import RenderedPeople
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
@@ -51,7 +53,12 @@ class TrainPose(PeopleOptions):
             raise TensorsimError(f"--first-size: got {self.first_size}, expected (H, W), multiples of 32")
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=500)
         torch.manual_seed(self.seed)
-        net = HRNet(HRNetConfig(self.width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)
+        net: HRNet | TrainedCPM
+        if self.network == "cpm":
+            net = TrainedCPM(3, self.size, self.width or 32)
+        else:
+            small = HRNetConfig(self.width or 24, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32)
+            net = HRNet(small, self.size)
         self.begin(net)
         persons = read_people(self.data)
         cutouts = self.rendered_people()
@@ -66,6 +73,7 @@ class TrainPose(PeopleOptions):
             rendered,
             seed=self.seed,
             learning_rate=self.learning_rate,
+            sigma=1.0 if self.network == "cpm" else 1.5,
             first_size=self.first_size,
             first_samples=self.first_steps * self.batch,
         )

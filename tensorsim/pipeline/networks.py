@@ -1,7 +1,6 @@
 """Networks of files and names as the pipeline takes them."""
 
 import os
-from pathlib import Path
 
 from torch import nn
 
@@ -55,14 +54,18 @@ def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: boo
     Raises:
         TensorsimError: no such file or name, or weights of another network.
     """
-    if source is not None and Path(source).suffix == ".onnx":
-        if has_simcc(source):
-            return RtmPose(source, flip_test)
-        network: nn.Module = OnnxHeatmaps(source)
-    elif source is not None and "cpm" in Path(source).name:
-        network = CPM.from_pretrained(source)
+    from tensorsim.registry import locate
+    from tensorsim.weights import read_metadata
+
+    path = locate(source, "HRNet", "CPM")
+    if path.suffix == ".onnx":
+        if has_simcc(path):
+            return RtmPose(path, flip_test)
+        network: nn.Module = OnnxHeatmaps(path)
+    elif "cpm" in path.name or read_metadata(path).get("network") == "CPM":
+        network = CPM.from_pretrained(path)
     else:
-        network = HRNet.from_pretrained(source)
+        network = HRNet.from_pretrained(path)
     return TopDownPose(network, flip_test=flip_test, stand_up=True)
 
 

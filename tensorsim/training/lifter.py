@@ -1,4 +1,4 @@
-"""The recipe of the lifter: windows of motion before random cameras, seen through errors, to joints."""
+"""The recipes of the lifters: windows of motion before random cameras, seen through errors, to joints."""
 
 import math
 from typing import Any
@@ -6,12 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import BONES, mid_hips
+from tensorsim.body.skeleton import BONES, coco_to_body, mid_hips
 from tensorsim.training.lifter_motion import MotionPool
-from tensorsim.training.lifter_views import Windows, film
+from tensorsim.training.lifter_views import THRESHOLD, Windows, film
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.vision.lifting.sight import Sight
 from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
+from tensorsim.vision.lifting.videopose3d import body_to_h36m, h36m_to_body
+from tensorsim.vision.smoothing.along_time import nearest_valid
 
 #: Weights of the terms of the loss.
 _VELOCITY, _BONES, _RANGE, _SPREAD = 0.12, 0.3, 0.5, 0.03
@@ -103,7 +105,7 @@ class LifterRecipe(Recipe):
 
     def __init__(
         self,
-        net: TemporalNet,
+        net: nn.Module,
         pool: MotionPool,
         held_out: MotionPool,
         frames: int = 64,
@@ -116,7 +118,8 @@ class LifterRecipe(Recipe):
             "seed": seed,
             "motions": len(pool.joints),
         }
-        super().__init__(net, settings, {"network": "TemporalLifter"})
+        network = "TemporalLifter" if isinstance(net, TemporalNet) else type(net).__name__
+        super().__init__(net, settings, {"network": network})
         self.pool, self.frames, self.seed = pool, frames, seed
         self.learning_rate = learning_rate
         self.judged = [film(held_out, 64, frames, torch.Generator().manual_seed(k)) for k in range(6)]
@@ -180,3 +183,47 @@ def _weight(window: Windows) -> Tensor:
     """Frames in which the person is followed count fully, gaps less; people beside the picture hardly."""
     count = (window.scores >= 0.3).sum(dim=-1) * window.valid
     return 0.05 + 0.25 * (count > 0) + 0.7 * (count >= 8)
+
+
+#: Of the bodies that VideoPose3D learns, in metres: its results are metric.
+_TALL_M = 1.75
+
+
+def picture_joints(window: Windows) -> Tensor:
+    """What VideoPose3D gets: (B, T, 17, 2) joints of Human3.6M, from the centre of the picture over half its width."""
+    joints, _ = coco_to_body(window.keypoints, window.scores, THRESHOLD)
+    source = nearest_valid(window.valid)[..., None, None].expand_as(joints)
+    centred = body_to_h36m(joints.gather(1, source)) - window.center[:, None, None]
+    return centred / (window.extent[:, None, None, :1] / 2)
+
+
+class VideoPoseRecipe(LifterRecipe):
+    """The same for :class:`~tensorsim.vision.VideoPose3D`: the mean error of its joints, as its authors train it."""
+
+    def collate(self, samples: list[dict[str, Any]]) -> Batch:
+        """As :meth:`LifterRecipe.collate`."""
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003_139 + int(samples[0]["index"]))
+        return self._batch(film(self.pool, len(samples), self.frames, generator))
+
+    def _batch(self, window: Windows) -> Batch:
+        from_camera = window.joints @ window.rotation[:, None]  # right, down, away
+        true = _TALL_M * _about_hips(from_camera)
+        return {"joints": picture_joints(window), "target": body_to_h36m(true), "weight": _weight(window)}
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Mean distance of the joints from the true ones, metres (MPJPE)."""
+        weight = batch["weight"] / batch["weight"].sum().clamp(min=1.0)
+        error = (net(batch["joints"]).float() - batch["target"]).square().sum(dim=-1)
+        return {"loss": (weight * (error + 1e-8).sqrt().mean(dim=-1)).sum()}
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Errors on held-out motion, in cm of a body of 1.75 m: of joints about the hips, and of depths alone."""
+        place = depth = 0.0
+        for window in self.judged:
+            batch = self._batch(window)
+            weight = batch["weight"] / batch["weight"].sum()
+            with torch.autocast("cpu", enabled=False), torch.no_grad():
+                error = _about_hips(h36m_to_body(net(batch["joints"]) - batch["target"]))
+            place += float((weight * error.norm(dim=-1).mean(dim=-1)).sum()) / len(self.judged)
+            depth += float((weight * error[..., 2].abs().mean(dim=-1)).sum()) / len(self.judged)
+        return {"score": -place, "joints_cm": 100 * place, "depth_cm": 100 * depth}

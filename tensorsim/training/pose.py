@@ -1,4 +1,4 @@
-"""The recipe of the pose network: HRNet on crops of labelled people and, if wanted, rendered ones.
+"""The recipe of the pose networks: HRNet or CPM on crops of labelled people and, if wanted, rendered ones.
 
 From few pictures and without weights from elsewhere, plain mean squared error on heat maps leads to maps that are
 zero everywhere. Here the foreground counts more, and the maps are compared as distributions over places as well,
@@ -33,10 +33,10 @@ from tensorsim.training.pose_data import (
 )
 from tensorsim.training.pose_metrics import evaluate_pose
 from tensorsim.training.shards import Shards, find_shards, read_coco_shards, split
+from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.topdown import MIRRORED
 
-STRIDE = 4  # crop pixels per heat-map pixel
 #: Of the pictures of LSPE, never trained on, see :func:`tensorsim.training.shards.split`.
 LSPET_HELD_OUT_PERCENT = 3
 
@@ -118,7 +118,14 @@ def heatmap_loss(
 
 
 def person_loss(
-    maps: Tensor, points: Tensor, known: Tensor, gone: Tensor, rivals: Tensor, sided: Tensor, sigma: float
+    maps: Tensor,
+    points: Tensor,
+    known: Tensor,
+    gone: Tensor,
+    rivals: Tensor,
+    sided: Tensor,
+    sigma: float,
+    stride: int = 4,
 ) -> Tensor:
     """Mean loss over the keypoints of each person that are known or gone (N,), zero where none is.
 
@@ -138,14 +145,15 @@ def person_loss(
         rivals: (N, M, 17, 2) crop pixels, keypoints of M others; far outside where there are none.
         sided: (N,) bool.
         sigma: of the targets, map pixels.
+        stride: crop pixels per map pixel.
     """
     size = (maps.shape[-2], maps.shape[-1])
     others = (
-        gaussian_maps(rivals / STRIDE, size, sigma).amax(1) if rivals.shape[1] else torch.zeros_like(maps)
+        gaussian_maps(rivals / stride, size, sigma).amax(1) if rivals.shape[1] else torch.zeros_like(maps)
     )
 
     def mean_loss(points: Tensor, known: Tensor, gone: Tensor) -> Tensor:
-        targets = gaussian_maps(points / STRIDE, size, sigma) * known[..., None, None]
+        targets = gaussian_maps(points / stride, size, sigma) * known[..., None, None]
         told = known | gone
         losses = heatmap_loss(maps, targets, torch.maximum(targets, others))
         return (losses * told).sum(-1) / told.sum(-1).clamp_min(1)
@@ -158,8 +166,17 @@ def person_loss(
     return torch.where(~sided & (exchanged < 0.5 * straight), exchanged, straight)
 
 
+class TrainedCPM(CPM):
+    """CPM that gives the maps of every stage in training, (S, N, 17, h, w), as each of them is supervised."""
+
+    def forward(self, crops: Tensor) -> Tensor:
+        """Maps of all stages in training, else those of the last one."""
+        stages = self.stages(crops)
+        return torch.stack(stages) if self.training else stages[-1]
+
+
 class PoseRecipe(Recipe):
-    """Train :class:`~tensorsim.vision.HRNet` on people from four sources.
+    """Train :class:`~tensorsim.vision.HRNet` or :class:`~tensorsim.vision.CPM` on people from four sources.
 
     Args:
         net: the network, for crops of its ``input_size``.
@@ -180,7 +197,7 @@ class PoseRecipe(Recipe):
 
     def __init__(
         self,
-        net: HRNet,
+        net: HRNet | TrainedCPM,
         persons: PosePeople,
         validation: dict[str, list[Person]],
         rendered: RenderedPeople | None = None,
@@ -207,7 +224,9 @@ class PoseRecipe(Recipe):
             "shares": list(shares),
             "augmentation": asdict(self.augmentation),
         }
-        super().__init__(net, settings, {"input_size": f"{height}x{width}"})
+        network = "CPM" if isinstance(net, CPM) else "HRNet"
+        super().__init__(net, settings, {"network": network, "input_size": f"{height}x{width}"})
+        self.stride = 8 if isinstance(net, CPM) else 4
         self.input_size, self.first_size, self.first_samples = net.input_size, first_size, first_samples
         self.rendered, self.validation = rendered, validation
         self.seed, self.learning_rate, self.sigma = seed, learning_rate, sigma
@@ -249,12 +268,15 @@ class PoseRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Mean over the batch of :func:`person_loss`."""
+        """Mean over the batch, and over the stages of CPM, of :func:`person_loss`."""
         crops = batch["crops"].float() / 255
         maps = net(crops.contiguous(memory_format=torch.channels_last)).float()
-        points, known, gone = batch["points"], batch["known"], batch["gone"]
-        losses = person_loss(maps, points, known, gone, batch["rivals"], batch["sided"], self.sigma)
-        return {"loss": losses.mean()}
+        labels = {name: batch[name] for name in ("points", "known", "gone", "rivals", "sided")}
+        stages = maps if maps.dim() == 5 else maps[None]
+        losses = [
+            person_loss(of_stage, **labels, sigma=self.sigma, stride=self.stride) for of_stage in stages
+        ]
+        return {"loss": torch.stack(losses).mean()}
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; no decay of biases and normalisation."""

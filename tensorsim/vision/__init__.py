@@ -8,7 +8,7 @@ from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
-from tensorsim.vision.lifting.videopose3d import VideoPose3D
+from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
@@ -36,5 +36,6 @@ __all__ = [
     "TemporalLifter",
     "TopDownPose",
     "VideoPose3D",
+    "VideoPoseLifter",
     "coco_to_body",
 ]

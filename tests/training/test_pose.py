@@ -10,7 +10,15 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.loop import LoopConfig, fit
-from tensorsim.training.pose import PosePeople, PoseRecipe, covered, gaussian_maps, heatmap_loss, person_loss
+from tensorsim.training.pose import (
+    PosePeople,
+    PoseRecipe,
+    TrainedCPM,
+    covered,
+    gaussian_maps,
+    heatmap_loss,
+    person_loss,
+)
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
 from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck, pck_either_way
 from tensorsim.training.shards import Sample
@@ -254,6 +262,31 @@ def test_loss_of_a_batch_reaches_the_network(tmp_path: Path) -> None:
     batch = some.collate([some.sample(n) for n in range(4)])
     some.loss(some.net, batch)["loss"].backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in some.net.parameters())
+
+
+def test_every_stage_of_cpm_learns(tmp_path: Path) -> None:
+    """The loss is the mean of those of the stages, on maps of an eighth of the size of the crops."""
+    some = recipe(tmp_path)
+    net = TrainedCPM(3, (64, 64), width=8)
+    of_cpm = PoseRecipe(net, PosePeople(some.groups[0], [], []), {})  # type: ignore[arg-type]
+    batch = of_cpm.collate([of_cpm.sample(n) for n in range(2)])
+    crops = batch["crops"].float() / 255
+    stages = net.train()(crops)
+    assert stages.shape == (3, 2, 17, 8, 8)
+    known, gone = batch["known"][..., None, None], batch["gone"][..., None, None]
+    expected = 0.0
+    for maps in stages:
+        targets = gaussian_maps(batch["points"] / 8, (8, 8), 1.5) * known
+        told = (known | gone)[..., 0, 0]
+        rivals = batch["rivals"]
+        others = gaussian_maps(rivals / 8, (8, 8), 1.5).amax(1) if rivals.shape[1] else 0 * targets
+        losses = heatmap_loss(maps, targets, torch.maximum(targets, others))
+        expected += ((losses * told).sum(-1) / told.sum(-1).clamp_min(1)).mean().item() / 3
+    loss = of_cpm.loss(net, batch)["loss"]
+    assert loss.item() == pytest.approx(expected, rel=1e-4)
+    loss.backward()
+    assert all(p.grad is not None and float(p.grad.abs().max()) > 0 for p in net.parameters())
+    assert torch.equal(net.eval()(crops), net.stages(crops)[-1])
 
 
 def test_eight_crops_are_learnt(tmp_path: Path) -> None:

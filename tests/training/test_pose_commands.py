@@ -27,9 +27,11 @@ def data(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_train_then_evaluate(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("network", ["hrnet", "cpm"])
+def test_train_then_evaluate(network: str, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = data / "out"
     options = {"cutouts": data, "rendered": 13, "size": (64, 64), "first_size": (32, 32), "width": 4}
+    options["network"] = network
     TrainPose(data, out=out, steps=2, first_steps=1, batch=2, workers=0, quiet=True, **options).run()  # type: ignore[arg-type]
     weights = out / "best.safetensors"
     assert str(weights) in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""VideoPose3D: tracks of 2D joints to 3D joints by convolutions along time.
+"""VideoPose3D: tracks of 2D joints to 3D joints by convolutions along time, and as a lifter of the pipeline.
 
 D. Pavllo, C. Feichtenhofer, D. Grangier, M. Auli, "3D human pose estimation in video with temporal convolutions and
 semi-supervised training", CVPR 2019. Names are those of MMPose, whose checkpoints load key by key. The original
@@ -8,17 +8,23 @@ simulator compares its matching with such a network (TCN).
 import os
 import re
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.errors import (
     TensorsimError,
     check_finite,
     check_floating,
     check_min_rank,
     check_not_empty,
+    check_points,
     check_size,
 )
+from tensorsim.types import Lifted
+from tensorsim.vision.lifting.lifter import fit_poses
+from tensorsim.vision.smoothing.along_time import nearest_valid
 
 #: Joints of Human3.6M in its order, those of the published networks in and out.
 H36M_JOINTS = (
@@ -143,10 +149,11 @@ class VideoPose3D(nn.Module):
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str] | None = None) -> "VideoPose3D":
-        """Load a Human3.6M checkpoint of MMPose (their 2021 and later names), in evaluation mode.
+        """Load our own weights or a Human3.6M checkpoint of MMPose (their 2021 and later names), in evaluation mode.
 
         Args:
-            source: a path of a ``.pth`` or ``.safetensors``, or a name that ``tensorsim models list`` prints.
+            source: a path of a ``.pth`` or ``.safetensors``, a name that ``tensorsim models list`` prints, or None for
+                the shipped weights.
 
         Raises:
             TensorsimError: an unknown name, weights that cannot be fetched, a file that cannot be read or trusted, or
@@ -170,3 +177,77 @@ class VideoPose3D(nn.Module):
         network = cls(tuple(kernels), state["backbone.expand_conv.conv.weight"].shape[0])
         load_strict(network, state, path)
         return network.eval()
+
+
+def body_to_h36m(joints: Tensor) -> Tensor:
+    """The 17 joints of Human3.6M from the 14 of ``tensorsim.JOINTS``: (..., 14, D) -> (..., 17, D).
+
+    The thorax is the middle of the shoulders; the spine is half-way between it and the pelvis, the neck half-way
+    between it and the head.
+    """
+    pelvis, thorax, head = mid_hips(joints)[..., None, :], joints[..., 1:2, :], joints[..., 0:1, :]
+    right_arm, left_arm = joints[..., 2:5, :], joints[..., 5:8, :]
+    right_leg, left_leg = joints[..., 8:11, :], joints[..., 11:14, :]
+    spine, neck = 0.5 * (pelvis + thorax), 0.5 * (thorax + head)
+    return torch.cat([pelvis, right_leg, left_leg, spine, thorax, neck, head, left_arm, right_arm], dim=-2)
+
+
+def h36m_to_body(joints: Tensor) -> Tensor:
+    """The 14 joints of ``tensorsim.JOINTS`` among the 17 of Human3.6M: (..., 17, D) -> (..., 14, D)."""
+    head, thorax = joints[..., 10:11, :], joints[..., 8:9, :]
+    right_arm, left_arm = joints[..., 14:17, :], joints[..., 11:14, :]
+    right_leg, left_leg = joints[..., 1:4, :], joints[..., 4:7, :]
+    return torch.cat([head, thorax, right_arm, left_arm, right_leg, left_leg], dim=-2)
+
+
+class VideoPoseLifter(nn.Module):
+    """:class:`VideoPose3D` in the place of :class:`~tensorsim.vision.NearestPoseLifter` (the TCN of the paper).
+
+    Args:
+        network: with its weights.
+        image_height, image_width: of the picture in pixels: the network takes coordinates about its centre.
+
+    Shape:
+        joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) -> :class:`tensorsim.types.Lifted`,
+        without a deviation. A frame with fewer than two weighted joints takes the nearest other frame; the network
+        knows no weights and sees hidden joints where they are given. Differentiable.
+
+    Raises:
+        TensorsimError: other shapes, NaN, or a picture without pixels.
+    """
+
+    def __init__(self, network: VideoPose3D, image_height: int, image_width: int) -> None:
+        super().__init__()
+        if image_height < 1 or image_width < 1:
+            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        self.network = network
+        self.image_height, self.image_width = image_height, image_width
+
+    def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
+        """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
+        check_points(keypoints, 3, 14, 2, "keypoints", "(..., T, 14, 2) joints in pixels")
+        if weights.shape != keypoints.shape[:-1]:
+            raise TensorsimError(
+                f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
+            )
+        check_not_empty(keypoints, "keypoints")
+        check_finite(keypoints, "keypoints")
+        check_finite(weights, "weights")
+        source = nearest_valid((weights > 0).sum(dim=-1) >= 2)
+        keypoints = keypoints.gather(-3, source[..., None, None].expand_as(keypoints))
+        weights = weights.gather(-2, source[..., None].expand_as(weights)).to(keypoints.dtype)
+
+        joints = body_to_h36m(keypoints)
+        u = (joints[..., 0] - (self.image_width - 1) / 2) / (self.image_width / 2)
+        v = (joints[..., 1] - (self.image_height - 1) / 2) / (self.image_width / 2)
+        right_down_away = h36m_to_body(self.network(torch.stack([u, v], dim=-1)))
+        # Axes of the pool of poses: x right, y away, z up; in heights of this body about the hips.
+        pose = torch.stack(
+            [right_down_away[..., 0], right_down_away[..., 2], -right_down_away[..., 1]], dim=-1
+        )
+        pose = pose - mid_hips(pose)[..., None, :]
+        pose = pose / body_height(pose).clamp(min=1e-3)[..., None, None]
+        scale, placed, distance = fit_poses(keypoints, weights, pose)
+        depth = pose[..., 1]
+        none = torch.zeros_like(distance, dtype=torch.int64)
+        return Lifted(depth, scale, placed, none, distance, torch.zeros_like(depth))

@@ -16,8 +16,6 @@ from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.errors import TensorsimError, check_floating, check_rank, check_size
 from tensorsim.vision.pose2d.hrnet import IMAGENET_MEAN, IMAGENET_STD, normalise
 
-_FEATURES = 128
-
 
 class _ConvBN(nn.Module):
     """Convolution without bias that keeps the size, normalisation, ReLU."""
@@ -42,23 +40,21 @@ class _Maps(nn.Module):
         return self.conv(x)
 
 
-def _trunk() -> list[nn.Module]:
-    """Three 9x9 convolutions, each at half the resolution of the one before: (N, 3, H, W) -> (N, 128, H/8, W/8)."""
+def _trunk(width: int) -> list[nn.Module]:
+    """Three 9x9 convolutions, each at half the resolution of the one before: (N, 3, H, W) -> (N, width, H/8, W/8)."""
     layers: list[nn.Module] = []
-    for channels in (3, _FEATURES, _FEATURES):
-        layers += [_ConvBN(channels, _FEATURES, 9), nn.MaxPool2d(3, stride=2, padding=1)]
+    for channels in (3, width, width):
+        layers += [_ConvBN(channels, width, 9), nn.MaxPool2d(3, stride=2, padding=1)]
     return layers
 
 
 class _Stage(nn.Module):
     """Three 11x11 convolutions over maps and features."""
 
-    def __init__(self, channels_in: int) -> None:
+    def __init__(self, channels_in: int, width: int) -> None:
         super().__init__()
         self.model = nn.Sequential(
-            _ConvBN(channels_in, _FEATURES, 11),
-            _ConvBN(_FEATURES, _FEATURES, 11),
-            _ConvBN(_FEATURES, _FEATURES, 11),
+            _ConvBN(channels_in, width, 11), _ConvBN(width, width, 11), _ConvBN(width, width, 11)
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -66,18 +62,21 @@ class _Stage(nn.Module):
 
 
 class _Backbone(nn.Module):
-    def __init__(self, maps: int, stages: int, features: int) -> None:
+    def __init__(self, maps: int, stages: int, width: int) -> None:
         super().__init__()
+        narrow, wide = width // 4, 4 * width
         self.stem = nn.Sequential(
-            *_trunk(), _ConvBN(_FEATURES, 32, 5), _ConvBN(32, 512, 9), _ConvBN(512, 512, 1), _Maps(512, maps)
+            *_trunk(width),
+            _ConvBN(width, narrow, 5),
+            _ConvBN(narrow, wide, 9),
+            _ConvBN(wide, wide, 1),
+            _Maps(wide, maps),
         )
-        self.middle = nn.Sequential(*_trunk())
-        self.cpm_stages = nn.ModuleList(_Stage(maps + features) for _ in range(stages - 1))
-        self.middle_conv = nn.ModuleList(
-            nn.Sequential(_ConvBN(_FEATURES, features, 5)) for _ in range(stages - 1)
-        )
+        self.middle = nn.Sequential(*_trunk(width))
+        self.cpm_stages = nn.ModuleList(_Stage(maps + narrow, width) for _ in range(stages - 1))
+        self.middle_conv = nn.ModuleList(nn.Sequential(_ConvBN(width, narrow, 5)) for _ in range(stages - 1))
         self.out_convs = nn.ModuleList(
-            nn.Sequential(_ConvBN(_FEATURES, _FEATURES, 1), _Maps(_FEATURES, maps)) for _ in range(stages - 1)
+            nn.Sequential(_ConvBN(width, width, 1), _Maps(width, maps)) for _ in range(stages - 1)
         )
 
     def forward(self, x: Tensor) -> list[Tensor]:
@@ -99,23 +98,26 @@ class CPM(nn.Module):
     Args:
         stages: number of stages, the first estimate included.
         input_size: (H, W) of the crops that its weights are meant for; :class:`TopDownPose` crops to it.
+        width: channels of most layers, a multiple of 4; 128 in the published network.
 
     Raises:
-        TensorsimError: fewer than one stage; crops or an input size that are not multiples of 8, integer crops.
+        TensorsimError: fewer than one stage, another width; crops or sizes that are no multiples of 8; integers.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, stages: int = 6, input_size: tuple[int, int] = (256, 192)) -> None:
+    def __init__(self, stages: int = 6, input_size: tuple[int, int] = (256, 192), width: int = 128) -> None:
         super().__init__()
         if stages < 1:
             raise TensorsimError(f"CPM: got {stages} stages, expected at least 1")
         if len(input_size) != 2 or not all(n > 0 and n % 8 == 0 for n in input_size):
             raise TensorsimError(f"CPM: got input_size {input_size}, expected (H, W), multiples of 8")
+        if width < 4 or width % 4:
+            raise TensorsimError(f"CPM: got width {width}, expected a multiple of 4")
         self.input_size = (input_size[0], input_size[1])
         self.stride = 8
-        self.backbone = _Backbone(len(COCO_KEYPOINTS), stages, 32)
+        self.backbone = _Backbone(len(COCO_KEYPOINTS), stages, width)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
@@ -138,7 +140,7 @@ class CPM(nn.Module):
     def from_pretrained(
         cls, source: str | os.PathLike[str] | None = None, input_size: tuple[int, int] | None = None
     ) -> "CPM":
-        """Load a COCO checkpoint of MMPose, in evaluation mode.
+        """Load our own weights or a COCO checkpoint of MMPose, in evaluation mode.
 
         Args:
             source: a path of a ``.pth`` or ``.safetensors``, or a name that ``tensorsim models list`` prints.
@@ -157,6 +159,8 @@ class CPM(nn.Module):
         stages = 1 + len(
             {match[1] for key in state if (match := re.match(r"backbone\.cpm_stages\.(\d+)\.", key))}
         )
-        network = cls(stages, input_size or input_size_of(path) or (256, 192))
+        first = state.get("backbone.stem.0.conv.weight")
+        width = 128 if first is None else first.shape[0]
+        network = cls(stages, input_size or input_size_of(path) or (256, 192), width)
         load_strict(network, state, path)
         return network.eval()

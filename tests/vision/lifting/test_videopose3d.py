@@ -7,8 +7,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tensorsim.body.skeleton import body_height, mid_hips
+from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
-from tensorsim.vision.lifting.videopose3d import VideoPose3D
+from tensorsim.motion.pose_sampler import sample_poses
+from tensorsim.vision.lifting.videopose3d import (
+    H36M_JOINTS,
+    VideoPose3D,
+    VideoPoseLifter,
+    body_to_h36m,
+    h36m_to_body,
+)
 from tests.networks import settled
 from tests.stage import StageTester
 
@@ -98,3 +107,85 @@ def test_loads_both_namings(tmp_path: Path, head: str) -> None:
 def test_bad_kernels(kernels: tuple[int, ...]) -> None:
     with pytest.raises(TensorsimError, match="expected odd lengths"):
         VideoPose3D(kernels)
+
+
+class Told(VideoPose3D):
+    """Says the pose that it was told, metres about the pelvis in camera axes, whatever it sees."""
+
+    def __init__(self, pose: Tensor) -> None:
+        super().__init__((1,), channels=4)
+        self.register_buffer("pose", pose)
+
+    def forward(self, joints: Tensor) -> Tensor:
+        """The pose in every frame."""
+        self.seen = joints
+        return self.pose.to(joints.dtype).expand(*joints.shape[:-1], 3)
+
+
+class TestVideoPoseLifter(StageTester):
+    batched_arguments = (0, 1)
+
+    def make(self) -> nn.Module:
+        return VideoPoseLifter(make_network((3, 3)), 480, 640)
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        generator = torch.Generator().manual_seed(0)
+        keypoints = 100 + 200 * torch.rand(*batch, 5, 14, 2, generator=generator, dtype=dtype)
+        return keypoints, 0.2 + 0.8 * torch.rand(*batch, 5, 14, generator=generator, dtype=dtype)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        k, w = torch.zeros(4, 14, 2), torch.ones(4, 14)
+        return [
+            ((torch.zeros(4, 17, 2), torch.ones(4, 17)), r"expected \(\.\.\., T, 14, 2\)"),
+            ((k, torch.ones(4, 13)), r"weights: got shape \[4, 13\], expected \[4, 14\]"),
+            ((k * float("nan"), w), "keypoints: got NaN"),
+            ((k, w * float("nan")), "weights: got NaN"),
+            ((k[:0], w[:0]), "empty|expected"),
+        ]
+
+
+def test_joints_of_human36m_by_name() -> None:
+    """Each joint is where its name says, and the way back gives the same body."""
+    body = sample_poses(13, seed=4).float()
+    there = dict(zip(H36M_JOINTS, body_to_h36m(body).unbind(-2), strict=True))
+    here = dict(zip(JOINTS, body.unbind(-2), strict=True))
+    for side in ("right", "left"):
+        for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"):
+            assert torch.equal(there[f"{side}_{part}"], here[f"{side}_{part}"])
+    assert torch.equal(there["pelvis"], mid_hips(body))
+    torch.testing.assert_close(there["spine"], (mid_hips(body) + here["neck"]) / 2)
+    torch.testing.assert_close(there["neck"], (here["head"] + here["neck"]) / 2)
+    assert torch.equal(h36m_to_body(body_to_h36m(body)), body)
+
+
+def test_lifter_gives_the_depths_that_the_network_says() -> None:
+    """Of a pose that the network knows: depths in heights of the body, size and place in the picture."""
+    pose = sample_poses(13, seed=4)[0].float()  # x right, y away, z up, body heights
+    pose = pose - mid_hips(pose)
+    camera_axes = 1.82 * torch.stack([pose[:, 0], -pose[:, 2], pose[:, 1]], dim=-1)
+    network = Told(body_to_h36m(camera_axes))
+    seen = 150 * torch.stack([pose[:, 0], -pose[:, 2]], dim=-1) + torch.tensor([300.0, 220.0])
+    weights = torch.ones(2, 14)
+    weights[1, 2:] = 0.0  # enough for the place
+    lifted = VideoPoseLifter(network, 480, 640)(seen.expand(2, 14, 2), weights)
+    tall = float(body_height(pose))
+    torch.testing.assert_close(lifted.depth, (pose[:, 1] / tall).expand(2, 14))
+    torch.testing.assert_close(lifted.scale, torch.full((2,), 150 * tall))
+    torch.testing.assert_close(lifted.keypoints, seen.expand(2, 14, 2))
+    # Coordinates about the centre of the picture over half its width.
+    pelvis = (torch.tensor([300.0, 220.0]) - torch.tensor([319.5, 239.5])) / 320
+    torch.testing.assert_close(network.seen[0, 0], pelvis)
+
+
+def test_a_frame_without_joints_takes_the_nearest_other() -> None:
+    lifter = VideoPoseLifter(make_network((3,)), 480, 640)
+    keypoints, weights = 200 * torch.rand(6, 14, 2), torch.ones(6, 14)
+    weights[4] = 0.0
+    filled = keypoints.clone()
+    filled[4] = keypoints[3]
+    torch.testing.assert_close(lifter(keypoints, weights).depth, lifter(filled, torch.ones(6, 14)).depth)
+
+
+def test_a_picture_has_pixels() -> None:
+    with pytest.raises(TensorsimError, match="got 0 x 640 pixels"):
+        VideoPoseLifter(make_network((3,)), 0, 640)

@@ -9,8 +9,10 @@ from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 from tensorsim.errors import TensorsimError
+from tensorsim.pipeline import pretrained_pose
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.topdown import TopDownPose
+from tensorsim.weights import save_weights
 from tests.networks import settled
 from tests.stage import StageTester
 
@@ -110,6 +112,17 @@ def test_loads_its_file(tmp_path: Path) -> None:
         CPM.from_pretrained(path)
 
 
+def test_a_narrow_one_is_read_as_such(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    network = settled(CPM(2, (64, 48), width=8))
+    save_weights(network, tmp_path / "best.safetensors", {"network": "CPM", "input_size": "64x48"})
+    loaded = pretrained_pose(tmp_path / "best.safetensors", flip_test=False).network
+    assert isinstance(loaded, CPM)
+    assert loaded.input_size == (64, 48)
+    images = torch.rand(1, 3, 64, 48)
+    torch.testing.assert_close(loaded(images), network(images), atol=2e-3, rtol=0)  # the file is in float16
+
+
 def test_one_map_pixel_is_eight_crop_pixels() -> None:
     class Peak(CPM):
         """Says that every keypoint is at map pixel (3, 5)."""
@@ -126,7 +139,12 @@ def test_one_map_pixel_is_eight_crop_pixels() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"), [({"stages": 0}, "0 stages"), ({"input_size": (100, 64)}, "multiples of 8")]
+    ("arguments", "message"),
+    [
+        ({"stages": 0}, "0 stages"),
+        ({"input_size": (100, 64)}, "multiples of 8"),
+        ({"width": 6}, "multiple of 4"),
+    ],
 )
 def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
