@@ -42,6 +42,8 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
     "RTMDet": detector_logits,  # type: ignore[dict-item]
     "AcfDetector": tree_sums,  # type: ignore[dict-item]
+    "VideoPose3D": lambda network: network(2 * wave(9, 17, 2) - 1).flatten()[::19],
+    "CPM": lambda network: network(wave(1, 3, 64, 64)).flatten()[::43],
     "TemporalLifter": lambda lifter: lifter(*keypoints_to_lift(20)).joints.flatten()[::41],
 }
 
@@ -62,6 +64,10 @@ EXPECTED: dict[str, tuple[list[float], float]] = {
         [0.00249568, -0.897834, -0.0102167, -0.105965, -0.432464, 0.0658593],
         0.37101,
     ),  # TemporalLifter
+    "5f5f7cebae014e45": (
+        [0.00710835, -0.888452, 0.0814337, 0.185155, 0.0518079, -0.359967],
+        0.49223,
+    ),  # VideoPose3D
     "58e51ecca587dec2": ([-6.42517, -5.66322, -6.21195, -6.08765, -5.14814, -4.02888], 5.2342),  # AcfDetector
     "8ea31c49d3e407dc": (  # HRNet
         [-0.00193596, -0.00199509, -0.00161309, -0.00238228, -0.00231361, -0.00226974],

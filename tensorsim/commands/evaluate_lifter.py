@@ -1,4 +1,4 @@
-"""``tensorsim evaluate lifter``: how well both lifters lift people whom neither has seen."""
+"""``tensorsim evaluate lifter``: how well the lifters lift people whom none of them has seen."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class EvaluateLifter:
-    """Print errors of the temporal and the nearest lifter: from key points to smooth joints, camera and height known.
+    """Print errors of the three lifters: from key points to smooth joints, camera and height known.
 
     Generated people have other seeds than those of training; of motion capture, every second sequence was never
     trained on.
@@ -41,10 +41,12 @@ class EvaluateLifter:
         from tensorsim.training import lifter_scores as scores
         from tensorsim.training.lifter_motion import build_pool
         from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+        from tensorsim.vision.lifting.videopose3d import VideoPose3D
 
         lifters = {
             "temporal": scores.temporal(TemporalLifter.from_pretrained(self.weights)),
             "nearest": scores.nearest,
+            "videopose3d": scores.video_pose(VideoPose3D.from_pretrained()),
         }
         pool = build_pool(None, self.motions, self.motion, self.seed, held_out=True, quiet=self.quiet)
         rows = {"generated, errors": (("activities", "exercises"), True), "falls, errors": (("falls",), True)}

@@ -34,6 +34,8 @@ class ActivityRecognizer(nn.Module):
         class_names: of the network's outputs in their order; by default ``tensorsim.ACTIVITIES``.
         temperature: logits are divided by it for :meth:`probabilities` (Guo et al., "On calibration of modern neural
             networks", ICML 2017).
+        either_way: logits are the mean of those of the picture and of the one with approach and retreat exchanged, for
+            networks that learnt activities in every heading.
 
     Shapes: RadarMaps -> (..., classes). Differentiable by the maps.
 
@@ -42,8 +44,8 @@ class ActivityRecognizer(nn.Module):
         labels: the same as a :class:`LabelSet`.
 
     Raises:
-        TensorsimError: unknown inputs, a network with another number of input channels, or another number of
-            classes than names.
+        TensorsimError: unknown inputs, ``either_way`` with ``"merged"`` ones, a network with another number of input
+            channels, or another number of classes than names.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class ActivityRecognizer(nn.Module):
         range_db: float = 40.0,
         class_names: Sequence[str] | None = None,
         temperature: float = 1.0,
+        either_way: bool = False,
     ) -> None:
         super().__init__()
         check_positive(temperature, "ActivityRecognizer.temperature")
@@ -64,6 +67,11 @@ class ActivityRecognizer(nn.Module):
             raise TensorsimError(
                 f"ActivityRecognizer.inputs: got {inputs!r}, expected one of {', '.join(INPUTS)}"
             )
+        if either_way and inputs == "merged":
+            raise TensorsimError(
+                "ActivityRecognizer.either_way: got True with 'merged', ranges have no other way"
+            )
+        self.either_way = bool(either_way)
         channels = getattr(network, "in_channels", INPUTS[inputs])
         if channels != INPUTS[inputs]:
             raise TensorsimError(
@@ -87,7 +95,11 @@ class ActivityRecognizer(nn.Module):
 
     def forward(self, maps: RadarMaps) -> Tensor:
         """Logits (..., classes)."""
-        return self.network(self.picture(maps))
+        picture = self.picture(maps)
+        logits: Tensor = self.network(picture)
+        if self.either_way:
+            logits = 0.5 * (logits + self.network(picture.flip(-2)))
+        return logits
 
     @torch.jit.export
     def probabilities(self, maps: RadarMaps) -> Tensor:
@@ -138,6 +150,7 @@ class ActivityRecognizer(nn.Module):
                 "range_db": repr(self.range_db),
                 "class_names": labels.to_text(),
                 "temperature": repr(self.temperature),
+                "either_way": str(int(self.either_way)),
             },
         )
 
@@ -174,4 +187,5 @@ class ActivityRecognizer(nn.Module):
             float(stated.get("range_db", 40.0)),
             None if names is None else LabelSet.from_text(names).names,
             float(stated.get("temperature", 1.0)),
+            stated.get("either_way", "0") == "1",
         ).eval()

@@ -135,6 +135,7 @@ class EverydayRecipe(Recipe):
             "size": str(self.size),
             "speed_m_s": str(store.settings.speed_m_s),
             "range_db": str(RANGE_DB),
+            "either_way": "1",
         }
         super().__init__(net, settings, metadata)
         some = torch.stack([self.sample(index)["picture"] for index in range(200)])
@@ -186,12 +187,16 @@ class EverydayRecipe(Recipe):
 
     @torch.no_grad()
     def judged(self, net: nn.Module) -> tuple[Tensor, Tensor]:
-        """Logits (N, classes) and labels (N,) of the held-out clips, as they are, clip by clip in both scenes."""
+        """Logits (N, classes) and labels (N,) of the held-out clips, as they are, clip by clip in both scenes.
+
+        Logits are the mean over both ways round, as :class:`~tensorsim.recognition.ActivityRecognizer` takes it.
+        """
         pictures = torch.stack(
             [self._input(self.store.picture(clip, scene)) for clip, scene in self.validation.tolist()]
         )
         like = next(net.parameters())
-        logits = [net(part.to(like)).float().cpu() for part in pictures.split(64)]
+        both = [(part.to(like), part.to(like).flip(-2)) for part in pictures.split(64)]
+        logits = [0.5 * (net(part) + net(other)).float().cpu() for part, other in both]
         return torch.cat(logits), self.store.activity[self.validation[:, 0]]
 
     def validate(self, net: nn.Module) -> dict[str, float]:

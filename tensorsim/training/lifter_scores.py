@@ -19,6 +19,7 @@ from tensorsim.types import Tracks
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
 
 #: Frames of a window, 3 s, and people before each camera at a time.
 FRAMES, PEOPLE = 90, 16
@@ -28,9 +29,6 @@ CAMERAS = ((0.0, 1.0, 60.0), (12.0, 1.8, 75.0), (28.0, 2.8, 60.0))
 ENDS = (4, 7, 10, 13)
 #: Peaks are these quantiles of the speed over time, and count from this speed on.
 _PEAK, _SLOWEST_M_S = 0.98, 0.5
-
-#: A camera and the heights of people to the lifter for them.
-MakeLifter = Callable[[CameraConfig, tuple[float, ...]], nn.Module]
 
 
 class LiftErrors(NamedTuple):
@@ -74,6 +72,10 @@ class Seen(NamedTuple):
     valid: Tensor
 
 
+#: People before a camera to the lifter for them.
+MakeLifter = Callable[[Seen], nn.Module]
+
+
 def camera_of(tilt_deg: float, height_m: float, fov_deg: float) -> CameraConfig:
     """A camera above the origin that looks down by ``tilt_deg``."""
     return CameraConfig(
@@ -110,16 +112,25 @@ def watched(folder: Path) -> Iterator[Seen]:
             )  # fmt: skip
 
 
-def nearest(camera: CameraConfig, heights: tuple[float, ...]) -> nn.Module:
+def nearest(seen: Seen) -> nn.Module:
     """Nearest matching."""
-    return NearestPoseLifter(pitch_rad=camera.pitch_rad).eval()
+    return NearestPoseLifter(pitch_rad=seen.camera.pitch_rad).eval()
 
 
 def temporal(lifter: TemporalLifter) -> MakeLifter:
     """The network of a lifter."""
 
-    def make(camera: CameraConfig, heights: tuple[float, ...]) -> nn.Module:
-        return lifter.seen_by(camera, heights)
+    def make(seen: Seen) -> nn.Module:
+        return lifter.seen_by(seen.camera, seen.heights)
+
+    return make
+
+
+def video_pose(network: VideoPose3D) -> MakeLifter:
+    """VideoPose3D as a lifter."""
+
+    def make(seen: Seen) -> nn.Module:
+        return VideoPoseLifter(network, seen.extent[1], seen.extent[0])
 
     return make
 
@@ -131,7 +142,7 @@ def lifted(make: MakeLifter, seen: Seen) -> tuple[Tensor, Tensor]:
     stage = VideoToPose(
         nothing,
         nothing,
-        lifter=make(seen.camera, seen.heights),
+        lifter=make(seen),
         metric_pose=MetricPose(seen.camera, seen.heights),
     ).eval()
     tracks = Tracks(seen.boxes[None], seen.valid[None], seen.valid[None])

@@ -88,10 +88,27 @@ def test_temperature_makes_less_sure_and_keeps_the_label() -> None:
 
 def test_the_temperature_is_stored_with_the_weights(tmp_path) -> None:
     network = ts.recognition.SPGNet(2)
-    own = ts.recognition.ActivityRecognizer(RADAR, network, size=32, class_names=("a", "b"), temperature=2.5)
+    own = ts.recognition.ActivityRecognizer(
+        RADAR, network, size=32, class_names=("a", "b"), temperature=2.5, either_way=True
+    )
     own.save_pretrained(tmp_path / "own.safetensors")
     again = ts.recognition.ActivityRecognizer.from_pretrained(RADAR, tmp_path / "own.safetensors")
     assert again.temperature == 2.5
+    assert again.either_way
+
+
+def test_the_other_way_round_counts_as_much() -> None:
+    """A mirror image has the mean of both logits, so what tells the ways apart is gone, and the file says so."""
+    scene = maps(64, 20)
+    plain = recognizer()(scene)
+    both = ts.recognition.ActivityRecognizer(
+        RADAR, BrightHalf(), size=64, class_names=("receding", "approaching"), either_way=True
+    )
+    turned = scene._replace(doppler_time=torch.cat([scene.doppler_time[:1], scene.doppler_time[1:].flip(0)]))
+    torch.testing.assert_close(both(scene), (plain + recognizer()(turned)) / 2, atol=1e-3, rtol=0)
+    torch.testing.assert_close(torch.jit.script(both)(scene), both(scene))
+    with pytest.raises(TensorsimError, match="ranges have no other way"):
+        ts.recognition.ActivityRecognizer(RADAR, BrightHalf(), "merged", either_way=True)
 
 
 def test_bad_input_is_refused() -> None:
