@@ -131,7 +131,10 @@ class LifterRecipe(Recipe):
     def collate(self, samples: list[dict[str, Any]]) -> Batch:
         """Film as many windows as there are samples; their first number is the seed."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003_139 + int(samples[0]["index"]))
-        window = film(self.pool, len(samples), self.frames, generator)
+        return self.batch_of(film(self.pool, len(samples), self.frames, generator))
+
+    def batch_of(self, window: Windows) -> Batch:
+        """What :meth:`loss` takes of filmed windows."""
         sight = window.sight()
         return {
             "sight": tuple(sight),
@@ -200,12 +203,8 @@ def picture_joints(window: Windows) -> Tensor:
 class VideoPoseRecipe(LifterRecipe):
     """The same for :class:`~tensorsim.vision.VideoPose3D`: the mean error of its joints, as its authors train it."""
 
-    def collate(self, samples: list[dict[str, Any]]) -> Batch:
-        """As :meth:`LifterRecipe.collate`."""
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003_139 + int(samples[0]["index"]))
-        return self._batch(film(self.pool, len(samples), self.frames, generator))
-
-    def _batch(self, window: Windows) -> Batch:
+    def batch_of(self, window: Windows) -> Batch:
+        """Joints in the picture and the true ones in camera axes, metres about the hips."""
         from_camera = window.joints @ window.rotation[:, None]  # right, down, away
         true = _TALL_M * _about_hips(from_camera)
         return {"joints": picture_joints(window), "target": body_to_h36m(true), "weight": _weight(window)}
@@ -220,7 +219,7 @@ class VideoPoseRecipe(LifterRecipe):
         """Errors on held-out motion, in cm of a body of 1.75 m: of joints about the hips, and of depths alone."""
         place = depth = 0.0
         for window in self.judged:
-            batch = self._batch(window)
+            batch = self.batch_of(window)
             weight = batch["weight"] / batch["weight"].sum()
             with torch.autocast("cpu", enabled=False), torch.no_grad():
                 error = _about_hips(h36m_to_body(net(batch["joints"]) - batch["target"]))

@@ -159,7 +159,7 @@ def test_videopose3d_sees_and_learns_the_same_body(pool: MotionPool) -> None:
     torch.manual_seed(0)
     net = VideoPose3D((3, 3), 64, dropout=0.0)
     recipe = VideoPoseRecipe(net, pool, pool, frames=24, learning_rate=4e-3)
-    batch = recipe._batch(window)
+    batch = recipe.batch_of(window)
     hips = (mid_hips(view.joints)[:, :, None] @ view.rotation[:, None])[..., 0, :]
     true = batch["target"] / 1.75 * height[:, None, None, None] + hips[:, :, None]  # metres from the camera
     seen = true[..., :2] / true[..., 2:] * view.focal[:, None, None, None] / 320
