@@ -154,7 +154,12 @@ def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.M
             truth = clip.joints(30.0).float()[None]
             there = torch.ones(1, truth.shape[1], dtype=torch.bool)
             nobody = (torch.zeros(0, truth.shape[1], 14, 3), there[:0])
-            self.chains = {"truth": lambda f, h: (truth, there), "nobody": lambda f, h: nobody}
+            running = truth + 0.4 * torch.arange(truth.shape[1])[:, None, None]  # at 12 m/s
+            self.chains = {
+                "truth": lambda f, h: (truth, there),
+                "nobody": lambda f, h: nobody,
+                "too fast": lambda f, h: (running, there),
+            }
 
     monkeypatch.setattr(video, "Watcher", Watcher)
     monkeypatch.setattr(video, "HEIGHT", 36)
@@ -164,7 +169,8 @@ def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.M
     rows = {row[0]: row for row in report.tables[0].rows}
     assert rows["truth"][3] > 40
     assert rows["nobody"][3] == pytest.approx(rows["empty map"][3])
-    assert "**TCN** (no weights)" in report.notes[1]
+    assert rows["too fast"][3] == pytest.approx(rows["empty map"][3])
+    assert "**TCN** (no weights)" in report.notes[2]
     errors = {row[0]: row for row in report.tables[-1].rows}
     assert errors["truth"][1] == pytest.approx(0.0, abs=1e-6)
     assert (errors["truth"][4], errors["nobody"][4]) == (1.0, 0.0)
