@@ -230,7 +230,8 @@ class VideoPoseLifter(nn.Module):
             raise TensorsimError(
                 f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
             )
-        check_not_empty(keypoints, "keypoints")
+        if keypoints.shape[-3] < 1:
+            raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
         check_finite(keypoints, "keypoints")
         check_finite(weights, "weights")
         source = nearest_valid((weights > 0).sum(dim=-1) >= 2)
@@ -240,7 +241,10 @@ class VideoPoseLifter(nn.Module):
         joints = body_to_h36m(keypoints)
         u = (joints[..., 0] - (self.image_width - 1) / 2) / (self.image_width / 2)
         v = (joints[..., 1] - (self.image_height - 1) / 2) / (self.image_width / 2)
-        right_down_away = h36m_to_body(self.network(torch.stack([u, v], dim=-1)))
+        found = torch.zeros(joints.shape[:-1] + (3,), dtype=joints.dtype, device=joints.device)  # noqa: RUF005  # as TorchScript has it
+        if joints.numel() > 0:  # the network refuses tracks of nobody
+            found = self.network(torch.stack([u, v], dim=-1))
+        right_down_away = h36m_to_body(found)
         # Axes of the pool of poses: x right, y away, z up; in heights of this body about the hips.
         pose = torch.stack(
             [right_down_away[..., 0], right_down_away[..., 2], -right_down_away[..., 1]], dim=-1

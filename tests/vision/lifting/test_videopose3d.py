@@ -140,8 +140,16 @@ class TestVideoPoseLifter(StageTester):
             ((k, torch.ones(4, 13)), r"weights: got shape \[4, 13\], expected \[4, 14\]"),
             ((k * float("nan"), w), "keypoints: got NaN"),
             ((k, w * float("nan")), "weights: got NaN"),
-            ((k[:0], w[:0]), "empty|expected"),
+            ((k[:0], w[:0]), "at least 1 frame"),
         ]
+
+
+def test_nobody_is_lifted() -> None:
+    lifted = VideoPoseLifter(make_network((3,)), 480, 640)(
+        torch.zeros(2, 0, 5, 14, 2), torch.zeros(2, 0, 5, 14)
+    )
+    assert lifted.depth.shape == (2, 0, 5, 14)
+    assert lifted.scale.shape == (2, 0, 5)
 
 
 def test_joints_of_human36m_by_name() -> None:
