@@ -237,7 +237,9 @@ class TemporalLifter(nn.Module):
         """Standing height of each track, (S,), of (..., P, T, N, D)."""
         people = like.shape[-4]
         person = torch.arange(people, device=like.device).clamp(max=self.heights.shape[0] - 1)
-        clips = like[..., 0, 0, 0, 0].numel()
+        clips = 1
+        for size in like.shape[:-4]:
+            clips *= size
         return self.heights[person].repeat(clips)
 
     def _focal_px(self, image_width: int) -> float:

@@ -91,3 +91,15 @@ def test_the_shipped_lifter_raises_arms_where_they_are() -> None:
     assert float((raised - 1.75 * (0.288 + 0.332 * 0.416)).abs().max()) < 0.2
     forward = found.joints[0, 15, [4, 7], 1].abs()  # about straight ahead or behind
     assert float(forward.min()) > 0.2
+
+
+def test_nobody_is_lifted() -> None:
+    """A film in which the tracker finds no one: joints of no person, in every layout of clips."""
+    lifter = TemporalLifter(TemporalNet(8)).eval()
+    for lead in ((0,), (2, 0)):
+        keypoints, scores = torch.zeros(*lead, 12, 17, 2), torch.zeros(*lead, 12, 17)
+        boxes, valid = torch.zeros(*lead, 12, 4), torch.zeros(*lead, 12, dtype=torch.bool)
+        found = lifter(keypoints, scores, boxes, valid, 360, 640, 30.0)
+        assert found.joints.shape == (*lead, 12, 14, 3)
+        placed = lifter.in_picture(found, keypoints[..., :14, :], scores[..., :14], 360, 640)
+        assert placed.depth.shape == (*lead, 12, 14)
