@@ -55,9 +55,10 @@ class TrainPose(PeopleOptions):
         torch.manual_seed(self.seed)
         net: HRNet | TrainedCPM
         if self.network == "cpm":
-            net = TrainedCPM(3, self.size, self.width or 32)
+            net = TrainedCPM(3, self.size, 32 if self.width is None else self.width)
         else:
-            small = HRNetConfig(self.width or 24, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32)
+            width = 24 if self.width is None else self.width
+            small = HRNetConfig(width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32)
             net = HRNet(small, self.size)
         self.begin(net)
         persons = read_people(self.data)
