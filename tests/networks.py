@@ -7,6 +7,7 @@ from torch import nn
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.skeleton import body_to_coco
+from tensorsim.training.loop import Batch, Recipe
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -24,6 +25,19 @@ def settled(network: Network) -> Network:
             ):
                 nn.init.uniform_(values, low, high, generator=generator)
     return network.eval()
+
+
+def terms_of_training(recipe: Recipe, batch: Batch, steps: int, term: str = "loss") -> list[float]:
+    """A term of the loss before each of so many steps on one batch; the recipe's network learns."""
+    optimiser = recipe.optimiser()
+    values = []
+    for _ in range(steps):
+        terms = recipe.loss(recipe.net, batch)
+        optimiser.zero_grad()
+        terms["loss"].backward()
+        optimiser.step()
+        values.append(float(terms[term].detach()))
+    return values
 
 
 def keypoints_to_lift(frames: int) -> tuple[Any, ...]:

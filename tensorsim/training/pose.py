@@ -226,7 +226,7 @@ class PoseRecipe(Recipe):
         }
         network = "CPM" if isinstance(net, CPM) else "HRNet"
         super().__init__(net, settings, {"network": network, "input_size": f"{height}x{width}"})
-        self.stride = 8 if isinstance(net, CPM) else 4
+        self.stride = getattr(net, "stride", 4)
         self.input_size, self.first_size, self.first_samples = net.input_size, first_size, first_samples
         self.rendered, self.validation = rendered, validation
         self.seed, self.learning_rate, self.sigma = seed, learning_rate, sigma

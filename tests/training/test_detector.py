@@ -27,6 +27,7 @@ from tensorsim.types import Detections, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.detection.rtmdet_layers import RTMDET_SIZES, RTMDetSize
 from tensorsim.weights import save_weights
+from tests.networks import terms_of_training
 from tests.training.tars import write_tar
 from tests.training.test_detector_data import cutouts, encoded, shard
 
@@ -48,14 +49,7 @@ def test_four_pictures_are_learnt(recipe: DetectorRecipe) -> None:
     samples = [recipe.sample(i) for i in range(4)]
     batch = recipe.collate(samples)
     assert int(batch["valid"].sum()) >= 4
-    net, optimiser = recipe.net, recipe.optimiser()
-    losses = []
-    for _ in range(60):
-        loss = recipe.loss(net, batch)["loss"]
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
+    losses = terms_of_training(recipe, batch, 60)
     assert losses[-1] < 0.5 * losses[0]
 
 

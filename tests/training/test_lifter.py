@@ -25,6 +25,7 @@ from tensorsim.training.lifter_views import Draw, before_camera, film, seen_in, 
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
+from tests.networks import terms_of_training
 
 
 @pytest.fixture(scope="module")
@@ -138,15 +139,7 @@ def test_learns(pool: MotionPool) -> None:
     torch.manual_seed(0)
     net = TemporalNet(32)
     recipe = LifterRecipe(net, pool, pool, frames=24, learning_rate=4e-3)
-    optimiser = recipe.optimiser()
-    batch = recipe.collate([{"index": k} for k in range(24)])
-    losses = []
-    for _ in range(40):
-        terms = recipe.loss(net, batch)
-        optimiser.zero_grad()
-        terms["loss"].backward()
-        optimiser.step()
-        losses.append(float(terms["depth"].detach()))
+    losses = terms_of_training(recipe, recipe.collate([{"index": k} for k in range(24)]), 40, "depth")
     assert losses[-1] < 0.5 * losses[0]
 
 
@@ -169,15 +162,7 @@ def test_videopose3d_sees_and_learns_the_same_body(pool: MotionPool) -> None:
     torch.testing.assert_close(
         picture_joints(window)[whole][:, limbs], seen[whole][:, limbs], atol=0.01, rtol=0
     )
-    optimiser = recipe.optimiser()
-    batch = recipe.collate([{"index": k} for k in range(24)])
-    losses = []
-    for _ in range(40):
-        loss = recipe.loss(net, batch)["loss"]
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
+    losses = terms_of_training(recipe, recipe.collate([{"index": k} for k in range(24)]), 40)
     assert losses[-1] < 0.5 * losses[0]
     assert set(recipe.validate(net.eval())) == {"score", "joints_cm", "depth_cm"}
 

@@ -41,6 +41,25 @@ def fit_poses(keypoints: Tensor, weights: Tensor, poses: Tensor) -> tuple[Tensor
     return scale, placed, distance
 
 
+def check_to_lift(keypoints: Tensor, weights: Tensor) -> None:
+    """Refuse joints (..., T, 14, 2) and weights (..., T, 14) that no lifter takes.
+
+    Raises:
+        TensorsimError: other shapes, NaN, negative weights, or no frames.
+    """
+    check_points(keypoints, 3, 14, 2, "keypoints", "(..., T, 14, 2) joints in pixels")
+    if weights.shape != keypoints.shape[:-1]:
+        raise TensorsimError(
+            f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
+        )
+    if keypoints.shape[-3] < 1:
+        raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
+    check_finite(keypoints, "keypoints")
+    check_finite(weights, "weights")
+    if not is_exporting() and bool((weights < 0).any()):
+        raise TensorsimError("weights: got negative values, expected weights >= 0")
+
+
 def rolled(keypoints: Tensor, angle: float) -> Tensor:
     """Pixels (..., 2) turned clockwise (u right, v down) by ``angle`` in radians about the origin of the picture."""
     if angle == 0.0:
@@ -150,18 +169,7 @@ class NearestPoseLifter(nn.Module):
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
         """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
-        layout = "(..., T, 14, 2) joints in pixels"
-        check_points(keypoints, 3, 14, 2, "keypoints", layout)
-        if weights.shape != keypoints.shape[:-1]:
-            raise TensorsimError(
-                f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
-            )
-        if keypoints.shape[-3] < 1:
-            raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
-        check_finite(keypoints, "keypoints")
-        check_finite(weights, "weights")
-        if not is_exporting() and bool((weights < 0).any()):
-            raise TensorsimError("weights: got negative values, expected weights >= 0")
+        check_to_lift(keypoints, weights)
         shape, frames = keypoints.shape, keypoints.shape[-3]
         tracks = keypoints[..., 0, 0, 0].numel()
         keypoints, weights = keypoints.reshape(tracks, frames, 14, 2), weights.reshape(tracks, frames, 14)

@@ -19,11 +19,10 @@ from tensorsim.errors import (
     check_floating,
     check_min_rank,
     check_not_empty,
-    check_points,
     check_size,
 )
 from tensorsim.types import Lifted
-from tensorsim.vision.lifting.lifter import fit_poses
+from tensorsim.vision.lifting.lifter import check_to_lift, fit_poses
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
 #: Joints of Human3.6M in its order, those of the published networks in and out.
@@ -213,7 +212,7 @@ class VideoPoseLifter(nn.Module):
         knows no weights and sees hidden joints where they are given. Differentiable.
 
     Raises:
-        TensorsimError: other shapes, NaN, or a picture without pixels.
+        TensorsimError: other shapes, NaN, negative weights, no frames, or a picture without pixels.
     """
 
     def __init__(self, network: VideoPose3D, image_height: int, image_width: int) -> None:
@@ -225,15 +224,7 @@ class VideoPoseLifter(nn.Module):
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Lifted:
         """Joints (..., T, 14, 2) pixels and weights (..., T, 14) -> Lifted."""
-        check_points(keypoints, 3, 14, 2, "keypoints", "(..., T, 14, 2) joints in pixels")
-        if weights.shape != keypoints.shape[:-1]:
-            raise TensorsimError(
-                f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
-            )
-        if keypoints.shape[-3] < 1:
-            raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
-        check_finite(keypoints, "keypoints")
-        check_finite(weights, "weights")
+        check_to_lift(keypoints, weights)
         source = nearest_valid((weights > 0).sum(dim=-1) >= 2)
         keypoints = keypoints.gather(-3, source[..., None, None].expand_as(keypoints))
         weights = weights.gather(-2, source[..., None].expand_as(weights)).to(keypoints.dtype)

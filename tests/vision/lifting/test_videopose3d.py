@@ -140,6 +140,7 @@ class TestVideoPoseLifter(StageTester):
             ((k, torch.ones(4, 13)), r"weights: got shape \[4, 13\], expected \[4, 14\]"),
             ((k * float("nan"), w), "keypoints: got NaN"),
             ((k, w * float("nan")), "weights: got NaN"),
+            ((k, -w), "weights: got negative"),
             ((k[:0], w[:0]), "at least 1 frame"),
         ]
 
