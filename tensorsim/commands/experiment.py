@@ -40,6 +40,12 @@ class RunExperiment:
     """Names of activities; all twelve if none is given."""
     data: str | None = None
     """Folder of measured sets: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
+    films: str | None = None
+    """Folder of real films with labels.json, as `tensorsim evaluate films` takes it."""
+    maps: str | None = None
+    """Folder of simulated maps of everyday motion, as `tensorsim train everyday` makes them. Default: in the cache."""
+    groups: int | None = None
+    """Groups of these maps, of some 100 clips each."""
     clips: int | None = None
     """Clips per class."""
     test_clips: int | None = None
@@ -50,6 +56,8 @@ class RunExperiment:
     """Passes over the training clips."""
     steps: int | None = None
     """Batches of a training, where it does not count epochs."""
+    film_steps: int | None = None
+    """Batches of a training on the maps of everyday motion."""
     length_s: float | None = None
     """Length of a clip in seconds."""
     seeds: int | None = None
@@ -93,7 +101,7 @@ class RunExperiment:
 
     def _settings(self) -> dict[str, Any]:
         names = (
-            "networks", "scenes", "inputs", "denoisers", "activities", "data", "clips", "test_clips", "size", "epochs",
-            "steps", "length_s", "seeds", "snr_db", "seed",
+            "networks", "scenes", "inputs", "denoisers", "activities", "data", "films", "maps", "groups", "clips",
+            "test_clips", "size", "epochs", "steps", "film_steps", "length_s", "seeds", "snr_db", "seed",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}

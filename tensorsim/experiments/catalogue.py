@@ -67,7 +67,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     "inputs": Experiment(
         "Recognisers by input", networks.InputsConfig, networks.inputs_report, networks.quick_inputs
     ),
-    "real": Experiment("Recognisers on measured radar", real.RealConfig, real.real_report, real.quick_real),
+    "real": Experiment(
+        "Recognisers on measured radar and real films", real.RealConfig, real.real_report, real.quick_real
+    ),
     "paper": Experiment("All experiments", paper.PaperConfig, _paper, lambda: paper.PaperConfig(quick=True)),
 }
 

@@ -20,11 +20,12 @@ class PaperConfig:
 
     Attributes:
         quick: all of them in their quick form.
-        data: folder of measured sets for ``real``; without it, that one is left out.
+        data, films: folders of measured sets and of real films for ``real``; without both, that one is left out.
     """
 
     quick: bool = False
     data: str = ""
+    films: str = ""
 
 
 def paper_report(config: PaperConfig, work: Work, experiments: Mapping[str, Experiment]) -> Report:
@@ -39,10 +40,12 @@ def paper_report(config: PaperConfig, work: Work, experiments: Mapping[str, Expe
     for name, experiment in experiments.items():
         settings = experiment.quick() if config.quick else experiment.config()
         if name == "real":
-            if not config.data:
-                notes.append("**real** is left out: no folder of measured sets was given (--data).")
+            if not config.data and not config.films:
+                notes.append(
+                    "**real** is left out: no folder of measured sets (--data) or of films (--films) was given."
+                )
                 continue
-            settings = replace(settings, data=config.data)
+            settings = replace(settings, data=config.data, films=config.films)
         found = experiment.run(settings, work)
         notes += [f"**{name}**: {found.notes[0]}", *found.notes[1:]]
         tables += [

@@ -69,20 +69,33 @@ def label_windows(
     Raises:
         TensorsimError: maps with batch dimensions, or a length that is not positive.
     """
-    if maps.doppler_time.dim() != 2:
-        raise TensorsimError(
-            f"label_windows: got maps of shape {list(maps.doppler_time.shape)}, expected those of one scene (F, K)"
-        )
-    check_positive(duration_s, "duration_s")
     windows = []
-    for start_s in window_starts(duration_s, window_s, step_s):
-        end_s = min(start_s + window_s, duration_s) if duration_s >= window_s + step_s else duration_s
-        part = _part(maps, start_s / duration_s, end_s / duration_s)
+    for start_s, end_s, part in windows_of(maps, duration_s, window_s, step_s):
         probabilities = recognizer.probabilities(part)
         best = int(probabilities.argmax())
         sure = float(probabilities[best]) >= least_probability
         label = recognizer.class_names[best] if sure else NOT_SURE
         windows.append(Window(start_s, end_s, label, tuple(probabilities.tolist())))
+    return windows
+
+
+def windows_of(
+    maps: RadarMaps, duration_s: float, window_s: float = WINDOW_S, step_s: float = STEP_S
+) -> list[tuple[float, float, RadarMaps]]:
+    """Start and end in seconds and the maps of each window of one scene; see :func:`label_windows`.
+
+    Raises:
+        TensorsimError: maps with batch dimensions, or a length that is not positive.
+    """
+    if maps.doppler_time.dim() != 2:
+        raise TensorsimError(
+            f"windows_of: got maps of shape {list(maps.doppler_time.shape)}, expected those of one scene (F, K)"
+        )
+    check_positive(duration_s, "duration_s")
+    windows = []
+    for start_s in window_starts(duration_s, window_s, step_s):
+        end_s = min(start_s + window_s, duration_s) if duration_s >= window_s + step_s else duration_s
+        windows.append((start_s, end_s, _part(maps, start_s / duration_s, end_s / duration_s)))
     return windows
 
 

@@ -13,7 +13,8 @@ from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import PRESETS
 from tensorsim.recognition.calibration import expected_calibration_error, fit_temperature
 from tensorsim.recognition.map_image import MapToImage, area_weights, scaled
-from tensorsim.training.classifier import NETWORKS, RANGE_DB, held_out
+from tensorsim.recognition.networks import find_classifier
+from tensorsim.training.classifier import RANGE_DB, held_out
 from tensorsim.training.everyday_maps import EverydayStore
 from tensorsim.training.expected_map import noise_rows
 from tensorsim.training.loop import Batch, Recipe
@@ -74,10 +75,10 @@ class EverydayRecipe(Recipe):
     """Adam with a cosine schedule on pictures of everyday motion.
 
     Args:
-        network: a name of :data:`tensorsim.training.classifier.NETWORKS`.
+        network: a name of :data:`tensorsim.recognition.networks.CLASSIFIERS`.
         store: pictures; every fifth group is held out.
-        size: height and width of the pictures, a divisor of the store's; None takes 32 for SPGNet and the store's for
-            SPNet.
+        size: height and width of the pictures, a divisor of the store's; None takes what the network's authors take,
+            at most the store's.
         seed: of weights, order and augmentation.
         init: weights to start from.
         learning_rate: the highest.
@@ -96,11 +97,9 @@ class EverydayRecipe(Recipe):
         init: Path | None = None,
         learning_rate: float = 1e-3,
     ) -> None:
-        if network not in NETWORKS:
-            raise TensorsimError(f"network: got {network!r}, expected one of {', '.join(NETWORKS)}")
-        kind, usual = NETWORKS[network]
+        classifier = find_classifier(network)
         stored = store.settings.size
-        self.size = min(usual, stored) if size is None else size
+        self.size = min(classifier.size, stored) if size is None else size
         if stored % self.size:
             raise TensorsimError(f"size: got {self.size}, expected a divisor of the store's {stored}")
         aside = torch.tensor([held_out(group) for group in store.group.tolist()])
@@ -120,7 +119,7 @@ class EverydayRecipe(Recipe):
             rows.append(noise_rows(radar, image))
         self.noise = torch.stack([row / row.max() for row in rows]).float()
         torch.manual_seed(seed)
-        net = kind(len(ACTIVITIES))
+        net = classifier.build(len(ACTIVITIES), size=self.size)
         settings: dict[str, Any] = {
             "network": network,
             "size": self.size,
@@ -131,7 +130,7 @@ class EverydayRecipe(Recipe):
             "learning_rate": learning_rate,
         }
         metadata = {
-            "network": kind.__name__,
+            "network": type(net).__name__,
             "size": str(self.size),
             "speed_m_s": str(store.settings.speed_m_s),
             "range_db": str(RANGE_DB),

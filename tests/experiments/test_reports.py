@@ -1,19 +1,23 @@
 """Reports from results that are known: order, figures, what they say."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip
-from tensorsim.experiments import ablations, networks, paper, real, video
+from tensorsim.experiments import ablations, networks, paper, real, real_films, video
 from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
 from tensorsim.experiments.trials import Trial
 from tensorsim.experiments.work import Report, Table, Work
+from tensorsim.training.everyday_maps import EverydaySettings
+from tensorsim.training.maps import to_bytes
 
 QUICK = replace(networks.quick_networks(), networks=("ccln", "diat-radharnet"), seeds=2, snr_db=(50.0, 10.0))
 
@@ -121,7 +125,7 @@ def test_pictures_become_square_with_the_same_mean() -> None:
 
 
 def test_real_says_what_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(TensorsimError, match="--data: got nothing, expected a folder"):
+    with pytest.raises(TensorsimError, match="--data, --films: got nothing, expected a folder"):
         real.quick_real().sets()
     with pytest.raises(
         TensorsimError, match="has none of the measured sets, expected some of glasgow_cfar_masks"
@@ -139,6 +143,59 @@ def test_real_runs_and_goes_on(tmp_path: Path, shared_data: Path) -> None:
     report = real.real_report(config, work)
     assert sorted(row[0] for row in report.tables[0].rows) == ["CCLN", "DIAT-RadHARNet"]
     assert all(0 <= row[1] <= 100 for row in report.tables[0].rows)
+    assert real.real_report(config, work).tables[0].csv() == report.tables[0].csv()
+
+
+def everyday_store(folder: Path, groups: int) -> None:
+    """Pictures of two activities that differ in the place of one bright band."""
+    folder.mkdir(parents=True)
+    settings = EverydaySettings(filmed=4, true=0)
+    (folder / "settings.json").write_text(json.dumps(asdict(settings)))
+    for group in range(groups):
+        activity = torch.tensor([0, 7] * 4)
+        power = torch.full((8, 2, 64, 64), 1e-3)
+        power[activity == 0, :, 30:34] = 1.0
+        power[activity == 7, :, :, 30:34] = 1.0
+        pictures = torch.stack([to_bytes(picture) for picture in power])
+        save_file(
+            {"pictures": pictures, "activity": activity, "filmed": torch.ones(8, dtype=torch.bool)},
+            folder / f"everyday-{group:05d}.safetensors",
+        )
+
+
+def test_networks_learn_everyday_maps_and_label_films(tmp_path: Path) -> None:
+    """A film whose window shows the band of walking is a walk; one without a map is wrong."""
+    everyday_store(tmp_path / "maps", 5)
+    band = torch.zeros(2, 1, 32, 32)
+    band[..., 15:17] = 1.0
+    windows = {"free-space": band, "through-wall": torch.zeros(0, 1, 32, 32)}
+    films = [real_films.FilmPictures(("S8 Walking",), windows)]
+    training = real_films.EverydayTraining(tmp_path / "maps", 5, 32, 60)
+    work = Work(tmp_path / "work", quiet=True)
+    found = real_films.film_accuracy("ccln", 0, training, films, work)
+    assert found["free-space clips"] == found["through-wall clips"] == 1.0
+    assert found["free-space films"] == 1.0
+    assert found["through-wall films"] == 0.0
+    assert real_films.titled({"ccln": [found, found]}) == [["CCLN", 100.0, 100.0, 100.0, 0.0]]
+
+
+@pytest.mark.slow
+def test_real_labels_films(tmp_path: Path, shared_data: Path) -> None:
+    folder = tmp_path / "films"
+    folder.mkdir()
+    labels = json.loads((shared_data / "films_labelled" / "labels.json").read_text())
+    row = next(row for row in labels if row["file"] == "kick_ball.mp4")
+    (folder / row["file"]).symlink_to((shared_data / "films_labelled" / row["file"]).resolve())
+    (folder / "labels.json").write_text(json.dumps([row]))
+    everyday_store(tmp_path / "maps", 5)
+    config = replace(
+        real.quick_real(), films=str(folder), maps=str(tmp_path / "maps"), film_steps=2, networks=("ccln",)
+    )
+    work = Work(tmp_path / "work", quiet=True)
+    report = real.real_report(config, work)
+    assert [table.file for table in report.tables] == ["films"]
+    assert report.tables[0].rows[0][0] == "CCLN"
+    assert all(share in (0.0, 100.0) for share in report.tables[0].rows[0][3:])
     assert real.real_report(config, work).tables[0].csv() == report.tables[0].csv()
 
 

@@ -1,0 +1,176 @@
+"""Recognisers trained on simulated maps of everyday motion and asked about real films of known activity."""
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from tensorsim.config import ACTIVITIES, SimulationConfig
+from tensorsim.errors import TensorsimError, collected_warnings
+from tensorsim.evaluation.labelled_films import FilmReader, LabelledFilm, Scene, read_labels
+from tensorsim.experiments.work import Work, digest
+from tensorsim.files import complete_file
+from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.recognition import ActivityRecognizer
+from tensorsim.recognition.networks import find_classifier
+from tensorsim.recognition.timeline import windows_of
+from tensorsim.registry import locate
+from tensorsim.streaming import maps_of_pose
+from tensorsim.training.everyday_classifier import EverydayRecipe
+from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
+from tensorsim.training.loop import LoopConfig, fit
+
+#: Configurations of the scenes.
+SCENES = {"free-space": SimulationConfig.free_space(), "through-wall": SimulationConfig.through_wall()}
+#: Largest speed that the pictures show, m/s, and their dynamic range.
+SPEED_M_S, RANGE_DB = 3.8, 40.0
+
+
+class FilmPictures(NamedTuple):
+    """Simulated maps of a film as a network sees them.
+
+    Attributes:
+        accept: the activities that are right.
+        windows: for each scene (W, 1, size, size) in [0, 1], the windows of four seconds; none if the simulation
+            refuses the motion.
+    """
+
+    accept: tuple[str, ...]
+    windows: dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class EverydayTraining:
+    """A training on maps of everyday motion.
+
+    Attributes:
+        maps: folder of the maps; those that are missing are made.
+        groups: of maps, every fifth for validation.
+        size: height and width of the pictures: 32 or 64.
+        steps: batches of 64.
+    """
+
+    maps: Path
+    groups: int
+    size: int
+    steps: int
+
+
+def film_pictures(folder: Path, size: int, work: Work) -> list[FilmPictures]:
+    """Pictures of all films of a folder with ``labels.json``, by the shipped networks; kept in the cache.
+
+    Raises:
+        TensorsimError: not such a folder.
+    """
+    from safetensors.torch import load_file, save_file
+
+    films = read_labels(folder)
+    described = [(film.path.name, film.path.stat().st_size, film.start_s, film.end_s) for film in films]
+    path = work.cache / "results" / f"films-{digest({'films': described, 'size': size})}.safetensors"
+    if not path.is_file():
+        with complete_file(path) as scratch:
+            save_file(_made(films, size, work), scratch)
+    stored = load_file(path)
+    return [
+        FilmPictures(film.accept, {scene: stored[f"{scene}/{k}"] for scene in SCENES})
+        for k, film in enumerate(films)
+    ]
+
+
+@torch.inference_mode()
+def _made(films: list[LabelledFilm], size: int, work: Work) -> dict[str, Tensor]:
+    networks = locate(None, "RTMDet"), locate(None, "HRNet")
+    stage = VideoToPose.from_config(SimulationConfig()).eval()
+    reader = FilmReader(stage, networks, work.cache / "films")
+    cpu = torch.device("cpu")
+    scenes = {
+        scene: Scene(
+            PoseToDoppler.from_config(config),
+            ActivityRecognizer(config.scene.radar, nn.Identity(), "doppler", size, SPEED_M_S, RANGE_DB),
+        )
+        for scene, config in SCENES.items()
+    }
+    made = {}
+    for k, film in enumerate(tqdm(films, desc="films", unit="film", disable=work.quiet)):
+        with collected_warnings():  # `tensorsim evaluate films` prints them
+            video = reader.open(film)
+            pose = reader.people(film, video, cpu, quiet=True).pose
+            for name, scene in scenes.items():
+                torch.manual_seed(0)  # of the receiver's noise
+                shown = [torch.zeros(0, 1, size, size)]
+                # Motion too fast for the radar has no map, and no right label.
+                with suppress(TensorsimError):
+                    maps = maps_of_pose(scene.stage, pose, video.fps, cpu, quiet=True)
+                    parts = windows_of(maps, pose.valid.shape[2] / video.fps)
+                    shown += [scene.recognizer.picture(part)[None] for _, _, part in parts]
+                made[f"{name}/{k}"] = torch.cat(shown)
+    return made
+
+
+def film_accuracy(
+    name: str, seed: int, training: EverydayTraining, films: list[FilmPictures], work: Work
+) -> dict[str, float]:
+    """Train a network and label the films.
+
+    Returns:
+        Share of held-out clips, as the pipeline finds them in films, and of real films that are labelled rightly, for
+        each scene.
+    """
+    described = training.maps / "settings.json"
+    stated = json.loads(described.read_text(encoding="utf-8")) if described.is_file() else {}
+    build_everyday(training.maps, training.groups, EverydaySettings(**stated), quiet=work.quiet)
+    recipe = EverydayRecipe(
+        name, EverydayStore(training.maps, range(training.groups)), training.size, seed, learning_rate=1e-3
+    )
+    settings = {
+        "network": name,
+        "seed": seed,
+        "groups": training.groups,
+        "size": training.size,
+        "steps": training.steps,
+    }
+    loop = LoopConfig(
+        work.cache / "trials" / f"everyday-{name}-{digest(settings)}",
+        steps=training.steps,
+        batch=64,
+        seed=seed,
+        workers=0,
+        checkpoint_every=max(1, min(50, training.steps)),
+        validate_every=training.steps,
+        ema_decay=0.99 if training.steps > 500 else 0.9,
+        quiet=work.quiet,
+        events=False,
+    )
+    fit(recipe, loop)
+    found = recipe.validate(recipe.net.eval())
+    shares = {f"{scene} clips": found[f"{scene} filmed"] for scene in SCENES}
+    return shares | {f"{scene} films": right_share(recipe.net, films, scene) for scene in SCENES}
+
+
+@torch.no_grad()
+def right_share(net: nn.Module, films: list[FilmPictures], scene: str) -> float:
+    """Share of the films whose most probable activity, on the mean over windows and both ways round, is right."""
+    right = 0
+    for film in films:
+        windows = film.windows[scene]
+        if len(windows) == 0:
+            continue
+        logits = 0.5 * (net(windows) + net(windows.flip(-2)))
+        right += ACTIVITIES[int(logits.softmax(-1).mean(0).argmax())] in film.accept
+    return right / len(films)
+
+
+def titled(results: Mapping[str, list[dict[str, float]]]) -> list[list[Any]]:
+    """Rows of the table: network, then the mean of each share over the trainings in per cent."""
+    rows: list[list[Any]] = []
+    for name, trained in results.items():
+        keys = [f"{scene} {kind}" for kind in ("clips", "films") for scene in SCENES]
+        means = [100 * sum(each[key] for each in trained) / len(trained) for key in keys]
+        rows.append([find_classifier(name).title, *means])
+    return sorted(rows, key=lambda row: -(row[3] + row[4]))
