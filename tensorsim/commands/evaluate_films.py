@@ -32,6 +32,8 @@ class EvaluateFilms(NetworkOptions):
     """Activity classifier: path or name. Default: the shipped one."""
     only: tuple[str, ...] = ()
     """Names of films, or parts of them; default all."""
+    lifter: Literal["temporal", "nearest"] | None = None
+    """How joints get their depths, as in `tensorsim simulate`."""
     stride: int = 1
     """Keep every n-th frame."""
     calibrate: bool = True
@@ -56,10 +58,12 @@ class EvaluateFilms(NetworkOptions):
 
         import torch
 
+        from tensorsim.config import PoseConfig
         from tensorsim.device import usable_device
         from tensorsim.errors import collected_warnings
         from tensorsim.evaluation.labelled_films import FilmReader, Scene, markdown, read_labels
         from tensorsim.pipeline import PoseToDoppler, VideoToPose
+        from tensorsim.pipeline.networks import pretrained_lifter
 
         films = read_labels(self.data)
         if self.only:
@@ -67,7 +71,11 @@ class EvaluateFilms(NetworkOptions):
         if not films:
             raise TensorsimError(f"{self.data}: got no film to label, expected at least one")
         device = usable_device(self.device)
-        stage = VideoToPose(*load_networks(*networks, self.flip_test, self.engine)).to(device).eval()
+        people = PoseConfig() if self.lifter is None else PoseConfig(lifter=self.lifter)
+        stage = VideoToPose(
+            *load_networks(*networks, self.flip_test, self.engine), lifter=pretrained_lifter(people)
+        )
+        stage = stage.to(device).eval()
         reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:
