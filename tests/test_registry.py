@@ -189,9 +189,7 @@ SHOWN = {
     "DnCNN": (2, 24, 40),
     "SPNet": (2, 1, 64, 64),
     "SPGNet": (2, 1, 32, 32),
-    "measured-glasgow": (2, 1, 80, 64),
-    "measured-kmkim": (2, 1, 64, 15),
-    "measured-radhar": (2, 1, 16, 60),
+    "DIATRadHARNet": (2, 1, 32, 32),
 }
 
 
@@ -207,7 +205,7 @@ def test_shipped_networks_load_run_and_script(entry: ModelEntry) -> None:
     if entry.network == "TemporalLifter":
         arguments = keypoints_to_lift(12)
     else:
-        shape = SHOWN[entry.name if entry.name in SHOWN else entry.network]
+        shape = SHOWN[entry.network]
         arguments = (torch.rand(shape, generator=torch.Generator().manual_seed(0)),)
     with torch.no_grad():
         assert_same(torch.jit.script(network)(*arguments), network(*arguments), atol=1e-5)

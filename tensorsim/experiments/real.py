@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
-from tensorsim.evaluation.measured.training import fit_pictures, predict
+from tensorsim.evaluation.measured.training import fit_pictures, predict, square
 from tensorsim.experiments import figures
 from tensorsim.experiments.networks import USUAL
 from tensorsim.experiments.real_films import SCENES, EverydayTraining, film_accuracy, film_pictures, titled
@@ -84,11 +83,6 @@ class RealConfig:
                 f"--data: {self.data} has none of the measured sets, expected some of {names}"
             )
         return found
-
-
-def square(pictures: Tensor, size: int) -> Tensor:
-    """Pictures (N, 1, H, W) as (N, 1, size, size): what is larger is averaged, what is smaller is interpolated."""
-    return F.interpolate(pictures.float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
 
 
 def real_report(config: RealConfig, work: Work) -> Report:

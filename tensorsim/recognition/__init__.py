@@ -9,7 +9,6 @@ from tensorsim.recognition.map_image import MapToImage, ridge_map
 from tensorsim.recognition.mc_gclu import MCGCLU
 from tensorsim.recognition.mrw_cn import MRWCN
 from tensorsim.recognition.networks import CLASSIFIERS
-from tensorsim.recognition.picture_net import PictureNet
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
@@ -29,7 +28,6 @@ __all__ = [
     "GlobalFilterNet",
     "LabelSet",
     "MapToImage",
-    "PictureNet",
     "SPGNet",
     "SPNet",
     "SPNetDense",

@@ -39,6 +39,7 @@ class Windows(NamedTuple):
         rotation: (B, 3, 3) assumed, world from camera.
         extent: (B, 2) width and height of the picture.
         fps: (B,).
+        camera_height: (B,) assumed height of the camera above the floor, body heights.
     """
 
     joints: Tensor
@@ -51,13 +52,14 @@ class Windows(NamedTuple):
     rotation: Tensor
     extent: Tensor
     fps: Tensor
+    camera_height: Tensor
 
     def sight(self) -> Sight:
         """What the network gets."""
         joints, joint_scores = coco_to_body(self.keypoints, self.scores, THRESHOLD)
         return level_sight(
             self.keypoints, self.scores, joints, joint_scores, self.boxes, self.valid, self.focal, self.center,
-            self.rotation, self.extent, self.fps, THRESHOLD,
+            self.rotation, self.extent, self.fps, self.camera_height, THRESHOLD,
         )  # fmt: skip
 
 
@@ -124,12 +126,21 @@ def windows_of(
 
 
 class View(NamedTuple):
-    """Cameras: joints (B, T, 14, 3) from them in world axes, rotation (B, 3, 3), focal length (B), picture (B, 2)."""
+    """Cameras.
+
+    Attributes:
+        joints: (B, T, 14, 3) from the camera in world axes, metres.
+        rotation: (B, 3, 3) world from camera.
+        focal: (B,) pixels.
+        extent: (B, 2) width and height of the picture.
+        height_m: (B,) of the camera above the floor.
+    """
 
     joints: Tensor
     rotation: Tensor
     focal: Tensor
     extent: Tensor
+    height_m: Tensor
 
 
 #: Camera axes (right, down, forward) of a level camera, as columns in world axes.
@@ -153,7 +164,7 @@ def _any_camera(joints: Tensor, draw: Draw) -> View:
     # Many cameras are level, if that has the hips in the picture.
     pitch = torch.where(draw.chance(0.25), (up + 0.8 * tall).clamp(max=0.0), pitch)
     yaw = 0.8 * wide * draw.number(-1.0, 1.0)
-    return View(local, rotation(2, yaw) @ rotation(0, pitch) @ _LEVEL, focal, extent)
+    return View(local, rotation(2, yaw) @ rotation(0, pitch) @ _LEVEL, focal, extent, height)
 
 
 def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int], draw: Draw) -> View:
@@ -173,7 +184,7 @@ def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int],
     )
     turned = camera_to_world(camera)[:, :3].to(local.dtype).expand(draw.count, 3, 3)
     size = torch.tensor([float(width), float(height)]).expand(draw.count, 2)
-    return View(local, turned, focal, size)
+    return View(local, turned, focal, size, torch.full_like(far, camera.position_m[2]))
 
 
 def _missed(
@@ -255,9 +266,14 @@ def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) 
     stretch = torch.exp(torch.where(draw.chance(0.3), 0.15, 0.02) * draw.normal().clamp(-2, 2))
     forward = view.rotation[:, :, 2]
     shift = (stretch - 1)[:, None] * (mid_hips(view.joints) * forward[:, None]).sum(dim=-1)
-    joints = view.joints + (shift[..., None] * forward[:, None])[:, :, None]
+    joints = (view.joints + (shift[..., None] * forward[:, None])[:, :, None]) @ tipped[:, None].mT
+    # Mostly the height of the camera is estimated along with them, so that people stay on the floor.
+    sunk = mid_hips(view.joints)[..., 2].mean(dim=-1) - mid_hips(joints)[..., 2].mean(dim=-1)
+    above = view.height_m + torch.where(draw.chance(0.7), sunk, torch.zeros_like(sunk))
+    above = above * torch.exp(torch.where(draw.chance(0.3), 0.20, 0.04) * draw.normal())
     return seen._replace(
-        joints=joints @ tipped[:, None].mT / height[:, None, None, None],
+        joints=joints / height[:, None, None, None],
+        camera_height=above / height,
         focal=view.focal * stretch,
         rotation=tipped @ view.rotation,
     )
@@ -298,5 +314,5 @@ def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = 
     boxes = torch.minimum(boxes.clamp(min=0), torch.cat([extent, extent], dim=-1)[:, None])
     return Windows(
         view.joints / height[:, None, None, None], points, scores, boxes, valid, view.focal, center, view.rotation,
-        extent, fps,
+        extent, fps, view.height_m / height,
     )  # fmt: skip

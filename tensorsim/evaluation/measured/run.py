@@ -8,14 +8,16 @@ from torch import Tensor
 
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.sets import MeasuredSet
-from tensorsim.evaluation.measured.training import fit_pictures, predict
-from tensorsim.recognition.picture_net import PictureNet
+from tensorsim.evaluation.measured.training import Augment, fit_pictures, predict, square
+from tensorsim.recognition.diat_radharnet import DIATRadHARNet
 from tensorsim.weights import save_weights
 
 #: What is trained on what, in the order of the tables.
 SETTINGS = ("simulation_only", "ten_shot", "ten_shot_alone", "all", "lda")
 #: Measured clips of each class in ``ten_shot``.
 SHOTS = 10
+#: Height and width of the pictures that the network sees.
+SIZE = 32
 #: Share of each class to learn from where no other folder is given to test on.
 LEARNED = 0.7
 
@@ -104,44 +106,63 @@ class Experiment:
 
     def quick(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips by the shipped weights."""
-        net = PictureNet.from_pretrained(self.measured.weights)
-        return {"simulation_only": predict(net, self.test)}
+        net = DIATRadHARNet.from_pretrained(self.measured.weights)
+        return {"simulation_only": self._tested(net)}
 
     def full(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips in each of ``SETTINGS``."""
         simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet)
-        net = self._fit(self._new(self.seed), simulated, labels, self.steps, self.seed)
+        net = self._simulation_trained(simulated, labels, self.seed)
         path = self.out / f"{self.measured.weights.replace('-', '_')}.safetensors"
         save_weights(
             net, path, {"trained_on": "simulation alone", "classes": ",".join(self.measured.classes)}
         )
         chosen = few(self.train_labels, SHOTS)
         everything = torch.arange(len(self.train_labels))
-        logits = {"simulation_only": predict(net, self.test)}
+        logits = {"simulation_only": self._tested(net)}
         logits["ten_shot"] = self._measured_logits(net, chosen, self.steps // 2, 1e-3)
-        logits["ten_shot_alone"] = self._measured_logits(self._new(self.seed), chosen, self.steps // 2, 3e-3)
-        logits["all"] = self._measured_logits(net, everything, 2 * self.steps, 2e-3)
+        logits["ten_shot_alone"] = self._measured_logits(
+            self._new(self.train[chosen], self.seed), chosen, self.steps // 2, 3e-3
+        )
+        logits["all"] = self._measured_logits(net, everything, 2 * self.steps, 5e-3)
         logits["lda"] = lda_logits(self.train, self.train_labels, self.test, len(self.measured.classes))
         return logits
 
     def simulation_alone(self, seed: int, without: str | None = None) -> Tensor:
         """Logits (N, classes) of the test clips by a network trained on simulation alone, perhaps without an effect."""
         simulated, labels = self.measured.simulate(self.clips, seed, self.quiet, without)
-        return predict(self._fit(self._new(seed), simulated, labels, self.steps, seed), self.test)
+        return self._tested(self._simulation_trained(simulated, labels, seed))
 
-    def _new(self, seed: int) -> PictureNet:
+    def _new(self, pictures: Tensor, seed: int) -> DIATRadHARNet:
+        """A network with random weights that takes off the mean of these pictures."""
         torch.manual_seed(seed)
-        return PictureNet(len(self.measured.classes), self.train.shape[-2])
-
-    def _fit(self, net: PictureNet, shown: Tensor, labels: Tensor, steps: int, seed: int) -> PictureNet:
-        fit_pictures(net, shown, labels, steps=steps, augment=self.measured.augment, seed=seed)
+        net = DIATRadHARNet(len(self.measured.classes))
+        net.mean.fill_(float(pictures.float().mean()))
         return net
 
-    def _measured_logits(self, net: PictureNet, chosen: Tensor, steps: int, learning_rate: float) -> Tensor:
+    def _simulation_trained(self, simulated: Tensor, labels: Tensor, seed: int) -> DIATRadHARNet:
+        net = self._new(simulated, seed)
+        fit_pictures(
+            net, simulated, labels, steps=self.steps, augment=_seen(self.measured.augment), seed=seed
+        )
+        return net
+
+    def _measured_logits(
+        self, net: DIATRadHARNet, chosen: Tensor, steps: int, learning_rate: float
+    ) -> Tensor:
         """Logits (N, classes) of the test clips by a copy of ``net`` that goes on with chosen clips of train alone."""
         learner = copy.deepcopy(net)
         fit_pictures(
             learner, self.train[chosen], self.train_labels[chosen], steps=steps,
-            augment=self.measured.augment_measured, learning_rate=learning_rate, seed=self.seed,
+            augment=_seen(self.measured.augment_measured), learning_rate=learning_rate, seed=self.seed,
         )  # fmt: skip
-        return predict(learner, self.test)
+        return self._tested(learner)
+
+    def _tested(self, net: DIATRadHARNet) -> Tensor:
+        """Logits (N, classes) of the test clips."""
+        return predict(net, square(self.test, SIZE))
+
+
+def _seen(augment: Augment) -> Augment:
+    """The same change of pictures, which are then brought to the size that the network sees."""
+    return lambda pictures, generator: square(augment(pictures, generator), SIZE)

@@ -12,6 +12,11 @@ from tensorsim.device import multiplies_bfloat16
 Augment = Callable[[Tensor, torch.Generator], Tensor]
 
 
+def square(pictures: Tensor, size: int) -> Tensor:
+    """Pictures (N, 1, H, W) as (N, 1, size, size): what is larger is averaged, what is smaller is interpolated."""
+    return F.interpolate(pictures.float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
+
+
 def shift(shown: Tensor, most: int, dim: int, generator: torch.Generator) -> Tensor:
     """Pictures (B, C, H, W), each turned along ``dim`` by up to ``most`` cells either way."""
     by = torch.randint(-most, most + 1, (shown.shape[0],), generator=generator)

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 #: Numbers per frame that :meth:`features` gives.
-FEATURES = 64
+FEATURES = 67
 #: Frames to each side over which direction and size are averaged.
 RADIUS = 10
 
@@ -88,6 +88,7 @@ def level_sight(
     rotation: Tensor,
     extent: Tensor,
     fps: Tensor,
+    camera_height: Tensor,
     threshold: float = 0.3,
 ) -> Sight:
     """What the network needs to know of S tracks.
@@ -104,6 +105,7 @@ def level_sight(
         rotation: (S, 3, 3) from camera axes to world axes.
         extent: (S, 2) width and height of the picture in pixels.
         fps: (S,) frames per second.
+        camera_height: (S,) of the camera above the floor, in heights of the person.
         threshold: of scores.
     """
     there = valid.to(keypoints.dtype)
@@ -152,10 +154,17 @@ def level_sight(
         dim=-1,
     ).clamp(0.0, 1.0) * there[..., None]  # fmt: skip
     rate = (30.0 / fps)[:, None].expand_as(elevation)
+    # Whoever stands, sits or lies touches the floor with what is lowest: a point of the floor at a distance d is seen
+    # at e = -h / d. So -e / (h size) is the size over that of the body at one body height.
+    above = camera_height[:, None].clamp(0.1, 10.0)
+    lowest = torch.where(seen > 0, spot[..., 1], torch.full_like(seen, 8.0)).amin(dim=-1)
+    under = torch.stack([lowest, edges[..., 3]], dim=-1) + (elevation / size)[..., None]
+    on_floor = (-under / above[..., None]).clamp(-4.0, 8.0) * enough[..., None]
     features = torch.cat(
         [
             spot.flatten(-2), (scores.clamp(0.0, 1.0) * seen), edges, room,
             torch.stack([elevation, 1.0 + 0.5 * size.log(), there, rate, enough], dim=-1),
+            0.25 * on_floor, above[..., None].log().expand_as(enough[..., None]),
         ], dim=-1,
     )  # fmt: skip
     return Sight(features, spots, elevation, size, azimuth)

@@ -137,6 +137,7 @@ class TemporalLifter(nn.Module):
         k = keypoints.reshape(tracks, frames, 17, 2).to(dtype)
         s, b = scores.reshape(tracks, frames, 17).to(dtype), boxes.reshape(tracks, frames, 4).to(dtype)
         v = valid.reshape(tracks, frames)
+        height_of_each = self._height_of_each(keypoints).to(dtype)
         joints: list[Tensor] = []
         spreads: list[Tensor] = []
         ranges: list[Tensor] = []
@@ -145,14 +146,15 @@ class TemporalLifter(nn.Module):
             first, stop = max(start - self.reach, 0), min(start + self.frames_per_block, frames)
             last = min(stop + self.reach, frames)
             found, azimuth = self._block(
-                k[:, first:last], s[:, first:last], b[:, first:last], v[:, first:last], image_height, image_width, fps
+                k[:, first:last], s[:, first:last], b[:, first:last], v[:, first:last], height_of_each,
+                image_height, image_width, fps,
             )  # fmt: skip
             keep = stop - start
             joints.append(found.joints[:, start - first :][:, :keep])
             spreads.append(found.log_spread[:, start - first :][:, :keep])
             ranges.append(found.log_range_spread[:, start - first :][:, :keep])
             turns.append(azimuth[:, start - first :][:, :keep])
-        height = self._height_of_each(keypoints).to(dtype)[:, None]
+        height = height_of_each[:, None]
         azimuth = torch.cat(turns, dim=1)
         points = height[..., None, None] * turned_back(torch.cat(joints, dim=1), azimuth)
         root = mid_hips(points)
@@ -208,6 +210,7 @@ class TemporalLifter(nn.Module):
         scores: Tensor,
         boxes: Tensor,
         valid: Tensor,
+        height: Tensor,
         rows: int,
         columns: int,
         fps: float,
@@ -229,6 +232,7 @@ class TemporalLifter(nn.Module):
             pose[:, :3].expand(tracks, 3, 3),
             torch.stack([columns * one, rows * one], dim=-1),
             fps * one,
+            pose[2, 3] / height,
             self.keypoint_threshold,
         )
         return self.network(sight), sight.azimuth

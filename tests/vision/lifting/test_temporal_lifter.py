@@ -160,7 +160,7 @@ def test_tilt_turn_and_focal_length_are_taken_out() -> None:
                 pixels[None], one.expand(1, frames, 17), body[None], one.expand(1, frames, 14),
                 torch.zeros(1, frames, 4, dtype=torch.float64), torch.ones(1, frames, dtype=torch.bool), focal * one,
                 torch.tensor([center], dtype=torch.float64), pose[None, :, :3],
-                torch.tensor([[WIDTH, HEIGHT]], dtype=torch.float64), 30 * one,
+                torch.tensor([[WIDTH, HEIGHT]], dtype=torch.float64), 30 * one, one,
             )
         )  # fmt: skip
     torch.testing.assert_close(sights[0].joints, sights[1].joints, atol=5e-3, rtol=0)
@@ -249,8 +249,9 @@ def test_refuses_settings_that_cannot_be() -> None:
 def sight_in_numpy(
     keypoints: np.ndarray, scores: np.ndarray, joints: np.ndarray, joint_scores: np.ndarray, boxes: np.ndarray,
     valid: np.ndarray, focal: float, center: np.ndarray, rotation: np.ndarray, extent: np.ndarray, fps: float,
+    camera_height: float,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
-    """One track, frame by frame, with angles: features (T, 64), joints (T, 14, 2), elevation, size, azimuth (T,)."""
+    """One track, frame by frame, with angles: features (T, 67), joints (T, 14, 2), elevation, size, azimuth (T,)."""
     frames = len(keypoints)
 
     def ray(pixel: np.ndarray) -> np.ndarray:
@@ -297,6 +298,14 @@ def sight_in_numpy(
         )
         more = [elevation[t], 1 + 0.5 * np.log(size[t]), valid[t], 30 / fps, counts[t] >= 5]
         there = float(valid[t])
+        # 1 / (distance of the floor where a point of the picture shows it), over the size, with both in heights.
+        lowest = min(
+            [on_plane(t, k)[1] for k, s in zip(keypoints[t], seen[t], strict=True) if s], default=np.inf
+        )
+        bottom_edge = elevation[t] + size[t] * np.clip(edges[3], -8, 8) * there
+        floor = [np.clip(-e / camera_height / size[t], -4, 8) / 4 for e in (lowest, bottom_edge)]
+        floor = np.array(floor) if counts[t] >= 5 else np.zeros(2)
+        more += [*floor, np.log(camera_height)]
         parts = [np.ravel(spot), scores[t] * seen[t], np.array(edges) * there, room * there, more]
         features.append(np.concatenate(parts))
     return np.array(features), np.array(found), elevation, size, azimuth
@@ -321,10 +330,11 @@ def test_features_are_those_of_angles_in_numpy() -> None:
         rotation[None],
         torch.tensor([[WIDTH, HEIGHT]]).double(),
         torch.tensor([24.0]).double(),
+        torch.tensor([1.2]).double(),
     )
     expected = sight_in_numpy(
         *(x[0].numpy() for x in arguments), focal, np.array(center), rotation.numpy(),
-        np.array([WIDTH, HEIGHT]), 24.0,
+        np.array([WIDTH, HEIGHT]), 24.0, 1.2,
     )  # fmt: skip
     angle = torch.atan2(sight.azimuth[0, :, 1], sight.azimuth[0, :, 0])
     for mine, theirs in zip((*sight[:4], angle[None]), expected, strict=True):
@@ -339,7 +349,7 @@ def test_where_nobody_is_seen_for_long_the_camera_looks() -> None:
     rotation = camera_to_world(CAMERA)[None, :, :3].double()
     sight = level_sight(
         keypoints, scores * 0, joints, joint_scores, boxes, valid, 500 * one, torch.tensor([[319.5, 239.5]]).double(),
-        rotation, torch.tensor([[WIDTH, HEIGHT]]).double(), 30 * one,
+        rotation, torch.tensor([[WIDTH, HEIGHT]]).double(), 30 * one, one,
     )  # fmt: skip
     assert sight.size.unique().tolist() == pytest.approx([0.08])
     np.testing.assert_allclose(sight.elevation.numpy(), math.tan(CAMERA.pitch_rad), rtol=1e-6)
