@@ -96,7 +96,7 @@ def calibrated(
     assert isinstance(heights, Tensor)
     calibrator = CameraCalibrator(tuple(heights.tolist()), keypoint_threshold=stage.keypoint_threshold)
     found = with_reserve(calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps))
-    return stage.seen_by(camera_config(found)), found
+    return stage.seen_by(camera_config(found), known=False), found
 
 
 def detections_of_film(

@@ -90,8 +90,9 @@ def test_simulate_writes_everything(
 ) -> None:
     out = tmp_path / "deep" / "out"
     cli.main(
-        ["simulate", str(walk), "--out", str(out), "--person-height", "1.75", "--no-calibrate", *stand_ins]
-    )
+        ["simulate", str(walk), "--out", str(out), "--person-height", "1.75", "--no-calibrate", "--lifter", "nearest",
+         *stand_ins]
+    )  # fmt: skip
     assert {p.name for p in out.iterdir()} == FILES
     assert "1 people in 25 frames" in capsys.readouterr().out
     maps, pose = np.load(out / "maps.npz"), np.load(out / "pose.npz")

@@ -104,5 +104,6 @@ def test_camera_of_the_composition_reaches_the_lifter() -> None:
     composed = VideoToPose(RectangleDetector(), StandingPose(), camera=camera)
     config = ts.SimulationConfig().replace(pose__camera=camera)
     configured = VideoToPose.from_config(config, RectangleDetector(), StandingPose())
-    for name, buffer in configured.lifter.named_buffers():
-        assert torch.equal(buffer, composed.lifter.get_buffer(name)), name
+    assert composed.temporal is not None
+    for name, buffer in configured.temporal.named_buffers():
+        assert torch.equal(buffer, composed.temporal.get_buffer(name)), name

@@ -38,7 +38,7 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "SPGNet": lambda network: network(wave(1, 1, 32, 32)),
     "SPNet": lambda network: network(wave(1, 1, 64, 64)),
     "DnCNN": lambda network: network.noise(wave(24, 40)).flatten()[::96],  # type: ignore[operator]
-    "PictureNet": lambda network: network(wave(1, network.channels, network.rows, 64)),
+    "DIATRadHARNet": lambda network: network(wave(1, 1, 32, 32)),
     "HRNet": lambda network: network(wave(1, 3, 64, 64)).flatten()[::443],
     "RTMDet": detector_logits,  # type: ignore[dict-item]
     "AcfDetector": tree_sums,  # type: ignore[dict-item]
@@ -49,20 +49,20 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
 
 #: First numbers and root mean square of all, by the first digits of the file's SHA-256.
 EXPECTED: dict[str, tuple[list[float], float]] = {
-    "a13716bde7bb6df2": ([-2.89371, -0.603295, 1.05912, -2.97312, -2.33061, -2.2752], 2.3191),  # SPGNet
+    "22aa4dc171f3ba62": ([-3.50214, -2.8015, 0.590537, -2.66019, -3.83538, -3.34251], 2.8391),  # SPGNet
     "c833ed9170aaa3b8": ([-0.302423, 5.17975, 0.844778, 0.0896744, -0.455284, -0.332846], 1.6123),  # SPNet
     "7a15296264b6a721": ([0.74892, 1.13028, 0.24339, 0.36871, 1.25796, 0.71812], 0.76663),  # DnCNN
     "90280277c27b4134": ([-6.33586, -2.389, -3.60517, -3.53825, -3.28889, -2.88149], 14.729),  # RTMDet
     "9c67dd0447777938": ([-5.8902, -3.0857, -3.79031, -3.77907, -3.93062, -3.59724], 9.824),  # RTMDet
-    "423536b5f7729544": (
-        [0.123281, -0.296293, -0.723737, -0.774542, -2.29278, -1.56025],
-        1.2191,
-    ),  # PictureNet
-    "635c86394040e891": ([-3.99982, 2.47428, -0.224426, -2.47148], 2.6589),  # PictureNet
-    "873b467d3aef57f0": ([-0.62995, 1.20185, -1.79243, 0.190756, -0.119144], 1.0104),  # PictureNet
-    "12247fedcbf33d73": (
-        [0.00249568, -0.897834, -0.0102167, -0.105965, -0.432464, 0.0658593],
-        0.37101,
+    "da7cf4552d24e8c3": ([-0.638164, 2.84223, -0.745937, -0.708206], 1.5446),  # DIATRadHARNet
+    "e9b7667250ee4172": ([-0.0478059, 2.02712, 0.667224, -0.286124, -0.325381], 0.97411),  # DIATRadHARNet
+    "de6eab974f533543": (
+        [3.07035, -0.99288, -0.901084, -0.76005, -1.01738, -0.58401],
+        1.482,
+    ),  # DIATRadHARNet
+    "fc74bbbca9ed50e8": (
+        [0.00095248, -0.883877, 0.0274649, -0.103575, -0.443762, 0.0722427],
+        0.38004,
     ),  # TemporalLifter
     "5f5f7cebae014e45": (
         [0.00710835, -0.888452, 0.0814337, 0.185155, 0.0518079, -0.359967],

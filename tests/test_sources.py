@@ -47,7 +47,8 @@ def coco_json(
 
 
 def lifter(camera: ts.CameraConfig, height_m: float) -> ts.VideoToPose:
-    return ts.VideoToPose(nn.Identity(), nn.Identity(), person_height_m=(height_m,), camera=camera)
+    stage = ts.VideoToPose(nn.Identity(), nn.Identity(), person_height_m=(height_m,), camera=camera)
+    return stage.eval().requires_grad_(False)
 
 
 def test_kinds(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ class Simulate(NetworkOptions, RadarOptions):
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
     lifter: Literal["temporal", "nearest"] | None = None
     """How key points become 3D: by a network that sees a window of time, or from the nearest poses of a library.
-    Default: nearest."""
+    Default: temporal."""
     library: Path | None = None
     """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
     per_person: bool = False

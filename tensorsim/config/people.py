@@ -88,7 +88,7 @@ class PoseConfig:
         calibrate: estimate tilt, height and field of view of the camera from the people of a film, in place of
             ``camera``; see :class:`tensorsim.vision.CameraCalibrator`.
         position: ``"camera"`` (pinhole camera) or ``"paper"`` (increments of pixels times metres per pixel).
-        lifter: ``"nearest"`` (nearest poses of a library) or ``"temporal"`` (a network that sees a window of time).
+        lifter: ``"temporal"`` (a network that sees a window of time) or ``"nearest"`` (nearest poses of a library).
         lifter_weights: name or file of the temporal lifter's weights; None is the shipped network.
         library: file of the pose library of the nearest lifter; None is the shipped one.
         neighbours: poses of the library that are averaged per frame; 1 is the paper's nearest match.
@@ -109,7 +109,7 @@ class PoseConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     calibrate: bool = False
     position: Position = "camera"
-    lifter: Lifting = "nearest"
+    lifter: Lifting = "temporal"
     lifter_weights: str | None = None
     library: str | None = None
     neighbours: int = 128

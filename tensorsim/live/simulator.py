@@ -1,6 +1,7 @@
 """The whole live chain: a frame in, people, new columns of the maps and a label out."""
 
 import copy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,7 +75,8 @@ class LiveSimulator:
     (:class:`~tensorsim.live.radar.LiveRadar`). Columns of the maps come a frame after their last pulse.
 
     Args:
-        config: of the run; None is the free-space scene. The camera is that of ``pose.camera``.
+        config: of the run; None is the free-space scene. The camera is that of ``pose.camera``. Nearest matching lifts,
+            each frame alone, for the temporal lifter needs the frames to come.
         fps: frames per second of the camera.
         detector, pose: networks in place of those that the configuration names.
         recognizer: names the activity of the last four seconds every second; None gives no labels.
@@ -82,7 +84,7 @@ class LiveSimulator:
 
     Attributes:
         missed: frames that were given as missed so far.
-        config: with range-time maps at a display rate.
+        config: with nearest matching, and range-time maps at a display rate.
 
     Example:
         >>> live = ts.LiveSimulator(fps=fps)
@@ -107,11 +109,11 @@ class LiveSimulator:
     ) -> None:
         check_positive(fps, "fps")
         config = SimulationConfig() if config is None else config
+        config = config.replace(pose=replace(config.pose, lifter="nearest", lifter_weights=None))
         for name, given in (
             ("an initial distance", config.pose.initial_distance_m is not None),
             ("calibration", config.pose.calibrate),
             ("position 'paper'", config.pose.position == "paper"),
-            ("the temporal lifter", config.pose.lifter != "nearest"),
             (f"people {config.pose.people!r}", config.pose.people != "all"),
         ):
             if given:

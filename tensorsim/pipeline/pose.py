@@ -43,7 +43,8 @@ class VideoToPose(nn.Module):
         fewest_joints: of the 14, in a frame that says anything of the pose.
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
-        tracker, lifter, metric_pose, smoother: replacements of the default stages. A ``metric_pose`` has heights,
+        tracker, lifter, metric_pose, smoother: replacements of the default stages; ``lifter`` is the shipped
+            :class:`~tensorsim.vision.TemporalLifter`. A ``metric_pose`` has heights,
             distances and camera of its own.
         bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
             keypoints that are exact; None leaves it out.
@@ -83,11 +84,6 @@ class VideoToPose(nn.Module):
         self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
-        if lifter is None:
-            lifter = NearestPoseLifter(pitch_rad=0.0 if camera is None else camera.pitch_rad)
-        # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
-        self.temporal = lifter if isinstance(lifter, TemporalLifter) else None
-        self.lifter = None if self.temporal is not None else check_part(lifter, "lifter")
         if metric_pose is None:
             heights = PoseConfig().person_height_m if person_height_m is None else person_height_m
             metric_pose = MetricPose(camera, heights, initial_distance_m, keypoint_threshold)
@@ -98,6 +94,11 @@ class VideoToPose(nn.Module):
                 "camera": camera,
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
+        if lifter is None:
+            lifter = _lifter_beside(metric_pose, keypoint_threshold)
+        # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
+        self.temporal = lifter if isinstance(lifter, TemporalLifter) else None
+        self.lifter = None if self.temporal is not None else check_part(lifter, "lifter")
         self.metric_pose = metric_pose
         # A replacement is called with what every metric pose takes. TorchScript compiles one of both calls.
         self.asks_for_edges = isinstance(metric_pose, MetricPose)
@@ -166,8 +167,8 @@ class VideoToPose(nn.Module):
             smoother=KalmanSmoother(mode=smoothing.mode),
         ).eval()
 
-    def seen_by(self, camera: CameraConfig) -> "VideoToPose":
-        """The same stage, with the same networks, for another camera.
+    def seen_by(self, camera: CameraConfig, known: bool = True) -> "VideoToPose":
+        """The same stage, with the same networks, for another camera, known or estimated from a film.
 
         Raises:
             TensorsimError: a lifter or metric pose of another class, which may know no camera.
@@ -183,7 +184,7 @@ class VideoToPose(nn.Module):
         other = copy.copy(self)
         other._modules = dict(self._modules)
         if isinstance(lifter, TemporalLifter):
-            other.temporal = lifter.seen_by(camera)
+            other.temporal = lifter.seen_by(camera, known=known)
         else:
             other.lifter = lifter.tilted(camera.pitch_rad, camera.roll_rad)
         other.metric_pose = self.metric_pose.seen_by(camera)
@@ -362,6 +363,14 @@ def _camera_position(metric_pose: nn.Module) -> tuple[float, float, float]:
         return CameraConfig().position_m
     x, y, z = metric_pose.camera_pose[:, 3].tolist()
     return x, y, z
+
+
+def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> TemporalLifter:
+    """The shipped lifter for the camera and people of a metric pose, or for the default ones."""
+    if not isinstance(metric_pose, MetricPose):
+        return TemporalLifter.from_pretrained(keypoint_threshold=keypoint_threshold)
+    heights = tuple(metric_pose.heights.tolist())
+    return TemporalLifter.from_pretrained(None, metric_pose.camera, heights, keypoint_threshold)
 
 
 class _AsPlaced(nn.Module):

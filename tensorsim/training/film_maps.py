@@ -20,8 +20,7 @@ from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.training.film_errors import FilmErrors, activity_of_folder, films_of
-from tensorsim.vision.lifting.lifter import NearestPoseLifter
-from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
 
 class FilmLoss:
@@ -35,7 +34,7 @@ class FilmLoss:
 
     def __init__(self, errors: FilmErrors) -> None:
         self.errors = errors
-        self.lifter = NearestPoseLifter().eval()
+        self.lifter = TemporalLifter.from_pretrained()
 
     @torch.no_grad()
     def __call__(self, joints: Tensor, height_m: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -48,7 +47,7 @@ class FilmLoss:
             return torch.ones_like(joints), seen.valid[0]
         nothing = nn.Identity()
         stage = VideoToPose(
-            nothing, nothing, lifter=self.lifter, metric_pose=MetricPose(CAMERA, (height_m,))
+            nothing, nothing, (height_m,), camera=CAMERA, lifter=self.lifter.seen_by(CAMERA, (height_m,))
         ).eval()
         found, valid = seen.lifted_by(stage)
         return found[0].double(), valid[0]

@@ -4,9 +4,8 @@ Networks do not err at random: a hidden arm stays in the wrong place for as long
 mixed up for a while, people who lie down are lost. Sizes of errors are shares of the body's height in the picture.
 """
 
-import copy
 import math
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,17 +17,13 @@ from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, pri
 from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
 from tensorsim.types import Tracks
-from tensorsim.vision.lifting.lifter import NearestPoseLifter
-from tensorsim.vision.lifting.metric_pose import MetricPose
-from tensorsim.vision.lifting.pose_library import load_pose_library
+from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Errors of each COCO key point relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
 RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2
 #: Key points that are mixed up with those of the other side: arms, legs, all.
 MIXED_UP = ((5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16), tuple(range(5, 17)))
-#: What is believed of the tilt is a multiple of this: the lifter prepares its poses for each tilt, which takes long.
-PITCH_STEP_DEG = 3.0
 #: Pictures: height, width.
 SIZES = ((360, 640), (480, 640), (640, 360))
 
@@ -64,8 +59,7 @@ def draw_camera(hips: Tensor, draw: Draw) -> Filming:
     middle = hips.mean(0) - hips.new_tensor([0.0, 0.0, above])
     towards = math.atan2(float(middle[2]), float(middle[:2].norm()))
     half = math.atan(math.tan(fov / 2) * height / width)
-    step = math.radians(PITCH_STEP_DEG)
-    thought = step * round((towards + float(draw(-0.45, 0.45)) * half) / step)
+    thought = towards + float(draw(-0.45, 0.45)) * half
     pitch = thought + math.radians(4.0) * float(draw.normal(1))
     stretch = math.exp(0.12 * float(draw.normal(1)))
     lifted = max(0.3, above * stretch + 0.1 * float(draw.normal(1)))
@@ -160,28 +154,11 @@ def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: D
 
 
 class FilmedMotion:
-    """Motion as the pipeline finds it in films: key points with errors, lifted, placed and smoothed.
+    """Motion as the pipeline finds it in films: key points with errors, lifted, placed and smoothed."""
 
-    Args:
-        every: only every n-th pose of the shipped library is searched, for speed.
-    """
-
-    def __init__(self, every: int = 8) -> None:
+    def __init__(self) -> None:
         nothing = nn.Identity()
-        lifter = NearestPoseLifter(load_pose_library()[::every], neighbours=32)
-        self.stage = VideoToPose(nothing, nothing, lifter=lifter).eval()
-        self._tilted: dict[float, nn.Module | None] = {}
-
-    def _seen_by(self, camera: CameraConfig) -> VideoToPose:
-        """The stage for a camera, with a lifter that is made once for each tilt."""
-        stage = self.stage
-        if camera.pitch_rad not in self._tilted:
-            self._tilted[camera.pitch_rad] = stage.seen_by(camera).lifter
-        other = copy.copy(stage)
-        other._modules = dict(stage._modules)
-        other.lifter = self._tilted[camera.pitch_rad]
-        other.metric_pose = cast(MetricPose, stage.metric_pose).seen_by(camera)
-        return other
+        self.stage = VideoToPose(nothing, nothing, lifter=TemporalLifter.from_pretrained()).eval()
 
     @torch.no_grad()
     def __call__(
@@ -196,7 +173,7 @@ class FilmedMotion:
         boxes = keypoint_boxes(keypoints, scores, margin=0.08)
         if not bool(valid.any()):
             return torch.ones((*valid.shape, 14, 3)), valid
-        stage = self._seen_by(filming.believed)
+        stage = self.stage.seen_by(filming.believed, known=False)
         tracks = Tracks(boxes.float()[None], valid[None], valid[None])
         pose = stage.lift(
             tracks, keypoints.float()[None], scores.float()[None], filming.height, filming.width, fps

@@ -70,7 +70,7 @@ def test_the_command_labels_films_and_runs_the_networks_once(
     monkeypatch.setattr(evaluate_films, "load_networks", lambda *_: (CountingDetector(), StandingPose()))
     out = tmp_path / "out"
     arguments = ["evaluate", "films", "--data", str(data), "--out", str(out), "--scenes", "through-wall"]
-    arguments += ["--detector", str(weights), "--pose", str(weights), "--quiet"]
+    arguments += ["--detector", str(weights), "--pose", str(weights), "--lifter", "nearest", "--quiet"]
     CountingDetector.frames = 0
     cli.main(arguments)
     walk, room = json.loads((out / "films.json").read_text())

@@ -47,7 +47,7 @@ def _small_library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     global CONFIG
     path = tmp_path_factory.mktemp("library") / "poses.safetensors"
     save_file({"poses": load_pose_library()[::40].clone()}, path)
-    whole, CONFIG = CONFIG, CONFIG.replace(pose__library=str(path))
+    whole, CONFIG = CONFIG, CONFIG.replace(pose__lifter="nearest", pose__library=str(path))
     yield
     CONFIG = whole
 
@@ -293,7 +293,6 @@ def test_what_needs_the_whole_film_is_refused(walk: Tensor) -> None:
         {"pose__initial_distance_m": (4.0,)},
         {"pose__calibrate": True},
         {"pose__people": "nearest"},
-        {"pose__library": None, "pose__lifter": "temporal"},
         {"smoothing__smoothing_ratio": 0.25},
         {"processing__mti": "mean"},
         {"scene__sway": True},
@@ -302,6 +301,12 @@ def test_what_needs_the_whole_film_is_refused(walk: Tensor) -> None:
             LiveSimulator(CONFIG.replace(**changes), FPS, *networks())
     with pytest.raises(TensorsimError, match=r"frame: got torch\.float32 of shape"):
         simulator().push(walk[0].float())
+
+
+def test_nearest_matching_lifts_whatever_the_configuration_says() -> None:
+    """The temporal lifter needs the frames to come."""
+    config = CONFIG.replace(pose__library=None, pose__lifter="temporal")
+    assert LiveSimulator(config, FPS, *networks()).config.pose.lifter == "nearest"
 
 
 def test_frames_that_come_too_fast_are_dropped_and_counted(clip: Path) -> None:

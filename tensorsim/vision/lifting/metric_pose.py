@@ -159,6 +159,7 @@ class MetricPose(nn.Module):
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
         camera = CameraConfig() if camera is None else camera
+        self.camera = camera
         self.focal_px, self.center_px = camera.focal_px, camera.center_px
         self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
         self.distance_gives_focal = initial_distance_m is not None

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, coco_to_body, mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.errors import (
     TensorsimError,
@@ -24,8 +24,11 @@ from tensorsim.errors import (
 )
 from tensorsim.geometry.camera import camera_to_world, project
 from tensorsim.types import Lifted
-from tensorsim.vision.lifting.sight import RADIUS, level_sight, turned_back
+from tensorsim.vision.lifting.sight import RADIUS, level_sight, turned_back, windowed_mean
 from tensorsim.vision.lifting.temporal_net import DILATIONS, Located, TemporalNet
+
+#: Lengths of all bones together, in standing heights; between people they differ by 2 %.
+_ALL_BONES = 2.39
 
 
 class TemporalPose(NamedTuple):
@@ -66,6 +69,9 @@ class TemporalLifter(nn.Module):
         keypoint_threshold: score from which a key point counts as seen.
         frames_per_block: frames that go through the network at once, which bounds the memory; the result does not
             depend on it.
+        camera_known: False for a camera that was estimated. The network sees where the floor is and takes the distance
+            of those who lie or sit from it, which a tilt that is wrong by some degrees moves by a metre. Then people
+            are put where their bones have the lengths that they should have.
 
     Shape:
         COCO key points (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
@@ -78,6 +84,7 @@ class TemporalLifter(nn.Module):
 
     heights: Tensor
     camera_pose: Tensor
+    bones: Tensor
     focal_px: float | None
     center_px: tuple[float, float] | None
 
@@ -88,6 +95,7 @@ class TemporalLifter(nn.Module):
         person_height_m: tuple[float, ...] = (1.80, 1.70),
         keypoint_threshold: float = 0.3,
         frames_per_block: int = 4096,
+        camera_known: bool = True,
     ) -> None:
         super().__init__()
         check_positive(keypoint_threshold, "TemporalLifter.keypoint_threshold")
@@ -98,22 +106,27 @@ class TemporalLifter(nn.Module):
             check_positive(height, "TemporalLifter.person_height_m")
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
+        self.camera_known, self.log_bones = camera_known, math.log(_ALL_BONES)
         #: Body heights within which a key point counts as right; at twice as much it is wrong.
         self.near = 0.06
         #: Frames before and after one that have a say in its result.
-        self.reach = self.network.reach + 2 * RADIUS  # the size of the body is about its averaged direction
+        # The size of the body is about its averaged direction, that of its bones is averaged afterwards.
+        self.reach = self.network.reach + 3 * RADIUS
         camera = CameraConfig() if camera is None else camera
         self.focal_px, self.center_px = camera.focal_px, camera.center_px
         self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
         self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
+        self.register_buffer("bones", torch.tensor(BONES).T, persistent=False)
 
     def seen_by(
-        self, camera: CameraConfig, person_height_m: tuple[float, ...] | None = None
+        self, camera: CameraConfig, person_height_m: tuple[float, ...] | None = None, known: bool = True
     ) -> "TemporalLifter":
-        """The same, with the same network, for another camera and, unless None, other people."""
+        """The same, with the same network, for another camera, known or estimated, and, unless None, other people."""
         heights = tuple(self.heights.tolist()) if person_height_m is None else person_height_m
-        other = TemporalLifter(self.network, camera, heights, self.keypoint_threshold, self.frames_per_block)
+        other = TemporalLifter(
+            self.network, camera, heights, self.keypoint_threshold, self.frames_per_block, known
+        )
         return other.to(self.heights.device).train(self.training)
 
     def forward(
@@ -235,7 +248,16 @@ class TemporalLifter(nn.Module):
             pose[2, 3] / height,
             self.keypoint_threshold,
         )
-        return self.network(sight), sight.azimuth
+        found: Located = self.network(sight)
+        if self.camera_known:
+            return found, sight.azimuth
+        # As seen from the camera, a body twice as far away and twice as large looks the same.
+        points = torch.cat([found.joints, mid_hips(found.joints)[..., None, :]], dim=-2)
+        bones = points.index_select(-2, self.bones[0]) - points.index_select(-2, self.bones[1])
+        excess = bones.square().sum(dim=-1).clamp(min=1e-12).sqrt().sum(dim=-1).log() - self.log_bones
+        excess = windowed_mean(excess[..., None], valid.to(excess.dtype) + 1e-3)[..., 0]
+        joints = found.joints * torch.exp(-excess)[..., None, None]
+        return Located(joints, found.log_spread, found.log_range_spread), sight.azimuth
 
     def _height_of_each(self, like: Tensor) -> Tensor:
         """Standing height of each track, (S,), of (..., P, T, N, D)."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import tensorsim as ts
-from tensorsim.body.skeleton import body_to_coco, coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, body_to_coco, coco_to_body, mid_hips
 from tensorsim.config import CameraConfig, PoseConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world, project
@@ -79,6 +79,11 @@ class TestTemporalLifter(StageTester):
             ((k, s, b, v, HEIGHT, WIDTH, 0.0), "fps"),
             ((k[:, :, :0], s[:, :, :0], b[:, :, :0], v[:, :, :0], *rest), "frame"),
         ]
+
+
+class TestBeforeAnEstimatedCamera(TestTemporalLifter):
+    def make(self) -> nn.Module:
+        return TemporalLifter(network(), CAMERA, (1.7, 1.6), frames_per_block=5, camera_known=False)
 
 
 def test_joints_lie_on_the_lines_of_sight_of_their_key_points() -> None:
@@ -168,16 +173,40 @@ def test_tilt_turn_and_focal_length_are_taken_out() -> None:
     torch.testing.assert_close(sights[0].azimuth, sights[1].azimuth, atol=5e-3, rtol=0)
 
 
-def test_blocks_equal_the_whole() -> None:
+@pytest.mark.parametrize("known", [True, False])
+def test_blocks_equal_the_whole(known: bool) -> None:
     """A long film in blocks with overlap gives what it gives in one piece."""
     _, keypoints, scores, boxes, valid = filmed(150)
     valid[0, 60:75] = False
     arguments = (keypoints.float(), scores.float(), boxes.float(), valid, HEIGHT, WIDTH, 30.0)
     with torch.no_grad():
-        whole = TemporalLifter(network(), CAMERA)(*arguments)
-        parts = TemporalLifter(network(), CAMERA, frames_per_block=40)(*arguments)
+        whole = TemporalLifter(network(), CAMERA, camera_known=known)(*arguments)
+        parts = TemporalLifter(network(), CAMERA, frames_per_block=40, camera_known=known)(*arguments)
     for one, other in zip(whole, parts, strict=True):
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+
+
+def test_before_an_estimated_camera_bones_have_their_lengths() -> None:
+    """Somebody who keeps still: the same picture, from where all bones together are 2.39 standing heights long."""
+    _, keypoints, scores, boxes, valid = filmed(60)
+    keypoints, boxes = (x[:, :1].expand_as(x) for x in (keypoints, boxes))
+    lifter = TemporalLifter(network(), CAMERA, (1.7,)).double()
+    estimated = lifter.seen_by(CAMERA, known=False)
+    with torch.no_grad():
+        known, found = (
+            part(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0) for part in (lifter, estimated)
+        )
+    points = torch.cat([found.joints, mid_hips(found.joints)[..., None, :]], dim=-2)
+    lengths = [(points[..., a, :] - points[..., b, :]).norm(dim=-1) for a, b in BONES]
+    total = torch.stack(lengths).sum(dim=0)[0, 30]
+    assert float(total) == pytest.approx(
+        2.39 * 1.7, rel=1e-4
+    )  # the ends of the film are seen a little otherwise
+    camera_m = torch.tensor(CAMERA.position_m, dtype=torch.float64)
+    seen = [p.joints[0, 30] + p.root[0, 30] - camera_m for p in (known, found)]
+    ratio = seen[1].norm(dim=-1) / seen[0].norm(dim=-1)
+    assert abs(float(ratio[0]) - 1) > 0.01
+    torch.testing.assert_close(seen[1], ratio[0] * seen[0])
 
 
 def test_frames_out_of_reach_have_no_say() -> None:
