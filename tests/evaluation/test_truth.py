@@ -137,7 +137,8 @@ def test_a_true_stage_leaves_its_error_out(stage: str, pipelines: Pipelines) -> 
     usual, better = error(Setting("b")), error(Setting("b", true_stage=stage))
     if stage == "lifting":
         local = [e - mid_hips(e)[:, None] for e in (usual, better)]
-        assert float(local[1].square().mean()) < 0.1 * float(local[0].square().mean())
+        # The usual lifter, from exact key points and with bones of their lengths, is 2 mm off.
+        assert float(local[1].square().mean()) < 0.4 * float(local[0].square().mean())
     elif stage == "position":
         assert float(mid_hips(better).abs().max()) < 0.1 * float(mid_hips(usual).abs().max())
     elif stage == "smoothing":
@@ -459,10 +460,10 @@ def test_an_activity_by_itself_has_a_floor(activity: str, tmp_path: Path) -> Non
 def test_another_lifter_has_cells_of_its_own(tmp_path: Path) -> None:
     loops = [
         truth.TruthLoop(tmp_path, clips=1, activities=("S8 Walking",), lifter=name)
-        for name in (None, "temporal")
+        for name in (None, "nearest")
     ]
     clip = loops[0].rows()["S8 Walking"][0]
     assert loops[0].cell("S8 Walking", clip, "b") != loops[1].cell("S8 Walking", clip, "b")
     kinds = [type(loop.pipelines().lifters[False]).__name__ for loop in loops]
-    assert kinds == ["NearestPoseLifter", "TemporalLifter"]
-    assert type(loops[1].pipelines().lifters[True]).__name__ == "NearestPoseLifter"  # the paper's
+    assert kinds == ["TemporalLifter", "NearestPoseLifter"]
+    assert type(loops[0].pipelines().lifters[True]).__name__ == "NearestPoseLifter"  # the paper's
