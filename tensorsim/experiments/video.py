@@ -26,6 +26,7 @@ from tensorsim.render.renderer import PersonRenderer
 from tensorsim.training.maps import SCENES
 from tensorsim.vision.detection.acf import AcfDetector
 from tensorsim.vision.detection.rtmdet import RTMDet
+from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
 from tensorsim.vision.tracking.mosse import MosseTracker
@@ -97,19 +98,20 @@ class Watcher:
     def __init__(self) -> None:
         self.detector = RTMDet.from_pretrained()
         self.pose = pretrained_pose()
+        self.matching = NearestPoseLifter(pitch_rad=CAMERA.pitch_rad)
         tcn = VideoPoseLifter(VideoPose3D.from_pretrained(), HEIGHT, WIDTH)
         self.chains: dict[str, Chain] = {
-            FULL: _matched(self.detector, self.pose),
+            FULL: _lifted(self.detector, self.pose, self.matching),
             MOSSE: self._by_mosse,
-            ACF: _matched(AcfDetector.from_pretrained(), self.pose),
-            CPM: _matched(self.detector, pretrained_pose("cpm-pose-small")),
-            TCN: _matched(self.detector, self.pose, tcn),
+            ACF: _lifted(AcfDetector.from_pretrained(), self.pose, self.matching),
+            CPM: _lifted(self.detector, pretrained_pose("cpm-pose-small"), self.matching),
+            TCN: _lifted(self.detector, self.pose, tcn),
             TEMPORAL: self._by_temporal_lifter,
         }
         self.missing: dict[str, str] = {}
         for name, row in BY_NAME.items():
             if find(name).path.is_file():
-                self.chains[row] = _matched(self.detector, pretrained_pose(name))
+                self.chains[row] = _lifted(self.detector, pretrained_pose(name), self.matching)
             else:
                 self.missing[row] = f"needs the published weights: tensorsim models fetch {name}"
 
@@ -129,13 +131,13 @@ class Watcher:
         before = torch.zeros(tracks.valid.shape[1], first, dtype=torch.bool)
         boxes = torch.cat([tracks.boxes.new_zeros(len(before), first, 4), tracks.boxes[0]], dim=1)
         valid = torch.cat([before, tracks.valid[0]], dim=1)
-        stage = VideoToPose(self.detector, self.pose, (height_m,), camera=CAMERA).eval()
+        stage = VideoToPose(self.detector, self.pose, (height_m,), camera=CAMERA, lifter=self.matching).eval()
         keypoints, scores = stage.estimate(frames, boxes.transpose(0, 1), valid.transpose(0, 1))
         return Observed(boxes, valid, keypoints.transpose(0, 1), scores.transpose(0, 1)).lifted_by(stage)
 
 
-def _matched(detector: nn.Module, pose: nn.Module, lifter: nn.Module | None = None) -> Chain:
-    """The chain with a lifter that knows no camera; None is nearest matching."""
+def _lifted(detector: nn.Module, pose: nn.Module, lifter: nn.Module) -> Chain:
+    """The chain with a lifter that knows no camera but its tilt."""
 
     def watch(frames: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
         return _joints(VideoToPose(detector, pose, (height_m,), camera=CAMERA, lifter=lifter), frames)
