@@ -141,6 +141,7 @@ def film_accuracy(
         batch=64,
         seed=seed,
         workers=0,
+        precision="float32",  # gradients of depthwise convolutions in bfloat16 come out as NaN at times
         checkpoint_every=max(1, min(50, training.steps)),
         validate_every=training.steps,
         ema_decay=0.99 if training.steps > 500 else 0.9,
