@@ -24,6 +24,18 @@ def mid_hips(joints: Tensor) -> Tensor:
     )  # literals: TorchScript reads no constants of modules
 
 
+def bone_lengths(joints: Tensor, ends: Tensor) -> Tensor:
+    """Lengths (..., 12) of the bones of bodies (..., 14, 3).
+
+    Args:
+        joints: in any unit of length; below a thousandth of it a length is that.
+        ends: (2, 12) int64, ``torch.tensor(BONES).T``, which TorchScript cannot read here.
+    """
+    points = torch.cat([joints, mid_hips(joints)[..., None, :]], dim=-2)
+    along = points.index_select(-2, ends[0]) - points.index_select(-2, ends[1])
+    return along.square().sum(dim=-1).clamp(min=1e-6).sqrt()
+
+
 def body_height(joints: Tensor) -> Tensor:
     """Standing height of the body from its legs and trunk, in any pose.
 

@@ -74,8 +74,8 @@ class EvaluateFilms(NetworkOptions):
         people = PoseConfig() if self.lifter is None else PoseConfig(lifter=self.lifter)
         stage = VideoToPose(
             *load_networks(*networks, self.flip_test, self.engine), lifter=pretrained_lifter(people)
-        )
-        stage = stage.to(device).eval()
+        ).eval()
+        stage.to(device)
         reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:

@@ -25,8 +25,8 @@ class RealConfig:
     """Settings of ``real``.
 
     Attributes:
-        data: folder of measured sets (glasgow_cfar_masks, kmkim_cw24_iq, radhar_points).
-        films: folder of real films with labels.json. Neither it nor ``data`` is refused.
+        data: folder of measured sets (glasgow_cfar_masks, kmkim_cw24_iq, radhar_points); "" leaves them out.
+        films: folder of real films with labels.json; "" leaves them out. At least one of both must be given.
         maps: folder of simulated maps of everyday motion, to train on for films; "" is one in the cache.
         groups: of these maps; a group is some 100 clips, and takes 10 s where it is missing.
         film_steps: batches of 64 of each training on them.
@@ -137,7 +137,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     """Real films labelled by networks trained on maps of everyday motion, all of the same maps."""
     films = film_pictures(Path(config.films), config.size, work)
     maps = Path(config.maps) if config.maps else work.cache / "everyday-maps"
-    training = EverydayTraining(maps, config.groups, config.size, config.film_steps)
+    training = EverydayTraining(maps, config.groups, config.size, config.film_steps, work.quiet)
     jobs = [(name, seed) for seed in range(config.seeds) for name in config.networks]
     results: dict[str, list[dict[str, float]]] = {name: [] for name in config.networks}
     for name, seed in tqdm(jobs, desc="films", unit="training", disable=work.quiet):
@@ -202,7 +202,7 @@ def _simulated(config: RealConfig, measured: MeasuredSet, work: Work) -> tuple[T
 
 
 def quick_real() -> RealConfig:
-    """Two small networks on a few clips; the folder of measured sets has still to be given."""
+    """Two small networks on a few clips; the folders of measured sets or films have still to be given."""
     return RealConfig(
         groups=5, film_steps=20, networks=("ccln", "diat-radharnet"), clips=4, size=32, steps=4, seeds=1
     )

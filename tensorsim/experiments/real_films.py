@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,14 +23,13 @@ from tensorsim.recognition.networks import find_classifier
 from tensorsim.recognition.timeline import windows_of
 from tensorsim.registry import locate
 from tensorsim.streaming import maps_of_pose
+from tensorsim.training.classifier import RANGE_DB
 from tensorsim.training.everyday_classifier import EverydayRecipe
 from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
 from tensorsim.training.loop import LoopConfig, fit
 
 #: Configurations of the scenes.
 SCENES = {"free-space": SimulationConfig.free_space(), "through-wall": SimulationConfig.through_wall()}
-#: Largest speed that the pictures show, m/s, and their dynamic range.
-SPEED_M_S, RANGE_DB = 3.8, 40.0
 
 
 class FilmPictures(NamedTuple):
@@ -54,12 +54,22 @@ class EverydayTraining:
         groups: of maps, every fifth for validation.
         size: height and width of the pictures: 32 or 64.
         steps: batches of 64.
+        quiet: no progress bar.
     """
 
     maps: Path
     groups: int
     size: int
     steps: int
+    quiet: bool = False
+
+    @cached_property
+    def store(self) -> EverydayStore:
+        """The maps, read once for all trainings; with the settings of those that are there."""
+        described = self.maps / "settings.json"
+        stated = json.loads(described.read_text(encoding="utf-8")) if described.is_file() else {}
+        build_everyday(self.maps, self.groups, EverydaySettings(**stated), quiet=self.quiet)
+        return EverydayStore(self.maps, range(self.groups))
 
 
 def film_pictures(folder: Path, size: int, work: Work) -> list[FilmPictures]:
@@ -88,11 +98,11 @@ def _made(films: list[LabelledFilm], size: int, work: Work) -> dict[str, Tensor]
     networks = locate(None, "RTMDet"), locate(None, "HRNet")
     stage = VideoToPose.from_config(SimulationConfig()).eval()
     reader = FilmReader(stage, networks, work.cache / "films")
-    cpu = torch.device("cpu")
+    cpu, speed_m_s = torch.device("cpu"), EverydaySettings().speed_m_s
     scenes = {
         scene: Scene(
             PoseToDoppler.from_config(config),
-            ActivityRecognizer(config.scene.radar, nn.Identity(), "doppler", size, SPEED_M_S, RANGE_DB),
+            ActivityRecognizer(config.scene.radar, nn.Identity(), "doppler", size, speed_m_s, RANGE_DB),
         )
         for scene, config in SCENES.items()
     }
@@ -122,15 +132,11 @@ def film_accuracy(
         Share of held-out clips, as the pipeline finds them in films, and of real films that are labelled rightly, for
         each scene.
     """
-    described = training.maps / "settings.json"
-    stated = json.loads(described.read_text(encoding="utf-8")) if described.is_file() else {}
-    build_everyday(training.maps, training.groups, EverydaySettings(**stated), quiet=work.quiet)
-    recipe = EverydayRecipe(
-        name, EverydayStore(training.maps, range(training.groups)), training.size, seed, learning_rate=1e-3
-    )
+    recipe = EverydayRecipe(name, training.store, training.size, seed, learning_rate=1e-3)
     settings = {
         "network": name,
         "seed": seed,
+        "maps": str(training.maps.resolve()),
         "groups": training.groups,
         "size": training.size,
         "steps": training.steps,
@@ -142,7 +148,7 @@ def film_accuracy(
         seed=seed,
         workers=0,
         precision="float32",  # gradients of depthwise convolutions in bfloat16 come out as NaN at times
-        checkpoint_every=max(1, min(50, training.steps)),
+        checkpoint_every=min(50, training.steps),
         validate_every=training.steps,
         ema_decay=0.99 if training.steps > 500 else 0.9,
         quiet=work.quiet,

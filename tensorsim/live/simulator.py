@@ -1,7 +1,6 @@
 """The whole live chain: a frame in, people, new columns of the maps and a label out."""
 
 import copy
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,7 +108,7 @@ class LiveSimulator:
     ) -> None:
         check_positive(fps, "fps")
         config = SimulationConfig() if config is None else config
-        config = config.replace(pose=replace(config.pose, lifter="nearest", lifter_weights=None))
+        config = config.replace(pose__lifter_weights=None, pose__lifter="nearest")
         for name, given in (
             ("an initial distance", config.pose.initial_distance_m is not None),
             ("calibration", config.pose.calibrate),

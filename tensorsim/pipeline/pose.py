@@ -44,8 +44,7 @@ class VideoToPose(nn.Module):
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages; ``lifter`` is the shipped
-            :class:`~tensorsim.vision.TemporalLifter`. A ``metric_pose`` has heights,
-            distances and camera of its own.
+            :class:`~tensorsim.vision.TemporalLifter`. A ``metric_pose`` has heights, distances and camera of its own.
         bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
             keypoints that are exact; None leaves it out.
 
@@ -102,7 +101,8 @@ class VideoToPose(nn.Module):
         self.metric_pose = metric_pose
         # A replacement is called with what every metric pose takes. TorchScript compiles one of both calls.
         self.asks_for_edges = isinstance(metric_pose, MetricPose)
-        self.camera_m = _camera_position(metric_pose)
+        known = metric_pose.camera if isinstance(metric_pose, MetricPose) else CameraConfig()
+        self.camera_m = known.position_m
         self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
@@ -355,14 +355,6 @@ class VideoToPose(nn.Module):
         # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
         there = usable | brief_gaps(usable, int(self.longest_gap_s * fps))
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
-
-
-def _camera_position(metric_pose: nn.Module) -> tuple[float, float, float]:
-    """Of the camera of a metric pose, in metres; that of the default one if it says nothing of a camera."""
-    if not isinstance(metric_pose, MetricPose):
-        return CameraConfig().position_m
-    x, y, z = metric_pose.camera_pose[:, 3].tolist()
-    return x, y, z
 
 
 def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> TemporalLifter:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import BONES, coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, bone_lengths, coco_to_body, mid_hips
 from tensorsim.training.lifter_motion import MotionPool
 from tensorsim.training.lifter_views import THRESHOLD, Windows, film
 from tensorsim.training.loop import Batch, Recipe
@@ -37,19 +37,6 @@ def _about_hips(joints: Tensor) -> Tensor:
     return joints - mid_hips(joints)[..., None, :]
 
 
-def _bone_lengths(joints: Tensor) -> Tensor:
-    """(B, T, 12) lengths of the bones."""
-    points = torch.cat([joints, mid_hips(joints)[..., None, :]], dim=-2)
-    first, second = zip(*BONES, strict=True)
-    return (
-        (points[..., list(first), :] - points[..., list(second), :])
-        .square()
-        .sum(dim=-1)
-        .clamp(min=1e-6)
-        .sqrt()
-    )
-
-
 def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> dict[str, Tensor]:
     """The loss and its terms.
 
@@ -74,7 +61,8 @@ def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> di
     hips_moved = torch.diff((hips / far).log() * far.clamp(max=4.0), dim=1) * rate[..., 0, 0]
     pairs = torch.minimum(weight[:, 1:], weight[:, :-1])
     speed = (moved.square().sum(dim=-1) + 1e-4).sqrt() * each
-    lengths = _bone_lengths(found.joints).log() - _bone_lengths(true).log()
+    ends = torch.tensor(BONES).T
+    lengths = bone_lengths(found.joints, ends).log() - bone_lengths(true, ends).log()
     spread = (
         laplace(across.detach(), found.log_spread[..., 0]) + laplace(along.detach(), found.log_spread[..., 1])
     ).mean(dim=-1) + laplace(off_range.detach(), found.log_range_spread)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import BONES, coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, bone_lengths, coco_to_body, mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.errors import (
     TensorsimError,
@@ -252,9 +252,7 @@ class TemporalLifter(nn.Module):
         if self.camera_known:
             return found, sight.azimuth
         # As seen from the camera, a body twice as far away and twice as large looks the same.
-        points = torch.cat([found.joints, mid_hips(found.joints)[..., None, :]], dim=-2)
-        bones = points.index_select(-2, self.bones[0]) - points.index_select(-2, self.bones[1])
-        excess = bones.square().sum(dim=-1).clamp(min=1e-12).sqrt().sum(dim=-1).log() - self.log_bones
+        excess = bone_lengths(found.joints, self.bones).sum(dim=-1).log() - self.log_bones
         excess = windowed_mean(excess[..., None], valid.to(excess.dtype) + 1e-3)[..., 0]
         joints = found.joints * torch.exp(-excess)[..., None, None]
         return Located(joints, found.log_spread, found.log_range_spread), sight.azimuth
