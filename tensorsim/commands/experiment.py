@@ -68,6 +68,8 @@ class RunExperiment:
     """Of people, motion and noise."""
     jobs: int = 1
     """Processes at a time."""
+    settings: str | None = None
+    """Folder with the NAME.yaml of earlier runs, for `paper`: the sizes of its experiments."""
     quiet: bool = False
     """No progress bars."""
 
@@ -103,5 +105,6 @@ class RunExperiment:
         names = (
             "networks", "scenes", "inputs", "denoisers", "activities", "data", "films", "maps", "groups", "clips",
             "test_clips", "size", "epochs", "steps", "film_steps", "length_s", "seeds", "snr_db", "seed",
+            "settings",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}

@@ -33,7 +33,22 @@ class Experiment:
 
 
 def _paper(config: paper.PaperConfig, work: Work) -> Report:
-    return paper.paper_report(config, work, {name: e for name, e in EXPERIMENTS.items() if name != "paper"})
+    experiments = {name: e for name, e in EXPERIMENTS.items() if name != "paper"}
+    settings = {name: _settings_in_paper(name, config) for name in experiments}
+    if not config.data and not config.films:
+        del settings["real"]
+    return paper.paper_report(settings, work, experiments)
+
+
+def _settings_in_paper(name: str, config: paper.PaperConfig) -> Any:
+    file = Path(config.settings) / f"{name}.yaml"
+    folders = {"data": config.data, "films": config.films, "maps": config.maps}
+    return configuration(
+        name,
+        config.quick,
+        file if config.settings and file.is_file() else None,
+        folders if name == "real" else {},
+    )
 
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from tensorsim.errors import TensorsimError
 from tensorsim.experiments.work import Report, Table, Work
 
 if TYPE_CHECKING:
@@ -20,33 +22,40 @@ class PaperConfig:
 
     Attributes:
         quick: all of them in their quick form.
+        settings: folder with the NAME.yaml of earlier runs; experiments without one have their defaults.
         data, films: folders of measured sets and of real films for ``real``; without both, that one is left out.
+        maps: folder of simulated maps of everyday motion for ``real``; "" is one in the cache.
     """
 
     quick: bool = False
+    settings: str = ""
     data: str = ""
     films: str = ""
+    maps: str = ""
+
+    def __post_init__(self) -> None:
+        if self.settings and not any(Path(self.settings).glob("*.yaml")):
+            raise TensorsimError(
+                f"--settings: got {self.settings}, expected a folder with NAME.yaml of experiments"
+            )
+        if self.settings and self.quick:
+            raise TensorsimError("--settings: got a folder and --quick, expected one of them")
 
 
-def paper_report(config: PaperConfig, work: Work, experiments: Mapping[str, Experiment]) -> Report:
-    """The reports of the experiments under one roof; each has its own settings."""
-    from dataclasses import replace
-
+def paper_report(settings: Mapping[str, Any], work: Work, experiments: Mapping[str, Experiment]) -> Report:
+    """The reports of these experiments under one roof, each with its settings."""
     notes: list[str] = [
         "The experiments of RadHARSimulator V2 (arXiv 2511.09022), made again on declared data with declared figures."
     ]
     tables: list[Table] = []
     drawn: dict[str, Figure] = {}
     for name, experiment in experiments.items():
-        settings = experiment.quick() if config.quick else experiment.config()
-        if name == "real":
-            if not config.data and not config.films:
-                notes.append(
-                    "**real** is left out: no folder of measured sets (--data) or of films (--films) was given."
-                )
-                continue
-            settings = replace(settings, data=config.data, films=config.films)
-        found = experiment.run(settings, work)
+        if name not in settings:
+            notes.append(
+                f"**{name}** is left out: no folder of measured sets (--data) or of films (--films) was given."
+            )
+            continue
+        found = experiment.run(settings[name], work)
         notes += [f"**{name}**: {found.notes[0]}", *found.notes[1:]]
         tables += [
             Table(f"{name}: {t.title}", t.columns, t.rows, t.digits, f"{name}-{t.file}" if t.file else name)

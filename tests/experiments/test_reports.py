@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip
-from tensorsim.experiments import ablations, networks, paper, real, real_films, video
+from tensorsim.experiments import ablations, catalogue, networks, paper, real, real_films, video
 from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
 from tensorsim.experiments.trials import Trial
@@ -238,11 +238,39 @@ def test_the_paper_joins_all_reports(tmp_path: Path) -> None:
         return Report(["Note.", "More."], [Table("T", ["a"], [[str(config)]])])
 
     entries = {name: Experiment(name, paper.PaperConfig, run, lambda: "quick") for name in ("one", "real")}
-    report = paper.paper_report(paper.PaperConfig(quick=True), Work(tmp_path), entries)
+    report = paper.paper_report({"one": "quick"}, Work(tmp_path), entries)
     assert [table.title for table in report.tables] == ["one: T"]
     assert [table.file for table in report.tables] == ["one"]
+    assert report.tables[0].rows == [["quick"]]
     assert any("**real** is left out" in note for note in report.notes)
-    assert "paper" in EXPERIMENTS
+
+
+def test_the_paper_takes_the_settings_of_earlier_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def recorded(name: str) -> Experiment:
+        def run(config: Any, work: Work) -> Report:
+            asked[name] = config
+            return Report(["Note."], [])
+
+        return replace(EXPERIMENTS[name], run=run)
+
+    entries = {name: recorded(name) if name != "paper" else EXPERIMENTS[name] for name in EXPERIMENTS}
+    monkeypatch.setattr(catalogue, "EXPERIMENTS", entries)
+    (tmp_path / "echo-ablation.yaml").write_text("experiment: echo-ablation\nclips: 3\nseed: 0\n")
+    (tmp_path / "real.yaml").write_text("experiment: real\ndata: elsewhere\nmaps: elsewhere\nclips: 7\n")
+    config = paper.PaperConfig(settings=str(tmp_path), data="measured")
+    EXPERIMENTS["paper"].run(config, Work(tmp_path, quiet=True))
+    assert set(asked) == set(EXPERIMENTS) - {"paper"}
+    assert asked["echo-ablation"] == ablations.EchoConfig(clips=3)
+    assert asked["denoiser-ablation"] == ablations.DenoiserConfig()
+    assert asked["real"] == real.RealConfig(data="measured", clips=7)
+    with pytest.raises(
+        TensorsimError, match=r"--settings: got .*, expected a folder with NAME.yaml of experiments"
+    ):
+        paper.PaperConfig(settings=str(tmp_path / "none"))
 
 
 def test_stored_results_are_of_known_experiments() -> None:
