@@ -1,5 +1,6 @@
 """Long films, frame by frame, and long motion, pulse by pulse: memory does not grow with their length."""
 
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.progress import picture, progress_bar
+from tensorsim.threads import spread
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 from tensorsim.vision.calibration.calibrator import (
     CameraCalibrator,
@@ -111,14 +113,17 @@ def detections_of_film(
     found: list[Detections] = []
     count = 0
     last = torch.empty(0)
+
+    def detected(frames: Tensor) -> tuple[int, Tensor, Detections]:
+        # Chunks begin at multiples of the interval.
+        return frames.shape[0], frames[-1:], stage.detect(frames[::interval].to(device))
+
     with progress_bar("detect", reader.frame_count, quiet) as bar:
-        for frames in reader.chunks(size * interval):
-            index = torch.arange(count, count + frames.shape[0])
-            if bool((index % interval == 0).any()):
-                found.append(stage.detect(frames[index % interval == 0].to(device)))
-            count += frames.shape[0]
-            last = frames[-1:].clone()
-            bar.update(frames.shape[0])
+        for length, shown, detections in spread(detected, reader.chunks(size * interval), device):
+            found.append(detections)
+            last = shown
+            count += length
+            bar.update(length)
         bar.total = count
     if count < 2:
         raise TensorsimError(
@@ -145,20 +150,25 @@ def keypoints_of_film(
     boxes, valid = tracks.boxes[0].transpose(0, 1), tracks.valid[0].transpose(0, 1)
     keypoints: list[Tensor] = []
     scores: list[Tensor] = []
-    done = 0
-    with progress_bar("pose", boxes.shape[0], quiet) as bar:
+
+    def parts() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        done = 0
         for frames in reader.chunks(stage.frames_per_batch):
             stop = done + frames.shape[0]
-            k, s = stage.estimate(frames.to(device), boxes[done:stop], valid[done:stop])
+            yield frames, boxes[done:stop], valid[done:stop]
+            done = stop
+
+    def estimated(part: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, ...]:
+        frames, box, there = part
+        return *part, *stage.estimate(frames.to(device), box, there)
+
+    with progress_bar("pose", boxes.shape[0], quiet) as bar:
+        for frames, box, there, k, s in spread(estimated, parts(), device):
             keypoints.append(k)
             scores.append(s)
             if background is not None:
-                background.add(frames, boxes[done:stop], valid[done:stop])
-            picture(
-                "film",
-                partial(_drawn, frames, boxes[done:stop], k, s, valid[done:stop], stage.keypoint_threshold),
-            )
-            done = stop
+                background.add(frames, box, there)
+            picture("film", partial(_drawn, frames, box, k, s, there, stage.keypoint_threshold))
             bar.update(frames.shape[0])
     return torch.cat(keypoints).transpose(0, 1).unsqueeze(0), torch.cat(scores).transpose(0, 1).unsqueeze(0)
 

@@ -1,4 +1,4 @@
-"""Work in a second thread: decoding and encoding of films, in which OpenCV lets other threads run."""
+"""Work in other threads: decoding and encoding of films, and networks on several parts of a film at a time."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -7,6 +7,10 @@ from contextlib import contextmanager
 from contextvars import copy_context
 from threading import Event
 from typing import Any, TypeVar
+
+import torch
+
+from tensorsim.device import one_thread
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,6 +27,42 @@ def ahead(items: Generator[Item, None, None], count: int = 2) -> Iterator[Item]:
                 yield item
         finally:
             pool.submit(items.close)
+
+
+#: Items that are worked on at a time, at most: of a film each needs the memory of its frames.
+MOST_AT_A_TIME = 4
+
+
+def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.device) -> Iterator[Result]:
+    """``work`` of each item, in the order of the items; on the CPU by several threads at a time.
+
+    Small convolutions gain little from a second thread, while two parts of a film side by side take half as long. So
+    torch computes on one thread in each, and as many items are worked on as it had threads. ``work`` must not
+    depend on what it was given before. Items are taken in the thread of the caller, and errors come in their place.
+    """
+    count = min(torch.get_num_threads(), MOST_AT_A_TIME) if device.type == "cpu" else 1
+    if count == 1:
+        yield from map(work, items)
+        return
+    inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    def in_mode(item: Item) -> Result:
+        # Both modes are of a thread.
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            return work(item)
+
+    waiting: deque[Future[Result]] = deque()
+    with one_thread(), ThreadPoolExecutor(count) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(copy_context().run, in_mode, item))
+                if len(waiting) == count:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 @contextmanager

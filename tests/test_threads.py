@@ -5,8 +5,9 @@ from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 
 import pytest
+import torch
 
-from tensorsim.threads import ahead, beside
+from tensorsim.threads import ahead, beside, spread
 
 
 class Counted:
@@ -76,3 +77,78 @@ def test_a_block_that_fails_ends_the_work() -> None:
 def test_work_that_fails_fails_the_block() -> None:
     with pytest.raises(ValueError, match="broken"), beside(sum, iter(Counted(3, fails=True))):
         pass
+
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_items_are_worked_on_side_by_side_and_come_in_order() -> None:
+    met = threading.Barrier(2)
+
+    def work(number: int) -> int:
+        met.wait(10.0)  # two at a time, or never
+        return number * number
+
+    source = Counted(20)
+    taken = 0
+    for found in spread(work, iter(source), CPU):
+        assert found == taken * taken
+        taken += 1
+        assert source.made <= taken + 2
+    assert taken == 20
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_work_in_threads_has_the_modes_and_the_context_of_the_caller() -> None:
+    setting: ContextVar[str] = ContextVar("setting", default="none")
+    setting.set("of the caller")
+
+    def work(number: int) -> tuple[bool, bool, int, str]:
+        return (
+            torch.is_inference_mode_enabled(),
+            torch.is_grad_enabled(),
+            torch.get_num_threads(),
+            setting.get(),
+        )
+
+    with torch.inference_mode():
+        assert set(spread(work, range(4), CPU)) == {(True, False, 1, "of the caller")}
+    with torch.no_grad():
+        assert set(spread(work, range(4), CPU)) == {(False, False, 1, "of the caller")}
+    assert set(spread(work, range(4), CPU)) == {(False, True, 1, "of the caller")}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_an_error_in_one_item_comes_in_its_place_and_ends_the_others() -> None:
+    begun = []
+
+    def work(number: int) -> int:
+        begun.append(number)
+        if number == 3:
+            raise ValueError("broken")
+        return number
+
+    results = spread(work, range(1000), CPU)
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(ValueError, match="broken"):
+        next(results)
+    assert max(begun) < 7
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_on_other_devices_items_are_worked_on_one_by_one() -> None:
+    def work(number: int) -> str:
+        return threading.current_thread().name
+
+    assert set(spread(work, range(3), torch.device("cuda"))) == {threading.current_thread().name}

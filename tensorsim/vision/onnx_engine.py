@@ -9,6 +9,7 @@ import io
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import torch
@@ -20,6 +21,9 @@ from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
+
+#: Held while a session is opened: parts of a film come in several threads, and the exporter stands only one.
+_OPENING = Lock()
 
 
 class OnnxEngine(nn.Module):
@@ -47,8 +51,9 @@ class OnnxEngine(nn.Module):
         """The outputs of the network, flat."""
         if images.device.type != "cpu" or images.dtype != torch.float32 or images.shape[0] == 0:
             return _flat(self.network(images))
-        if self._session is None:
-            self._session = _session(self.network, self.size, self.int8)
+        with _OPENING:
+            if self._session is None:
+                self._session = _session(self.network, self.size, self.int8)
         found = self._session.run(None, {"images": images.contiguous().numpy()})
         return [torch.from_numpy(output) for output in found]
 
