@@ -125,7 +125,7 @@ def _on_measured(config: RealConfig, sets: list[MeasuredSet], work: Work) -> Rep
     chance = ", ".join(f"{measured.name} {100 / len(measured.classes):.0f} %" for measured in sets)
     notes = [
         f"Trained on {config.clips} simulated clips of each class in {config.size}x{config.size} pixels, "
-        f"{config.steps} batches of 64 (AdamW, one cycle), {config.seeds} trainings each; tested on all measured "
+        f"{config.steps} batches of 64 (AdamW, one cycle), {_trainings(config)} each; tested on all measured "
         f"clips of {config.data}. Chance is {chance}. The paper's measured maps are not published.",
     ]
     title = "Accuracy on measured radar, trained on simulation alone"
@@ -153,10 +153,10 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     columns = ["network", *(f"{scene} {kind} %" for kind in ("clips", "films") for scene in SCENES)]
     notes = [
         f"Films: trained on {config.groups} groups of simulated maps of everyday motion in "
-        f"{config.size}x{config.size} pixels, {config.film_steps} batches of 64 (AdamW, cosine), {config.seeds} "
-        f"trainings each. `clips` are held-out ones of the same kind, as the pipeline finds them in films, `films` the "
-        f"{len(films)} of {config.films}: people found by the shipped networks, camera estimated. One film is "
-        f"{100 / len(films):.0f} points; chance is 8 %."
+        f"{config.size}x{config.size} pixels, {config.film_steps} batches of 64 (AdamW, cosine), "
+        f"{_trainings(config)} each. `clips` are held-out ones of the same kind, as the pipeline finds them in films, "
+        f"`films` the {len(films)} of {config.films}: people found by the shipped networks, camera estimated. "
+        f"One film is {100 / len(films):.0f} points; chance is 8 %."
     ]
     title = "Accuracy on real films, trained on simulation alone"
     shown = {row[0]: {scene: (row[3 + k], float("nan")) for k, scene in enumerate(SCENES)} for row in rows}
@@ -165,6 +165,10 @@ def _on_films(config: RealConfig, work: Work) -> Report:
         [Table(title, columns, rows, file="films")],
         {"films": figures.bars(shown, "accuracy, %", title)},
     )
+
+
+def _trainings(config: RealConfig) -> str:
+    return "one training" if config.seeds == 1 else f"{config.seeds} trainings"
 
 
 def _identity(data: Path, measured: MeasuredSet) -> list[Any]:
