@@ -114,14 +114,19 @@ def detections_of_film(
     count = 0
     last = torch.empty(0)
 
-    def detected(frames: Tensor) -> tuple[int, Tensor, Detections]:
-        # Chunks begin at multiples of the interval.
-        return frames.shape[0], frames[-1:], stage.detect(frames[::interval].to(device))
+    def parts() -> Iterator[tuple[int, Tensor, Tensor]]:
+        for frames in reader.chunks(size * interval):
+            # Copies, so that the other frames need no memory; chunks begin at multiples of the interval.
+            yield frames.shape[0], frames[::interval].clone(), frames[-1:].clone()
+
+    def detected(part: tuple[int, Tensor, Tensor]) -> tuple[int, Tensor, Detections]:
+        length, frames, final = part
+        return length, final, stage.detect(frames.to(device))
 
     with progress_bar("detect", reader.frame_count, quiet) as bar:
-        for length, shown, detections in spread(detected, reader.chunks(size * interval), device):
+        for length, final, detections in spread(detected, parts(), device):
             found.append(detections)
-            last = shown
+            last = final
             count += length
             bar.update(length)
         bar.total = count
@@ -131,7 +136,7 @@ def detections_of_film(
         )
     if (count - 1) % interval:
         found.append(stage.detect(last.to(device)))
-    whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+    whole = Detections(*(torch.cat(field) for field in zip(*found, strict=True)))
     return whole, stage.observed_frames(stage.frames_present(1, count, None, whole.boxes.device))
 
 

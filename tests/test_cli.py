@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -66,7 +67,10 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     return ["--detector", str(weights), "--pose", str(weights), "--scene", "through-wall", "--quiet"]
 
 
-def test_streaming_equals_the_graph(walk: Path) -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+def test_streaming_equals_the_graph(walk: Path, threads: int, request: pytest.FixtureRequest) -> None:
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+    torch.set_num_threads(threads)
     reader = VideoReader(walk)
     stage = VideoToPose(RectangleDetector(), StandingPose(), frames_per_batch=3)
     whole = torch.cat(list(reader.chunks(100)))
