@@ -16,7 +16,7 @@ from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
 from tensorsim.experiments import figures
-from tensorsim.experiments.work import Report, Table, Work, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
 from tensorsim.training.denoiser import simulate_pair
@@ -142,11 +142,12 @@ def echo_report(config: EchoConfig, work: Work) -> Report:
     }
     notes = [
         "Linear PSNR in dB of maps of the through-wall scene, against those of the complete echo model of the same "
-        f"motion, free of noise; {config.clips} clips of {CLIP_S:g} s per activity. In free space there is no wall "
-        "to leave out. Without attenuation the echo keeps its delay in the wall; without multipath the bounces in "
-        "the wall are left out. People are behind the wall, which weakens all of their echoes alike: without noise, "
-        "and with each map scaled by its own peak, leaving attenuation out changes nothing but the strength of the "
-        "echo, which the last column has. The paper compares with measured maps, which are not published.",
+        f"motion, free of noise; {counted(config.clips, 'clip')} of {CLIP_S:g} s per activity. In free space there is "
+        "no wall to leave out. Without attenuation the echo keeps its delay in the wall; without multipath the "
+        "bounces in the wall are left out. People are behind the wall, which weakens all of their echoes alike: "
+        "without noise, and with each map scaled by its own peak, leaving attenuation out changes nothing but the "
+        "strength of the echo, which the last column has. The paper compares with measured maps, which are not "
+        "published.",
         NORMALISATION,
     ]
     tables = [
@@ -172,6 +173,7 @@ class DenoiserConfig:
         scenes: names of radar presets.
         clips: per scene and ratio, one activity after another from S2 on.
         snr_db: signal-to-noise ratios.
+        columns: of each map at most, from its middle; K-SVD takes minutes for the 32 767 of a range-time map.
         seed: of people, motion and noise.
     """
 
@@ -179,6 +181,7 @@ class DenoiserConfig:
     scenes: tuple[str, ...] = SCENES
     clips: int = 22
     snr_db: tuple[float, ...] = (0.0, 10.0, 20.0)
+    columns: int = 1024
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -190,14 +193,11 @@ class DenoiserConfig:
             "scenes": len(self.scenes),
             "snr_db": len(self.snr_db),
             "clips": self.clips,
+            "columns": self.columns,
         }
         for what, count in counts.items():
             if count < 1:
                 raise TensorsimError(f"{what}: got {count}, expected at least 1")
-
-
-#: Columns of range-time maps that are denoised: K-SVD takes minutes for the 32 767 of free space.
-_COLUMNS_AT_MOST = 1024
 
 
 def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
@@ -217,10 +217,11 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
         def make(
             scene: str = scene, ratio: float = ratio, clip: int = clip
         ) -> dict[str, dict[str, list[float]]]:
-            return _denoised(denoisers, scene, ratio, clip, config.seed)
+            return _denoised(denoisers, scene, ratio, clip, config)
 
         settings = {
             "scene": scene, "ratio": ratio, "clip": clip, "seed": config.seed, "denoisers": config.denoisers,
+            "columns": config.columns,
         }  # fmt: skip
         for view, of_view in work.kept("denoiser", settings, make).items():
             for name, figures_of_map in of_view.items():
@@ -233,11 +234,11 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
         shown.setdefault(f"{SHORT[view]}, {scene}, {ratio:g} dB", {})[name] = means[0]
     columns = ["scene", "map", "SNR", "denoiser", *COLUMNS]
     notes = [
-        f"{config.clips} clips per scene and ratio, the activities from S2 on in turn; each map against that of the "
-        "same echo at 50 dB. RTM is the range-time map after the moving target indicator, 1024 columns of it. "
-        "Envelope and ridges are speed errors of the Doppler-time map. K-SVD learns its dictionary by "
-        "scikit-learn's online method. DnCNN is the shipped network, trained on such maps of other people; the "
-        "paper's was trained on photographs.",
+        f"{counted(config.clips, 'clip')} per scene and ratio, the activities from S2 on in turn; each map against "
+        "that of the same echo at 50 dB. RTM is the range-time map after the moving target indicator. Of each map "
+        f"{config.columns} columns at most count. Envelope and ridges are speed errors of the Doppler-time map. K-SVD "
+        "learns its dictionary by scikit-learn's online method. DnCNN is the shipped network, trained on such maps of "
+        "other people; the paper's was trained on photographs.",
         NORMALISATION,
     ]
     drawn = {"psnr": figures.bars(shown, "PSNR, dB", "PSNR of denoised maps")}
@@ -246,14 +247,19 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
 
 @torch.no_grad()
 def _denoised(
-    denoisers: dict[str, Callable[[Tensor], Tensor] | None], scene: str, ratio: float, clip: int, seed: int
+    denoisers: dict[str, Callable[[Tensor], Tensor] | None],
+    scene: str,
+    ratio: float,
+    clip: int,
+    config: DenoiserConfig,
 ) -> dict[str, dict[str, list[float]]]:
     """Figures by map and denoiser, and of the two guesses, for one clip."""
     people = len(ACTIVITIES) - 1
     activity = 1 + clip % people
     # Another person of the same activity.
     pairs = [
-        simulate_pair(scene, activity, seed * 1_000_003 + n, ratio) for n in (clip, clip + 1000 * people)
+        simulate_pair(scene, activity, config.seed * 1_000_003 + n, ratio)
+        for n in (clip, clip + 1000 * people)
     ]
     radar = PRESETS[scene].radar
     bins = pairs[0][0].doppler_time.shape[0]
@@ -261,8 +267,8 @@ def _denoised(
     result: dict[str, dict[str, list[float]]] = {}
     for view, axis in (("range_time_mti", None), ("doppler_time", speed)):
         whole = [getattr(maps, view).float() for maps in (*pairs[0], pairs[1][1])]
-        first = max(0, (whole[0].shape[1] - _COLUMNS_AT_MOST) // 2)
-        noisy, clean, other = (x[:, first : first + _COLUMNS_AT_MOST] for x in whole)
+        first = max(0, (whole[0].shape[1] - config.columns) // 2)
+        noisy, clean, other = (x[:, first : first + config.columns] for x in whole)
         maps = {name: noisy if denoise is None else denoise(noisy) for name, denoise in denoisers.items()}
         maps |= {"empty map": torch.zeros_like(clean), "another clip": other}
         result[view] = {name: scores(x, clean, axis) for name, x in maps.items()}
@@ -275,5 +281,5 @@ def quick_echo() -> EchoConfig:
 
 
 def quick_denoisers() -> DenoiserConfig:
-    """One clip through the wall at one ratio; K-SVD takes most of a minute for its maps."""
-    return DenoiserConfig(scenes=("through-wall",), clips=1, snr_db=(10.0,))
+    """A quarter of one clip through the wall at one ratio: K-SVD would take most of a minute for more."""
+    return DenoiserConfig(scenes=("through-wall",), clips=1, snr_db=(10.0,), columns=256)

@@ -12,7 +12,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.experiments import figures
 from tensorsim.experiments.pictures import INPUTS
 from tensorsim.experiments.trials import Trial, run_trials
-from tensorsim.experiments.work import Report, Table, Work, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
 from tensorsim.recognition.networks import CLASSIFIERS, find_classifier
 from tensorsim.training.maps import SCENES
 
@@ -111,13 +111,13 @@ def check_trainings(networks: Sequence[str], scenes: Sequence[str], seeds: int) 
 def protocol(clips: int, test_clips: int, size: int, epochs: int, seeds: int) -> str:
     """What a table of accuracies says of how it came about."""
     return (
-        f"{clips} clips per class in {size}x{size} pixels, split 8:2 by person into training and validation (the "
-        f"epoch with the lowest validation loss is kept); accuracy is counted on {test_clips} clips per class of "
-        f"people who took no part in that. Adam 1.47e-3, a tenth of it in the second half, L2 1e-4, batch 64, "
-        f"{epochs} epochs, 50 dB; {seeds} trainings each, spread is the standard deviation between them. Each "
-        "picture is in dB below its own peak, cut at 40 dB. The paper trains once on 300 clips per class of 224x224 "
-        "pixels and gives confusion matrices of its validation clips as pictures, without numbers; it says neither "
-        "how its clips are split over people nor how its pictures are scaled."
+        f"{counted(clips, 'clip')} per class in {size}x{size} pixels, split 8:2 by person into training and validation "
+        f"(the epoch with the lowest validation loss is kept); accuracy is counted on {counted(test_clips, 'clip')} "
+        "per class of people who took no part in that. Adam 1.47e-3, a tenth of it in the second half, L2 1e-4, batch "
+        f"64, {counted(epochs, 'epoch')}, 50 dB; {counted(seeds, 'training')} each, spread is the standard deviation "
+        "between them. Each picture is in dB below its own peak, cut at 40 dB. The paper trains once on 300 clips per "
+        "class of 224x224 pixels and gives confusion matrices of its validation clips as pictures, without numbers; "
+        "it says neither how its clips are split over people nor how its pictures are scaled."
     )
 
 

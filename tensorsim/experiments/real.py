@@ -16,9 +16,10 @@ from tensorsim.evaluation.measured.training import fit_pictures, predict, square
 from tensorsim.experiments import figures
 from tensorsim.experiments.networks import USUAL
 from tensorsim.experiments.real_films import SCENES, EverydayTraining, film_accuracy, film_pictures, titled
-from tensorsim.experiments.work import Report, Table, Work, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
 from tensorsim.files import complete_file
 from tensorsim.recognition.networks import find_classifier
+from tensorsim.training.everyday_maps import EverydaySettings
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class RealConfig:
         films: folder of real films with labels.json; "" leaves them out. At least one of both must be given.
         maps: folder of simulated maps of everyday motion, to train on for films; "" is one in the cache.
         groups: of these maps; a group is some 100 clips, and takes 10 s where it is missing.
+        group_clips: clips per activity of a group that is made: as the pipeline finds them in films, and of the
+            motion itself.
+        film_count: films to label, the first of the folder; 0 is all.
         film_steps: batches of 64 of each training on them.
         networks: names of recognisers.
         clips: simulated clips of each class.
@@ -43,6 +47,8 @@ class RealConfig:
     films: str = ""
     maps: str = ""
     groups: int = 80
+    group_clips: tuple[int, int] = (6, 3)
+    film_count: int = 0
     film_steps: int = 1000
     networks: tuple[str, ...] = USUAL
     clips: int = 300
@@ -56,7 +62,7 @@ class RealConfig:
             find_classifier(name)
         for what, count, least in (
             ("clips", self.clips, 1), ("steps", self.steps, 1), ("seeds", self.seeds, 1), ("groups", self.groups, 5),
-            ("film_steps", self.film_steps, 1),
+            ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
             if count < least:
                 raise TensorsimError(f"{what}: got {count}, expected at least {least}")
@@ -124,9 +130,9 @@ def _on_measured(config: RealConfig, sets: list[MeasuredSet], work: Work) -> Rep
     columns = ["network", *(f"{measured.name}{part} %" for measured in sets for part in ("", ", spread"))]
     chance = ", ".join(f"{measured.name} {100 / len(measured.classes):.0f} %" for measured in sets)
     notes = [
-        f"Trained on {config.clips} simulated clips of each class in {config.size}x{config.size} pixels, "
-        f"{config.steps} batches of 64 (AdamW, one cycle), {_trainings(config)} each; tested on all measured "
-        f"clips of {config.data}. Chance is {chance}. The paper's measured maps are not published.",
+        f"Trained on {counted(config.clips, 'simulated clip')} of each class in {config.size}x{config.size} pixels, "
+        f"{config.steps} batches of 64 (AdamW, one cycle), {counted(config.seeds, 'training')} each; tested on all "
+        f"measured clips of {config.data}. Chance is {chance}. The paper's measured maps are not published.",
     ]
     title = "Accuracy on measured radar, trained on simulation alone"
     return Report(
@@ -136,15 +142,18 @@ def _on_measured(config: RealConfig, sets: list[MeasuredSet], work: Work) -> Rep
 
 def _on_films(config: RealConfig, work: Work) -> Report:
     """Real films labelled by networks trained on maps of everyday motion, all of the same maps."""
-    films = film_pictures(Path(config.films), config.size, work)
-    maps = Path(config.maps) if config.maps else work.cache / "everyday-maps"
-    training = EverydayTraining(maps, config.groups, config.size, config.film_steps, work.quiet)
+    films = film_pictures(Path(config.films), config.size, work, config.film_count)
+    filmed, true = config.group_clips
+    maps = Path(config.maps) if config.maps else work.cache / f"everyday-maps-{filmed}-{true}"
+    made = EverydaySettings(filmed=filmed, true=true)
+    training = EverydayTraining(maps, config.groups, config.size, config.film_steps, made, work.quiet)
     jobs = [(name, seed) for seed in range(config.seeds) for name in config.networks]
     results: dict[str, list[dict[str, float]]] = {name: [] for name in config.networks}
     for name, seed in tqdm(jobs, desc="films", unit="training", disable=work.quiet):
         settings = {
-            "films": str(Path(config.films).resolve()), "maps": str(maps.resolve()), "groups": config.groups,
-            "size": config.size, "steps": config.film_steps, "network": name, "seed": seed,
+            "films": str(Path(config.films).resolve()), "film_count": config.film_count,
+            "maps": str(maps.resolve()), "groups": config.groups, "size": config.size, "steps": config.film_steps,
+            "network": name, "seed": seed,
         }  # fmt: skip
         results[name].append(
             work.kept("real-films", settings, partial(film_accuracy, name, seed, training, films, work))
@@ -152,11 +161,11 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     rows = titled(results)
     columns = ["network", *(f"{scene} {kind} %" for kind in ("clips", "films") for scene in SCENES)]
     notes = [
-        f"Films: trained on {config.groups} groups of simulated maps of everyday motion in "
-        f"{config.size}x{config.size} pixels, {config.film_steps} batches of 64 (AdamW, cosine), "
-        f"{_trainings(config)} each. `clips` are held-out ones of the same kind, as the pipeline finds them in films, "
-        f"`films` the {len(films)} of {config.films}: people found by the shipped networks, camera estimated. "
-        f"One film is {100 / len(films):.0f} points; chance is 8 %."
+        f"Films: trained on {config.groups} groups of simulated maps of everyday motion in {config.size}x{config.size} "
+        f"pixels, {config.film_steps} batches of 64 (AdamW, cosine), {counted(config.seeds, 'training')} each. `clips` "
+        f"are held-out ones of the same kind, as the pipeline finds them in films, `films` the {len(films)} of "
+        f"{config.films}: people found by the shipped networks, camera estimated. One film is {100 / len(films):.0f} "
+        "points; chance is 8 %."
     ]
     title = "Accuracy on real films, trained on simulation alone"
     shown = {row[0]: {scene: (row[3 + k], float("nan")) for k, scene in enumerate(SCENES)} for row in rows}
@@ -165,10 +174,6 @@ def _on_films(config: RealConfig, work: Work) -> Report:
         [Table(title, columns, rows, file="films")],
         {"films": figures.bars(shown, "accuracy, %", title)},
     )
-
-
-def _trainings(config: RealConfig) -> str:
-    return "one training" if config.seeds == 1 else f"{config.seeds} trainings"
 
 
 def _identity(data: Path, measured: MeasuredSet) -> list[Any]:
@@ -207,7 +212,8 @@ def _simulated(config: RealConfig, measured: MeasuredSet, work: Work) -> tuple[T
 
 
 def quick_real() -> RealConfig:
-    """Two small networks on a few clips; the folders of measured sets or films have still to be given."""
+    """Two small networks on a few clips and three films; the folders of sets or films have still to be given."""
     return RealConfig(
-        groups=5, film_steps=20, networks=("ccln", "diat-radharnet"), clips=4, size=32, steps=4, seeds=1
-    )
+        groups=5, group_clips=(1, 1), film_count=3, film_steps=20, networks=("ccln", "diat-radharnet"), clips=4,
+        size=32, steps=4, seeds=1,
+    )  # fmt: skip

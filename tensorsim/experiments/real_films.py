@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,6 +54,7 @@ class EverydayTraining:
         groups: of maps, every fifth for validation.
         size: height and width of the pictures: 32 or 64.
         steps: batches of 64.
+        made: contents of maps that are made, where the folder has none yet.
         quiet: no progress bar.
     """
 
@@ -61,26 +62,35 @@ class EverydayTraining:
     groups: int
     size: int
     steps: int
+    made: EverydaySettings = field(default_factory=EverydaySettings)
     quiet: bool = False
 
     @cached_property
     def store(self) -> EverydayStore:
         """The maps, read once for all trainings; with the settings of those that are there."""
         described = self.maps / "settings.json"
-        stated = json.loads(described.read_text(encoding="utf-8")) if described.is_file() else {}
-        build_everyday(self.maps, self.groups, EverydaySettings(**stated), quiet=self.quiet)
+        settings = self.made
+        if described.is_file():
+            settings = EverydaySettings(**json.loads(described.read_text(encoding="utf-8")))
+        build_everyday(self.maps, self.groups, settings, quiet=self.quiet)
         return EverydayStore(self.maps, range(self.groups))
 
 
-def film_pictures(folder: Path, size: int, work: Work) -> list[FilmPictures]:
-    """Pictures of all films of a folder with ``labels.json``, by the shipped networks; kept in the cache.
+def film_pictures(folder: Path, size: int, work: Work, count: int = 0) -> list[FilmPictures]:
+    """Pictures of the films of a folder with ``labels.json``, by the shipped networks; kept in the cache.
+
+    Args:
+        folder: of the films.
+        size: height and width of the pictures.
+        work: cache and progress.
+        count: of films, the first of the folder; 0 is all.
 
     Raises:
         TensorsimError: not such a folder.
     """
     from safetensors.torch import load_file, save_file
 
-    films = read_labels(folder)
+    films = read_labels(folder)[: count or None]
     described = [(film.path.name, film.path.stat().st_size, film.start_s, film.end_s) for film in films]
     path = work.cache / "results" / f"films-{digest({'films': described, 'size': size})}.safetensors"
     if not path.is_file():

@@ -49,6 +49,11 @@ class Work:
         return read_result(path)
 
 
+def counted(count: int, noun: str) -> str:
+    """``1 clip``, ``2 clips``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def write_result(path: Path, content: dict[str, Any]) -> None:
     """Write a result as JSON, whole or not at all. NaN and infinity stay what they are."""
     with complete_file(path) as scratch:
