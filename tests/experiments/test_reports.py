@@ -9,8 +9,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip
+from tensorsim.evaluation.labelled_films import LabelledFilm
 from tensorsim.experiments import ablations, catalogue, networks, paper, real, real_films, video
 from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
@@ -101,17 +103,21 @@ def test_echo_without_the_wall_is_stronger_and_else_the_same(
 
 
 def test_denoisers_stand_beside_an_empty_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def choice(name: str) -> Any:
-        return None if name == "none" else lambda maps: torch.zeros_like(maps)
+    seen: list[torch.Tensor] = []
 
-    monkeypatch.setattr(ablations, "map_denoiser", choice)
-    config = ablations.DenoiserConfig(("none", "zeros"), ("through-wall",), 1, (10.0,))
+    def zeros(maps: torch.Tensor) -> torch.Tensor:
+        seen.append(maps)
+        return torch.zeros_like(maps)
+
+    monkeypatch.setattr(ablations, "map_denoiser", lambda name: None if name == "none" else zeros)
+    config = ablations.DenoiserConfig(("none", "zeros"), ("through-wall",), 1, (10.0,), columns=32)
     report = ablations.denoiser_report(config, Work(tmp_path, quiet=True))
     rows = {(row[1], row[3]): row[4:] for row in report.tables[0].rows}
     for view in ("processed RTM", "DTM"):
         assert rows[view, "zeros"][:2] == rows[view, "empty map"][:2]
         assert rows[view, "none"][0] != rows[view, "another clip"][0]
     assert rows["DTM", "none"][0] > rows["DTM", "empty map"][0]
+    assert [map_.shape[-1] for map_ in seen] == [32, 32]
 
 
 def test_pictures_become_square_with_the_same_mean() -> None:
@@ -161,6 +167,34 @@ def everyday_store(folder: Path, groups: int) -> None:
             {"pictures": pictures, "activity": activity, "filmed": torch.ones(8, dtype=torch.bool)},
             folder / f"everyday-{group:05d}.safetensors",
         )
+
+
+def test_groups_of_maps_are_as_small_as_asked_for(tmp_path: Path) -> None:
+    training = real_films.EverydayTraining(tmp_path, 1, 32, 1, EverydaySettings(filmed=0, true=1), quiet=True)
+    activity = training.store.activity
+    assert torch.bincount(activity)[1:].tolist() == [1] * (len(ACTIVITIES) - 1)
+    # What the folder says of itself counts.
+    other = real_films.EverydayTraining(tmp_path, 1, 32, 1, EverydaySettings(filmed=5), quiet=True)
+    assert bool((other.store.activity == activity).all())
+
+
+def test_the_first_films_of_a_folder_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    films = [LabelledFilm(tmp_path / f"{k}.mp4", 0.0, 4.0, ("S8 Walking",)) for k in range(3)]
+    for film in films:
+        film.path.write_bytes(b"film")
+    monkeypatch.setattr(real_films, "read_labels", lambda folder: films)
+
+    def made(taken: list[LabelledFilm], size: int, work: Work) -> dict[str, torch.Tensor]:
+        return {
+            f"{scene}/{k}": torch.zeros(1, 1, size, size)
+            for scene in real_films.SCENES
+            for k in range(len(taken))
+        }
+
+    monkeypatch.setattr(real_films, "_made", made)
+    work = Work(tmp_path / "work", quiet=True)
+    assert len(real_films.film_pictures(tmp_path, 32, work, 2)) == 2
+    assert len(real_films.film_pictures(tmp_path, 32, work)) == 3
 
 
 def test_networks_learn_everyday_maps_and_label_films(tmp_path: Path) -> None:
