@@ -53,7 +53,7 @@ EXPECTED: dict[str, tuple[list[float], float]] = {
     "c833ed9170aaa3b8": ([-0.302423, 5.17975, 0.844778, 0.0896744, -0.455284, -0.332846], 1.6123),  # SPNet
     "7a15296264b6a721": ([0.74892, 1.13028, 0.24339, 0.36871, 1.25796, 0.71812], 0.76663),  # DnCNN
     "90280277c27b4134": ([-6.33586, -2.389, -3.60517, -3.53825, -3.28889, -2.88149], 14.729),  # RTMDet
-    "6d961fc1f8706c32": ([-5.45162, -4.14425, -4.04199, -3.86863, -4.27444, -4.04337], 14.666),  # rtmdet_person_recall.safetensors
+    "6d961fc1f8706c32": ([-5.45162, -4.14425, -4.04199, -3.86863, -4.27444, -4.04337], 14.666),  # RTMDet
     "da7cf4552d24e8c3": ([-0.638164, 2.84223, -0.745937, -0.708206], 1.5446),  # DIATRadHARNet
     "e9b7667250ee4172": ([-0.0478059, 2.02712, 0.667224, -0.286124, -0.325381], 0.97411),  # DIATRadHARNet
     "de6eab974f533543": (
@@ -88,7 +88,7 @@ def test_outputs_are_those_of_the_file(entry: registry.ModelEntry) -> None:
         values = LOOK[entry.network](kind.from_pretrained(entry.name)).double().flatten()
     digest = hashlib.sha256(entry.path.read_bytes()).hexdigest()[:16]
     first, rms = [float(f"{v:.6g}") for v in values[:6]], float(values.square().mean().sqrt())
-    line = f'"{digest}": ({first}, {rms:.5g}),  # {entry.file}'
+    line = f'"{digest}": ({first}, {rms:.5g}),  # {entry.network}'
     assert digest in EXPECTED, (
         f"{entry.file} is new: once its card's figures are measured, add this line: {line}"
     )

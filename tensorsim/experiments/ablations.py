@@ -16,7 +16,7 @@ from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
 from tensorsim.experiments import figures
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread, shipped_weights
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
 from tensorsim.training.denoiser import simulate_pair
@@ -221,7 +221,7 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
 
         settings = {
             "scene": scene, "ratio": ratio, "clip": clip, "seed": config.seed, "denoisers": config.denoisers,
-            "columns": config.columns,
+            "columns": config.columns, "weights": shipped_weights("DnCNN"),
         }  # fmt: skip
         for view, of_view in work.kept("denoiser", settings, make).items():
             for name, figures_of_map in of_view.items():

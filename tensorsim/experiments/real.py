@@ -15,8 +15,15 @@ from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
 from tensorsim.evaluation.measured.training import fit_pictures, predict, square
 from tensorsim.experiments import figures
 from tensorsim.experiments.networks import USUAL
-from tensorsim.experiments.real_films import SCENES, EverydayTraining, film_accuracy, film_pictures, titled
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.experiments.real_films import (
+    SCENES,
+    WATCHERS,
+    EverydayTraining,
+    film_accuracy,
+    film_pictures,
+    titled,
+)
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread, shipped_weights
 from tensorsim.files import complete_file
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.training.everyday_maps import EverydaySettings
@@ -153,7 +160,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
         settings = {
             "films": str(Path(config.films).resolve()), "film_count": config.film_count,
             "maps": str(maps.resolve()), "groups": config.groups, "size": config.size, "steps": config.film_steps,
-            "network": name, "seed": seed,
+            "network": name, "seed": seed, "weights": shipped_weights(*WATCHERS),
         }  # fmt: skip
         results[name].append(
             work.kept("real-films", settings, partial(film_accuracy, name, seed, training, films, work))

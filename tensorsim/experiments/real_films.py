@@ -15,7 +15,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES, SimulationConfig
 from tensorsim.errors import TensorsimError, collected_warnings
 from tensorsim.evaluation.labelled_films import FilmReader, LabelledFilm, Scene, read_labels
-from tensorsim.experiments.work import Work, digest
+from tensorsim.experiments.work import Work, digest, shipped_weights
 from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.recognition import ActivityRecognizer
@@ -27,6 +27,9 @@ from tensorsim.training.classifier import RANGE_DB
 from tensorsim.training.everyday_classifier import EverydayRecipe
 from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
 from tensorsim.training.loop import LoopConfig, fit
+
+#: Networks by which films are watched.
+WATCHERS = ("RTMDet", "HRNet", "TemporalLifter")
 
 #: Configurations of the scenes.
 SCENES = {"free-space": SimulationConfig.free_space(), "through-wall": SimulationConfig.through_wall()}
@@ -92,7 +95,10 @@ def film_pictures(folder: Path, size: int, work: Work, count: int = 0) -> list[F
 
     films = read_labels(folder)[: count or None]
     described = [(film.path.name, film.path.stat().st_size, film.start_s, film.end_s) for film in films]
-    path = work.cache / "results" / f"films-{digest({'films': described, 'size': size})}.safetensors"
+    settings = {
+        "films": described, "size": size, "weights": shipped_weights(*WATCHERS),
+    }  # fmt: skip
+    path = work.cache / "results" / f"films-{digest(settings)}.safetensors"
     if not path.is_file():
         with complete_file(path) as scratch:
             save_file(_made(films, size, work), scratch)

@@ -17,7 +17,7 @@ from tensorsim.evaluation.settings import Pipelines, Setting
 from tensorsim.evaluation.truth import pose_errors
 from tensorsim.experiments import figures
 from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
-from tensorsim.experiments.work import Report, Table, Work
+from tensorsim.experiments.work import Report, Table, Work, shipped_weights
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import VideoToPose, pretrained_pose
 from tensorsim.radar.presets import PRESETS
@@ -157,6 +157,7 @@ def video_report(config: VideoConfig, work: Work) -> Report:
     pipelines = Pipelines({scene: PRESETS[scene] for scene in config.scenes})
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
     jobs = [(row, k) for row in rows for k in range(config.clips)]
+    weights = shipped_weights("RTMDet", "HRNet", "AcfDetector", "CPM", "VideoPose3D", "TemporalLifter")
     for row, k in tqdm(jobs, desc="films", unit="film", disable=work.quiet):
         clip, other = rows[row][k], rows[row][k + 1]
 
@@ -165,7 +166,7 @@ def video_report(config: VideoConfig, work: Work) -> Report:
 
         settings = {
             "row": row, "clip": clip.name, "other": other.name, "length_s": config.length_s, "scenes": config.scenes,
-            "chains": list(watcher.chains),
+            "chains": list(watcher.chains), "weights": weights,
         }  # fmt: skip
         for name, cell in work.kept("film", settings, make).items():
             cells.setdefault((row, name), []).append(cell)

@@ -18,6 +18,7 @@ from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
 from tensorsim.experiments.trials import Trial
 from tensorsim.experiments.work import Report, Table, Work
+from tensorsim.registry import shipped
 from tensorsim.training.everyday_maps import EverydaySettings
 from tensorsim.training.maps import to_bytes
 
@@ -195,6 +196,13 @@ def test_the_first_films_of_a_folder_are_taken(tmp_path: Path, monkeypatch: pyte
     work = Work(tmp_path / "work", quiet=True)
     assert len(real_films.film_pictures(tmp_path, 32, work, 2)) == 2
     assert len(real_films.film_pictures(tmp_path, 32, work)) == 3
+
+    # Other weights of the shipped networks see the films anew.
+    before = set((tmp_path / "work" / "results").iterdir())
+    entries = [replace(entry, sha256="0" * 64) for entry in shipped()]
+    monkeypatch.setattr("tensorsim.experiments.work.shipped", lambda: tuple(entries))
+    assert len(real_films.film_pictures(tmp_path, 32, work)) == 3
+    assert len(set((tmp_path / "work" / "results").iterdir()) - before) == 1
 
 
 def test_networks_learn_everyday_maps_and_label_films(tmp_path: Path) -> None:
