@@ -54,10 +54,22 @@ def tones(step: Tensor, count: int, first: Tensor | None = None) -> Tensor:
     Products instead of exponentials: with the first Q and ``exp(j 2 pi step Q)`` come the next Q.
     """
     turn = phasor(step)
-    table = (torch.ones_like(turn) if first is None else first).unsqueeze(0)
-    while table.shape[0] < count:
-        table = torch.cat((table, table[: count - table.shape[0]] * turn))
+    head = torch.ones_like(turn) if first is None else first
+    if head.requires_grad or turn.requires_grad:
+        table = head.unsqueeze(0)
+        while table.shape[0] < count:
+            table = torch.cat((table, table[: count - table.shape[0]] * turn))
+            turn = turn * turn
+        return table
+    # Without gradients each product is written to its place.
+    table = turn.new_empty([count] + list(turn.shape))  # noqa: RUF005 (TorchScript)
+    table[0] = head
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        torch.mul(table[:more], turn, out=table[done : done + more])
         turn = turn * turn
+        done += more
     return table
 
 
