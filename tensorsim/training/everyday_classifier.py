@@ -26,17 +26,26 @@ from tensorsim.weights import load_state_dict, load_strict, save_weights
 NOISE_DB = (-70.0, -8.0)
 #: Largest part of a clip that is cut off at each end, and of rows and columns that are masked.
 CUT, MASKED = 0.08, 0.12
+#: Share of the pictures that are folded.
+FOLDED = 0.2
 #: Activities by index and what they are backwards in time; getting up and falling are not each other's reverse.
 REVERSED = {0: 0, 1: 1, 2: 2, 3: 3, 4: 5, 5: 4, 6: 6, 7: 7, 8: 9, 9: 8}
 #: The label has this much less than all of the probability, spread over all classes.
 SMOOTHING = 0.05
 
 
+def folded(power: Tensor) -> Tensor:
+    """A power picture (H, W) as a receiver of one channel has it, which cannot tell approach from retreat; peak 1."""
+    both = power + power.flip(0)
+    return both / both.max().clamp(min=1e-30)
+
+
 def augmented(power: Tensor, activity: int, noise: Tensor, generator: torch.Generator) -> tuple[Tensor, int]:
     """A power picture (H, W) as another clip could have it, and the activity of that clip.
 
-    Approach and retreat change places in half of the cases (every activity is done in every heading), time runs
-    backwards in half of those of :data:`REVERSED`, the ends are cut a little, and noise is added.
+    Approach and retreat change places in half of the cases (every activity is done in every heading), some pictures
+    are folded, time runs backwards in half of those of :data:`REVERSED`, the ends are cut a little, and noise is
+    added.
 
     Args:
         power: (H, W) with a peak of 1.
@@ -44,9 +53,11 @@ def augmented(power: Tensor, activity: int, noise: Tensor, generator: torch.Gene
         noise: (H,) expected power of noise in the rows, with a peak of 1.
         generator: of everything random.
     """
-    flip, back, first, last, level = torch.rand(5, generator=generator).tolist()
+    flip, back, first, last, level, fold = torch.rand(6, generator=generator).tolist()
     if flip < 0.5:
         power = power.flip(0)
+    if fold < FOLDED:
+        power = folded(power)
     if back < 0.5 and activity in REVERSED:
         power, activity = power.flip(1), REVERSED[activity]
     width = power.shape[1]
@@ -185,23 +196,23 @@ class EverydayRecipe(Recipe):
         return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
     @torch.no_grad()
-    def judged(self, net: nn.Module) -> tuple[Tensor, Tensor]:
-        """Logits (N, classes) and labels (N,) of the held-out clips, as they are, clip by clip in both scenes.
+    def judged(self, net: nn.Module, fold: bool = False) -> tuple[Tensor, Tensor]:
+        """Logits (N, classes) and labels (N,) of the held-out clips, as they are or folded, clip by clip in both scenes.
 
         Logits are the mean over both ways round, as :class:`~tensorsim.recognition.ActivityRecognizer` takes it.
         """
-        pictures = torch.stack(
-            [self._input(self.store.picture(clip, scene)) for clip, scene in self.validation.tolist()]
-        )
+        powers = [self.store.picture(clip, scene) for clip, scene in self.validation.tolist()]
+        pictures = torch.stack([self._input(folded(power) if fold else power) for power in powers])
         like = next(net.parameters())
         both = [(part.to(like), part.to(like).flip(-2)) for part in pictures.split(64)]
         logits = [0.5 * (net(part) + net(other)).float().cpu() for part, other in both]
         return torch.cat(logits), self.store.activity[self.validation[:, 0]]
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Accuracy of filmed and true motion in each scene and the loss; the score is the negative loss."""
+        """Accuracy of filmed, true and folded true motion in each scene and the loss; the score is the negative loss."""
         logits, labels = self.judged(net)
         right = (logits.argmax(-1) == labels).float()
+        right_folded = (self.judged(net, fold=True)[0].argmax(-1) == labels).float()
         loss = float(F.cross_entropy(logits, labels))
         figures = {}
         clips, scenes = self.validation.T
@@ -209,6 +220,7 @@ class EverydayRecipe(Recipe):
             for name, kind in (("filmed", True), ("true", False)):
                 chosen = (scenes == k) & (self.store.filmed[clips] == kind)
                 figures[f"{scene} {name}"] = float(right[chosen].mean())
+            figures[f"{scene} folded"] = float(right_folded[chosen].mean())
         return {"score": -loss, "loss": loss} | figures
 
 

@@ -17,6 +17,7 @@ from tensorsim.training.everyday_classifier import (
     REVERSED,
     EverydayRecipe,
     augmented,
+    folded,
     load_between,
     masked,
     save_calibrated,
@@ -75,6 +76,17 @@ def test_augmentation_keeps_what_a_clip_shows():
     assert len(seen) == 4
 
 
+def test_a_fifth_of_the_pictures_is_as_a_receiver_of_one_channel_has_them():
+    power = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(0)
+    pictures = [augmented(power, 2, torch.zeros(32), generator)[0] for _ in range(400)]
+    same = [float((picture - picture.flip(0)).abs().max()) < 1e-6 for picture in pictures]
+    assert 0.14 < sum(same) / 400 < 0.26
+    both = folded(power)
+    torch.testing.assert_close(both, (power + power.flip(0)) / (power + power.flip(0)).max())
+    assert float(folded(torch.zeros(32, 32)).max()) == 0.0
+
+
 def test_falls_are_never_played_backwards():
     power = torch.zeros(32, 32)
     power[8, :8] = 1.0
@@ -115,7 +127,7 @@ def test_samples_come_from_groups_that_are_not_held_out_and_depend_on_their_numb
     assert recipe.rate(99, 100) < 0.02
     recipe.net.eval()
     figures = recipe.validate(recipe.net)
-    assert set(figures) >= {"free-space filmed", "through-wall true", "score"}
+    assert set(figures) >= {"free-space filmed", "through-wall true", "through-wall folded", "score"}
 
 
 def test_calibration_writes_the_temperature_that_fits_the_held_out_films(folder, tmp_path):
