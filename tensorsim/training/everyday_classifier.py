@@ -197,7 +197,7 @@ class EverydayRecipe(Recipe):
 
     @torch.no_grad()
     def judged(self, net: nn.Module, fold: bool = False) -> tuple[Tensor, Tensor]:
-        """Logits (N, classes) and labels (N,) of the held-out clips, as they are or folded, clip by clip in both scenes.
+        """Logits (N, classes) and labels (N,) of the held-out clips, perhaps folded, clip by clip in both scenes.
 
         Logits are the mean over both ways round, as :class:`~tensorsim.recognition.ActivityRecognizer` takes it.
         """
@@ -209,18 +209,19 @@ class EverydayRecipe(Recipe):
         return torch.cat(logits), self.store.activity[self.validation[:, 0]]
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Accuracy of filmed, true and folded true motion in each scene and the loss; the score is the negative loss."""
+        """The loss and, in each scene, accuracy of filmed, true and folded true motion; the score is the negative loss."""
         logits, labels = self.judged(net)
         right = (logits.argmax(-1) == labels).float()
         right_folded = (self.judged(net, fold=True)[0].argmax(-1) == labels).float()
         loss = float(F.cross_entropy(logits, labels))
         figures = {}
         clips, scenes = self.validation.T
+        filmed = self.store.filmed[clips]
         for k, scene in enumerate(SCENES):
-            for name, kind in (("filmed", True), ("true", False)):
-                chosen = (scenes == k) & (self.store.filmed[clips] == kind)
-                figures[f"{scene} {name}"] = float(right[chosen].mean())
-            figures[f"{scene} folded"] = float(right_folded[chosen].mean())
+            here = scenes == k
+            figures[f"{scene} filmed"] = float(right[here & filmed].mean())
+            figures[f"{scene} true"] = float(right[here & ~filmed].mean())
+            figures[f"{scene} folded"] = float(right_folded[here & ~filmed].mean())
         return {"score": -loss, "loss": loss} | figures
 
 
