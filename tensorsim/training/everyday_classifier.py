@@ -209,7 +209,7 @@ class EverydayRecipe(Recipe):
         return torch.cat(logits), self.store.activity[self.validation[:, 0]]
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """The loss and, in each scene, accuracy of filmed, true and folded true motion; the score is the negative loss."""
+        """Accuracy of filmed, true and folded true motion in each scene, the loss, and its negative as the score."""
         logits, labels = self.judged(net)
         right = (logits.argmax(-1) == labels).float()
         right_folded = (self.judged(net, fold=True)[0].argmax(-1) == labels).float()
