@@ -26,8 +26,9 @@ from tensorsim.weights import load_state_dict, load_strict, save_weights
 NOISE_DB = (-70.0, -8.0)
 #: Largest part of a clip that is cut off at each end, and of rows and columns that are masked.
 CUT, MASKED = 0.08, 0.12
-#: Share of the pictures that are folded.
-FOLDED = 0.2
+#: Share of the pictures that are folded, and of the walks in which somebody comes or leaves.
+FOLDED, PASSING = 0.2, 0.4
+WALKING = ACTIVITIES.index("S8 Walking")
 #: Activities by index and what they are backwards in time; getting up and falling are not each other's reverse.
 REVERSED = {0: 0, 1: 1, 2: 2, 3: 3, 4: 5, 5: 4, 6: 6, 7: 7, 8: 9, 9: 8}
 #: The label has this much less than all of the probability, spread over all classes.
@@ -40,12 +41,19 @@ def folded(power: Tensor) -> Tensor:
     return both / both.max().clamp(min=1e-30)
 
 
+def passing(power: Tensor, late: float, early: float) -> Tensor:
+    """A power picture (H, W) of somebody who comes after a share of the time and leaves before the end; peak 1."""
+    time = (torch.arange(power.shape[1]) + 0.5) / power.shape[1]
+    seen = power * ((time >= late) & (time <= 1 - early))
+    return seen / seen.max().clamp(min=1e-30)
+
+
 def augmented(power: Tensor, activity: int, noise: Tensor, generator: torch.Generator) -> tuple[Tensor, int]:
     """A power picture (H, W) as another clip could have it, and the activity of that clip.
 
     Approach and retreat change places in half of the cases (every activity is done in every heading), some pictures
-    are folded, time runs backwards in half of those of :data:`REVERSED`, the ends are cut a little, and noise is
-    added.
+    are folded, some who walk come late or leave early (which is not a fall), time runs backwards in half of those of
+    :data:`REVERSED`, the ends are cut a little, and noise is added.
 
     Args:
         power: (H, W) with a peak of 1.
@@ -53,11 +61,14 @@ def augmented(power: Tensor, activity: int, noise: Tensor, generator: torch.Gene
         noise: (H,) expected power of noise in the rows, with a peak of 1.
         generator: of everything random.
     """
-    flip, back, first, last, level, fold = torch.rand(6, generator=generator).tolist()
+    flip, back, first, last, level, fold, passes, late, early = torch.rand(9, generator=generator).tolist()
     if flip < 0.5:
         power = power.flip(0)
     if fold < FOLDED:
         power = folded(power)
+    if activity == WALKING and passes < PASSING:
+        # Half of them are there from the start, and half to the end.
+        power = passing(power, max(0.0, 0.9 * late - 0.45), max(0.0, 0.9 * early - 0.45))
     if back < 0.5 and activity in REVERSED:
         power, activity = power.flip(1), REVERSED[activity]
     width = power.shape[1]

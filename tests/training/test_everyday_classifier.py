@@ -14,12 +14,15 @@ from tensorsim.radar.presets import PRESETS
 from tensorsim.recognition import ActivityRecognizer, SPGNet
 from tensorsim.recognition.calibration import fit_temperature
 from tensorsim.training.everyday_classifier import (
+    PASSING,
     REVERSED,
+    WALKING,
     EverydayRecipe,
     augmented,
     folded,
     load_between,
     masked,
+    passing,
     save_calibrated,
 )
 from tensorsim.training.everyday_maps import (
@@ -85,6 +88,23 @@ def test_a_fifth_of_the_pictures_is_as_a_receiver_of_one_channel_has_them():
     both = folded(power)
     torch.testing.assert_close(both, (power + power.flip(0)) / (power + power.flip(0)).max())
     assert float(folded(torch.zeros(32, 32)).max()) == 0.0
+
+
+def test_some_who_walk_come_late_or_leave_early():
+    power = torch.ones(32, 40)
+    power[8] = 2.0
+    seen = passing(power / 2, 0.25, 0.1)
+    assert float(seen.max()) == 1.0
+    assert (seen[0] > 0).nonzero().flatten().tolist() == list(range(10, 36))
+    assert float(passing(power, 0.6, 0.6).max()) == 0.0
+    generator = torch.Generator().manual_seed(0)
+    shares = {}
+    for activity in (2, WALKING):
+        pictures = [augmented(power, activity, torch.zeros(32), generator)[0] for _ in range(300)]
+        shares[activity] = sum(bool((picture.amax(0) < 1e-6).any()) for picture in pictures) / 300
+    assert shares[2] == 0.0
+    # Of those, a quarter are there all the time.
+    assert shares[WALKING] == pytest.approx(PASSING * 0.75, abs=0.08)
 
 
 def test_falls_are_never_played_backwards():
