@@ -79,7 +79,7 @@ def test_augmentation_keeps_what_a_clip_shows():
     assert len(seen) == 4
 
 
-def test_a_fifth_of_the_pictures_is_as_a_receiver_of_one_channel_has_them():
+def test_a_fifth_of_the_pictures_has_both_signs_of_speed_in_one():
     power = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
     generator = torch.Generator().manual_seed(0)
     pictures = [augmented(power, 2, torch.zeros(32), generator)[0] for _ in range(400)]
