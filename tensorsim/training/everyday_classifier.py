@@ -36,7 +36,7 @@ SMOOTHING = 0.05
 
 
 def folded(power: Tensor) -> Tensor:
-    """A power picture (H, W) with both signs of speed in one, as radars of one channel without range have it; peak 1."""
+    """A power picture (H, W) with both signs of speed in one, as a radar of one channel without range has it."""
     both = power + power.flip(0)
     return both / both.max().clamp(min=1e-30)
 
