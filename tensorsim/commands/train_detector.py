@@ -16,6 +16,7 @@ class TrainDetector(PeopleOptions):
     Attributes:
         data: folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, films_teacher, lspet, pedestrian
             and backgrounds (NAME-*.tar).
+        teacher: weights of a better RTMDet (.safetensors, .pth, .onnx), whose answers are learnt besides the labels.
         variant: of RTMDet.
         steps: optimiser steps.
         batch: pictures per step.
@@ -24,6 +25,7 @@ class TrainDetector(PeopleOptions):
     """
 
     data: Path
+    teacher: Path | None = None
     variant: str = "small-person"
     steps: int = 5000
     batch: int = 16
@@ -46,12 +48,13 @@ class TrainDetector(PeopleOptions):
             checkpoint_every=100,
             validate_every=self.validate_every,
         )
+        teacher = None if self.teacher is None else RTMDet.from_pretrained(self.teacher)
         torch.manual_seed(self.seed)
         net = TrainedRTMDet(self.variant)
         self.begin(net)
         sources, held_out = read_sources(self.data)
         sources = replace(sources, cutouts=self.rendered_people() or ())
-        recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate)
+        recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate, teacher=teacher)
         detector = RTMDet.from_pretrained(self.train(recipe, loop))
         calibrate(detector, held_out)
         calibrated = self.out / "detector.safetensors"

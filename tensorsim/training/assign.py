@@ -19,6 +19,8 @@ MOST_CELLS = 13
 IOU_WEIGHT = 3.0
 #: Cells pay 10^(steps from the centre of the object - this).
 CENTRE_RADIUS = 3.0
+#: Score from which a teacher's box is one to learn.
+TAUGHT_SCORE = 0.25
 
 
 class Assignment(NamedTuple):
@@ -161,3 +163,27 @@ def detection_losses(
         "classification": classification.detach(),
         "box": box.detach(),
     }
+
+
+def distillation_loss(logits: Tensor, boxes: Tensor, taught_logits: Tensor, taught_boxes: Tensor) -> Tensor:
+    """How far the answers of a one-class detector are from a teacher's, cell by cell; 0 where they are the same.
+
+    The quality focal loss against the teacher's scores, and twice the GIoU loss against its boxes, weighted with the
+    scores where they exceed :data:`TAUGHT_SCORE`; both in relation to the sum of these scores.
+
+    Args:
+        logits: (B, N) of the class.
+        boxes: (B, N, 4) predicted ``xyxy``.
+        taught_logits: (B, N), without gradients.
+        taught_boxes: (B, N, 4), without gradients.
+
+    Reference:
+        Hinton et al., "Distilling the Knowledge in a Neural Network", 2015; here of every cell.
+    """
+    quality = taught_logits.sigmoid()
+    weight = quality * (quality > TAUGHT_SCORE)
+    total = weight.sum().clamp(min=1.0)
+    classification = quality_focal_loss(logits, quality).sum() / total
+    image, cell = weight.nonzero(as_tuple=True)
+    error = giou_loss(boxes[image, cell], taught_boxes[image, cell])
+    return classification + 2.0 * (error * weight[image, cell]).sum() / total

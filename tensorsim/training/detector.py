@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.boxes import distances_to_boxes
-from tensorsim.training.assign import detection_losses
+from tensorsim.training.assign import detection_losses, distillation_loss
 from tensorsim.training.detector_data import PictureMaker, Sources
 from tensorsim.training.loop import Batch, Recipe
 from tensorsim.training.pose_data import lean_deg
@@ -82,6 +82,8 @@ class DetectorRecipe(Recipe):
         seed: of the pictures.
         learning_rate: highest learning rate.
         warm_up: steps until it is reached.
+        teacher: a better detector, whose answers in every cell are learnt besides the labels; None learns from labels
+            alone.
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class DetectorRecipe(Recipe):
         seed: int = 0,
         learning_rate: float = 1.5e-3,
         warm_up: int = 50,
+        teacher: RTMDet | None = None,
     ) -> None:
         settings = {
             "recipe": "detector",
@@ -99,11 +102,13 @@ class DetectorRecipe(Recipe):
             "seed": seed,
             "learning_rate": learning_rate,
             "people": [len(sources.complete), len(sources.films), len(sources.cutouts)],
+            "teacher": None if teacher is None else teacher.variant,
         }
         metadata = {"model": "RTMDet", "variant": net.variant}
         metadata |= {"input_size": str(USED_SIDE), "nms_iou": str(USED_IOU)}
         super().__init__(net, settings, metadata)
         self.detector = net
+        self.teacher = None if teacher is None else teacher.to(memory_format=torch.channels_last)
         self.held_out, self.seed, self.learning_rate, self.warm_up = held_out, seed, learning_rate, warm_up
         self.maker = PictureMaker(sources, SIDES[-1])
 
@@ -145,15 +150,22 @@ class DetectorRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Quality focal loss and twice the GIoU loss."""
+        """Quality focal loss and twice the GIoU loss, and what the teacher's answers differ by."""
         x = ((batch["image"] - self.detector.mean) / self.detector.std).flip(1)
-        logits, distances = net(x.contiguous(memory_format=torch.channels_last))
+        x = x.contiguous(memory_format=torch.channels_last)
+        logits, distances = net(x)
         strides = self.detector.strides
         with torch.autocast(x.device.type, enabled=False):
-            boxes = [distances_to_boxes(d.float(), s) for d, s in zip(distances, strides, strict=True)]
-            return detection_losses(
-                logits, torch.cat(boxes, dim=1), strides, batch["boxes"], batch["valid"], batch["known"]
-            )
+            boxes = _decoded(distances, strides)
+            losses = detection_losses(logits, boxes, strides, batch["boxes"], batch["valid"], batch["known"])
+            if self.teacher is not None:
+                with torch.no_grad():
+                    taught_logits, taught = self.teacher.to(x.device).dense(x.float())
+                difference = distillation_loss(
+                    _flat(logits), boxes, _flat(taught_logits), _decoded(taught, strides)
+                )
+                losses |= {"loss": losses["loss"] + difference, "distillation": difference.detach()}
+            return losses
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; norms and biases do not decay."""
@@ -177,3 +189,15 @@ class DetectorRecipe(Recipe):
         device = next(net.parameters()).device
         figures = measure(detector.to(device), self.held_out)
         return figures | {"score": figures["ap"]}
+
+
+def _flat(logits: list[Tensor]) -> Tensor:
+    """Logits of the first class, people, from the levels (B, classes, h, w) as (B, N)."""
+    return torch.cat([level[:, 0].flatten(1) for level in logits], dim=1).float()
+
+
+def _decoded(distances: list[Tensor], strides: list[int]) -> Tensor:
+    """Boxes (B, N, 4) ``xyxy`` of the distances (B, 4, h, w) of the levels."""
+    return torch.cat(
+        [distances_to_boxes(d.float(), s) for d, s in zip(distances, strides, strict=True)], dim=1
+    )

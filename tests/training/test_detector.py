@@ -53,6 +53,25 @@ def test_four_pictures_are_learnt(recipe: DetectorRecipe) -> None:
     assert losses[-1] < 0.5 * losses[0]
 
 
+def test_a_teacher_is_learnt_from_and_stays_as_it_is(recipe: DetectorRecipe) -> None:
+    """Without labels, scores and boxes come near to those of the teacher."""
+    torch.manual_seed(1)
+    teacher = RTMDet("test").eval()
+    for module in teacher.modules():  # a fresh network says the same of every cell
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight)
+    before = copy.deepcopy(teacher.state_dict())
+    sources = recipe.maker.sources
+    taught = DetectorRecipe(TrainedRTMDet("test"), sources, recipe.held_out, warm_up=5, teacher=teacher)
+    batch = taught.collate([taught.sample(i) for i in range(4)])
+    batch["valid"], batch["known"] = torch.zeros_like(batch["valid"]), torch.zeros_like(batch["known"])
+    losses = terms_of_training(taught, batch, 60, "distillation")
+    assert losses[-1] < 0.5 * losses[0]
+    for name, value in teacher.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    assert taught.settings != recipe.settings
+
+
 def test_the_detector_sees_what_the_recipe_trains_on(recipe: DetectorRecipe) -> None:
     """Normalisation and order of the channels in training are those of use."""
     image = recipe.sample(0)["image"][None]
@@ -152,7 +171,8 @@ def test_command_trains_and_goes_on_from_weights(
     assert (detector.input_size, detector.nms_iou) == (64, 0.7)
     # At a learning rate of next to nothing the second run ends where it began: at the weights of the first.
     monkeypatch.setattr(DetectorRecipe, "rate", lambda self, step, steps: 0.0)
-    for name, value in train("b", init=tmp_path / "a" / "best.safetensors").items():
+    second = train("b", init=tmp_path / "a" / "best.safetensors", teacher=trained)
+    for name, value in second.items():
         if "running" not in name and "num_batches" not in name:
             torch.testing.assert_close(value, first[name], rtol=2e-3, atol=1e-6, msg=name)
 

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tensorsim.training.assign import assign, cells_of, detection_losses, giou_loss, quality_focal_loss
+from tensorsim.training.assign import (
+    assign,
+    cells_of,
+    detection_losses,
+    distillation_loss,
+    giou_loss,
+    quality_focal_loss,
+)
 
 STRIDES = [8, 16, 32]
 Doubles = npt.NDArray[np.float64]
@@ -144,6 +151,21 @@ def test_quality_focal_loss_by_hand() -> None:
     grid = torch.linspace(-4, 4, 801)
     best = quality_focal_loss(grid, torch.full_like(grid, 0.7)).argmin()
     assert float(grid[best].sigmoid()) == pytest.approx(0.7, abs=0.01)
+
+
+def test_distillation_loss_by_hand() -> None:
+    # Two cells: the teacher is sure of the first, 0.8, and has a box there; of the second it says 0.2, too little.
+    taught = torch.tensor([[0.8, 0.2]]).logit()
+    boxes = torch.tensor([[[1.0, 0.0, 3.0, 2.0], [0.0, 0.0, 9.0, 9.0]]])
+    taught_boxes = torch.tensor([[[0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 1.0, 1.0]]])
+    entropy = -np.log(0.5)  # of a score of a half, whatever the teacher's
+    classification = 0.3**2 * entropy + 0.3**2 * entropy
+    # Scores that add up to less than one count as one.
+    expected = (classification + 2 * 0.8 * (1 - 1 / 3)) / 1.0
+    assert float(distillation_loss(torch.zeros(1, 2), boxes, taught, taught_boxes)) == pytest.approx(expected)
+    assert float(distillation_loss(taught, taught_boxes, taught, taught_boxes)) == pytest.approx(0, abs=1e-6)
+    twice = [x.expand(4, *x.shape[1:]) for x in (torch.zeros(1, 2), boxes, taught, taught_boxes)]
+    assert float(distillation_loss(*twice)) == pytest.approx(4 * expected / 3.2)
 
 
 def dense(score: float, side: int = 64) -> tuple[list[Tensor], Tensor]:
