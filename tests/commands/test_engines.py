@@ -36,11 +36,7 @@ def test_key_points_and_maps_of_the_engines_agree(
     assert away.max() < 0.5
     for name in ("range_time", "range_time_mti", "doppler_time"):
         shown = truth[name] > 1e-2 * truth[name].max()  # 40 dB
-        # Rounding moves joints by some micrometres: more than 0.1 dB in the few places where echoes cancel.
-        away_db = np.abs(20 * np.log10(maps[name][shown] / truth[name][shown]))
-        assert np.quantile(away_db, 0.99) < 0.1
-        assert away_db.max() < 0.5
-        assert np.linalg.norm(maps[name] - truth[name]) < 0.005 * np.linalg.norm(truth[name])
+        assert np.abs(20 * np.log10(maps[name][shown] / truth[name][shown])).max() < 0.1
 
     small, _ = simulated(film, tmp_path / "int8", "int8")
     away = np.linalg.norm(small["keypoints_px"] - expected["keypoints_px"], axis=-1)[seen]
