@@ -1,6 +1,7 @@
 """``tensorsim evaluate camera``: how well the camera is told from people who walk."""
 
 from dataclasses import dataclass
+from statistics import median
 from typing import TYPE_CHECKING
 
 from tensorsim.commands.options import check_seed
@@ -14,8 +15,8 @@ if TYPE_CHECKING:
 class EvaluateCamera:
     """Estimate cameras that are known from generated walks, and print the errors of tilt, field of view and range.
 
-    One row per tilt and height, over all fields of view; cameras that do not have the walk in the picture are left
-    out.
+    One row per tilt and height, over all fields of view: the median and the largest error. Walks of which less than
+    half is in the picture are left out.
     """
 
     tilts: tuple[float, ...] = (0.0, 12.0, 24.0, 35.0)
@@ -24,6 +25,8 @@ class EvaluateCamera:
     """Metres above the floor."""
     fovs: tuple[float, ...] = (40.0, 60.0, 90.0)
     """Horizontal fields of view in degrees."""
+    walks: int = 5
+    """Of other people, before each camera."""
     noise: float = 2.0
     """Standard deviation of the key points in pixels, in pictures of 640 x 480."""
     turn: float = 80.0
@@ -40,10 +43,12 @@ class EvaluateCamera:
             raise TensorsimError(
                 "evaluate camera: got no tilt, height or field of view, expected at least one each"
             )
+        if self.walks < 1:
+            raise TensorsimError(f"walks: got {self.walks}, expected at least 1")
 
         from tensorsim.evaluation import camera as cameras
 
-        print("| tilt | height | cameras | tilt error | field of view error | range error |")
+        print("| tilt | height | walks | tilt error | field of view error | range error |")
         print("| ---: | ---: | ---: | ---: | ---: | ---: |")
         found: list[CameraErrors] = []
         seed = self.seed
@@ -51,14 +56,15 @@ class EvaluateCamera:
             for height in self.heights:
                 row = []
                 for fov in self.fovs:
-                    seed += 1
                     camera = cameras.known_camera(tilt, height, fov)
-                    walk = cameras.walk_before(camera, seed, self.turn)
-                    if walk.seen >= cameras.LEAST_SEEN:
-                        told = cameras.estimate(walk, self.noise, self.known_height, seed)
-                        row.append(cameras.errors_of(told, camera, walk))
+                    for _ in range(self.walks):
+                        seed += 1
+                        walk = cameras.walk_before(camera, seed, self.turn)
+                        if walk.seen >= cameras.LEAST_SEEN:
+                            told = cameras.estimate(walk, self.noise, self.known_height, seed)
+                            row.append(cameras.errors_of(told, camera, walk))
                 if row:
-                    print(f"| {tilt:.0f} | {height:.1f} m | {len(row)} | {self._worst(row)} |", flush=True)
+                    print(f"| {tilt:.0f} | {height:.1f} m | {len(row)} | {self._errors(row)} |", flush=True)
                 found += row
         if not found:
             raise TensorsimError("evaluate camera: got no camera that has a walk in its picture")
@@ -67,9 +73,12 @@ class EvaluateCamera:
         print(f"tilt within 2 degrees: {tilts} of {len(found)}; range within 7 %: {ranges} of {len(found)}")
 
     @staticmethod
-    def _worst(row: "list[CameraErrors]") -> str:
-        """The largest errors of a row."""
-        pitch = max(abs(one.pitch_deg) for one in row)
-        fov = max(abs(one.fov_deg) for one in row)
-        far = max(abs(one.range) for one in row)
-        return f"{pitch:.1f} deg | {fov:.0f} deg | {100 * far:.0f} %"
+    def _errors(row: "list[CameraErrors]") -> str:
+        """Median and largest errors of a row."""
+        pitch = sorted(abs(one.pitch_deg) for one in row)
+        fov = sorted(abs(one.fov_deg) for one in row)
+        far = sorted(100 * abs(one.range) for one in row)
+        return (
+            f"{median(pitch):.1f}, {pitch[-1]:.1f} deg | {median(fov):.0f}, {fov[-1]:.0f} deg | "
+            f"{median(far):.0f}, {far[-1]:.0f} %"
+        )

@@ -11,10 +11,14 @@ from tensorsim.errors import TensorsimError, check_key_points, check_positive
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
     LEAN,
+    LEAN_SPREAD,
     PACE,
     PACE_SPREAD,
     STANDING,
+    WALK_RATIO,
+    WALK_RATIO_SPREAD,
     WALKING,
+    cadence,
     ends_of_body,
     is_upright,
     steadily,
@@ -143,10 +147,13 @@ class CameraCalibrator(nn.Module):
         self.keypoint_threshold = keypoint_threshold
         self.most_frames = most_frames
         degree = math.pi / 180
-        self.lean, self.pace, self.pace_spread = LEAN, PACE, PACE_SPREAD
+        self.lean, self.lean_spread = LEAN, LEAN_SPREAD
+        self.pace, self.pace_spread = PACE, PACE_SPREAD
+        self.walk_ratio, self.walk_ratio_spread = WALK_RATIO, WALK_RATIO_SPREAD
+        self.least_rhythm = 0.4  # share of a sinusoid in the steps from which a cadence is believed
         self.correlation_s = 0.4  # after which the errors of a body are no longer those of before
         self.smoothing_s = 0.15
-        self.path = 0.5  # body heights in the image after which somebody is seen anew
+        self.path = 0.25  # body heights in the image after which somebody is seen anew
         mean = [0.0, 0.0, math.log(1.5), 60 * degree]
         deviation = [20 * degree, 3 * degree, 0.45, 15 * degree]
         self.register_buffer("standing", torch.tensor(STANDING, dtype=torch.float64), persistent=False)
@@ -211,6 +218,7 @@ class CameraCalibrator(nn.Module):
         upright = steadily(is_upright(keypoints, scores, self.keypoint_threshold), valid, fps)
         count = upright.sum().reshape(1).double()
         walking = walking_share(keypoints, upright, fps)
+        cycles_hz, rhythm = cadence(keypoints, walking, fps)
         ends = ends_of_body(keypoints)
         sigma = self.smoothing_s * fps
         weights = upright.double()
@@ -231,14 +239,17 @@ class CameraCalibrator(nn.Module):
             upright,
             stature[:, None, None] * (self.standing + walking[..., None] * (self.walking - self.standing)),
             walking,
-            self.lean * stature,
             ((0.02 * size).square() + (2.0 / (width / 2)) ** 2).sqrt(),
         )
         nothing = torch.zeros(people, dtype=torch.float64, device=valid.device)
-        pace = (self.pace * stature).log()
-        mean = torch.cat([self.mean, nothing, pace])
-        deviation = torch.cat([self.deviation, self.height_sd_m / stature, nothing + self.pace_spread])
-        rest = torch.cat([nothing, pace]).expand(self.starts.shape[0], -1)
+        stepping = rhythm >= self.least_rhythm
+        pace = (torch.where(stepping, self.walk_ratio * cycles_hz.square(), self.pace) * stature).log()
+        mean = torch.cat([self.mean, nothing, pace, self.lean * stature])
+        pace_sd = torch.where(stepping, self.walk_ratio_spread, nothing + self.pace_spread)
+        deviation = torch.cat(
+            [self.deviation, self.height_sd_m / stature, pace_sd, self.lean_spread * stature]
+        )
+        rest = torch.cat([nothing, pace, self.lean * stature]).expand(self.starts.shape[0], -1)
         independent = self._independent(ends, upright, every / fps)
         at, covariance, cost = fit_camera(
             torch.cat([self.starts, rest], dim=-1), mean, deviation, bodies, fps / every, independent

@@ -71,7 +71,6 @@ class Bodies(NamedTuple):
         upright: (P, T) bool, the frames that count.
         above_floor: (P, T, 2) metres.
         walking: (P, T) from 0, standing, to 1, walking.
-        lean_m: (P,) by how much the shoulders are ahead of the ankles in a walk.
         noise: (P, T) standard deviation of a point in half widths.
     """
 
@@ -79,7 +78,6 @@ class Bodies(NamedTuple):
     upright: Tensor
     above_floor: Tensor
     walking: Tensor
-    lean_m: Tensor
     noise: Tensor
 
 
@@ -87,8 +85,9 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     """Residuals of upright bodies and of their walking speeds, in standard deviations.
 
     Args:
-        parameters: (..., 4 + 2 P): pitch, roll, logarithm of the height of the camera in m, horizontal field of view,
-            then for each person the logarithms of the factor on the body height and of the walking speed.
+        parameters: (..., 4 + 3 P): pitch, roll, logarithm of the height of the camera in m, horizontal field of view,
+            then for all people the logarithms of the factor on the body height and of the walking speed in m/s, and by
+            how many metres the shoulders are ahead of the ankles in a walk.
         bodies: what is seen.
         fps: frames per second.
 
@@ -99,8 +98,8 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     axes = camera_axes(parameters[..., 0], parameters[..., 1])
     focal = 1.0 / torch.tan(parameters[..., 3] / 2)
     height = parameters[..., 2].exp()
-    factor = parameters[..., 4 : 4 + people].exp()
-    pace = parameters[..., 4 + people :].exp()
+    own = parameters[..., 4:].unflatten(-1, [3, people])
+    factor, pace, lean = own[..., 0, :].exp(), own[..., 1, :].exp(), own[..., 2, :]
     above_floor = bodies.above_floor * factor[..., None, None]
     nowhere = torch.zeros_like(bodies.image)
     spot, _ = place_upright(axes, height, focal, bodies.image, above_floor, nowhere)
@@ -110,17 +109,21 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     time = torch.arange(frames, device=spot.device)
     before = (time - span // 2).clamp(min=0, max=max(frames - 1 - span, 0))
     after = (before + span).clamp(max=frames - 1)
-    way = spot.index_select(-2, after) - spot.index_select(-2, before)
+    start, end = spot.index_select(-2, before), spot.index_select(-2, after)
+    between = spot.index_select(-2, (before + after) // 2)
+    way = end - start
     distance = torch.linalg.vector_norm(way, dim=-1)
+    # In two parts: whoever turns goes further than straight from start to end.
+    path = torch.linalg.vector_norm(between - start, dim=-1) + torch.linalg.vector_norm(end - between, dim=-1)
     known = bodies.upright.index_select(-1, after) & bodies.upright.index_select(-1, before) & bodies.upright
     moves = bodies.walking * known.to(spot.dtype)
-    ahead = way / distance.clamp(min=0.3)[..., None] * (moves * bodies.lean_m[:, None])[..., None]
+    ahead = way / distance.clamp(min=0.3)[..., None] * (moves * lean[..., None])[..., None]
     beside = torch.stack([torch.zeros_like(ahead), ahead], dim=-2)
     _, seen = place_upright(axes, height, focal, bodies.image, above_floor, beside)
 
     away = (seen - bodies.image) / bodies.noise[..., None, None]
     away = torch.where(bodies.upright[..., None, None], away, 0.0).flatten(-2)
-    speed = distance / (span / fps)
+    speed = path / (span / fps)
     return away, moves * (speed / pace[..., None] - 1.0) / 0.1
 
 
@@ -131,26 +134,21 @@ def residuals(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
 
 
 def jacobian(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
-    """Derivative (..., P, T, 5, 4 + 2 P) of :func:`residuals` by the parameters, by central differences."""
+    """Derivative (..., P, T, 5, 4 + 3 P) of :func:`residuals` by the parameters, by central differences."""
     people, step = bodies.upright.shape[0], 1e-5
-    shared: list[Tensor] = []
-    own: list[Tensor] = []
+    columns: list[Tensor] = []
     each = torch.eye(people, dtype=parameters.dtype, device=parameters.device)[:, None, None, :]
-    for i in range(6):
-        # Heights and speeds of all people at once: each body depends on those of its own person only.
-        moved = torch.zeros(4 + 2 * people, dtype=parameters.dtype, device=parameters.device)
+    for i in range(4 + 3):
+        # One of the camera, or one of all people at once: each body depends on those of its own person only.
+        moved = torch.zeros(4 + 3 * people, dtype=parameters.dtype, device=parameters.device)
         if i < 4:
             moved[i] = step
-        elif i == 4:
-            moved[4 : 4 + people] = step
         else:
-            moved[4 + people :] = step
+            moved[4 + (i - 4) * people : 4 + (i - 3) * people] = step
         slope = residuals(parameters + moved, bodies, fps) - residuals(parameters - moved, bodies, fps)
-        if i < 4:
-            shared.append(slope / (2 * step))
-        else:
-            own.append(slope[..., None] * each / (2 * step))
-    return torch.cat([torch.stack(shared, dim=-1), own[0], own[1]], dim=-1)
+        slope = slope.unsqueeze(-1) / (2 * step)
+        columns.append(slope if i < 4 else slope * each)
+    return torch.cat(columns, dim=-1)
 
 
 def robust(residual: Tensor, outlier: float) -> tuple[Tensor, Tensor]:
@@ -174,15 +172,15 @@ def fit_camera(
     """Levenberg-Marquardt from several starts at once, with Cauchy's robust loss and normal priors.
 
     Args:
-        start: (S, 4 + 2 P) parameters, see :func:`misfit`.
-        mean, deviation: (4 + 2 P,) of the priors.
+        start: (S, 4 + 3 P) parameters, see :func:`misfit`.
+        mean, deviation: (4 + 3 P,) of the priors.
         bodies, fps: see :func:`misfit`.
         share: (P, 1, 1) how much each frame of a person counts; successive frames are not independent.
         rounds: steps.
         outlier: residual in standard deviations beyond which a body or a speed is doubted.
 
     Returns:
-        Parameters (S, 4 + 2 P), their covariance (S, 4 + 2 P, 4 + 2 P) and cost (S,).
+        Parameters (S, 4 + 3 P), their covariance (S, 4 + 3 P, 4 + 3 P) and cost (S,).
     """
     at, residual = start, residuals(start, bodies, fps)
     cost = _cost(at, residual, mean, deviation, share, outlier)
