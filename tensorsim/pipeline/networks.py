@@ -78,7 +78,7 @@ def pretrained_lifter(people: PoseConfig) -> NearestPoseLifter | TemporalLifter:
     if people.lifter == "temporal":
         return TemporalLifter.from_pretrained(
             people.lifter_weights, people.camera, people.person_height_m, people.keypoint_threshold
-        )
+        ).double()
     library = None if people.library is None else load_pose_library(people.library)
     return NearestPoseLifter(
         library,

@@ -358,11 +358,11 @@ class VideoToPose(nn.Module):
 
 
 def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> TemporalLifter:
-    """The shipped lifter for the camera and people of a metric pose, or for the default ones."""
+    """The shipped lifter, in float64, for the camera and people of a metric pose, or for the default ones."""
     if not isinstance(metric_pose, MetricPose):
-        return TemporalLifter.from_pretrained(keypoint_threshold=keypoint_threshold)
+        return TemporalLifter.from_pretrained(keypoint_threshold=keypoint_threshold).double()
     heights = tuple(metric_pose.heights.tolist())
-    return TemporalLifter.from_pretrained(None, metric_pose.camera, heights, keypoint_threshold)
+    return TemporalLifter.from_pretrained(None, metric_pose.camera, heights, keypoint_threshold).double()
 
 
 class _AsPlaced(nn.Module):

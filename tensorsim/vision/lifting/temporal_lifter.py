@@ -284,8 +284,8 @@ class TemporalLifter(nn.Module):
     ) -> "TemporalLifter":
         """The lifter with trained weights, in evaluation mode.
 
-        Its network computes in float64: the rounding of float32 moves joints by micrometres from frame to frame, which
-        a radar at 77 GHz sees.
+        It computes in float32, whose rounding moves joints by micrometres from frame to frame. A radar at 77 GHz sees
+        that: the pipeline takes ``from_pretrained().double()``.
 
         Args:
             source: a path, a name from ``tensorsim models list``, or None for the shipped weights.
@@ -307,7 +307,6 @@ class TemporalLifter(nn.Module):
             )
         network = TemporalNet(enter.shape[0])
         load_strict(network, weights, path)
-        network.double()
         return cls(network, camera, person_height_m, keypoint_threshold).eval()
 
 
