@@ -34,7 +34,7 @@ class FilmLoss:
 
     def __init__(self, errors: FilmErrors) -> None:
         self.errors = errors
-        self.lifter = TemporalLifter.from_pretrained()
+        self.lifter = TemporalLifter.from_pretrained().double()
 
     @torch.no_grad()
     def __call__(self, joints: Tensor, height_m: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

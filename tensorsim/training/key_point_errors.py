@@ -158,7 +158,7 @@ class FilmedMotion:
 
     def __init__(self) -> None:
         nothing = nn.Identity()
-        self.stage = VideoToPose(nothing, nothing, lifter=TemporalLifter.from_pretrained()).eval()
+        self.stage = VideoToPose(nothing, nothing, lifter=TemporalLifter.from_pretrained().double()).eval()
 
     @torch.no_grad()
     def __call__(
