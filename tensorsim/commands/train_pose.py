@@ -27,6 +27,8 @@ class TrainPose(PeopleOptions):
         steps: optimiser steps.
         batch: crops per step.
         learning_rate: highest learning rate.
+        second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
+            agree with the labels, they put them right and add the face.
     """
 
     data: Path
@@ -38,6 +40,7 @@ class TrainPose(PeopleOptions):
     steps: int = 12000
     batch: int = 32
     learning_rate: float = 2e-3
+    second_labels: Path | None = None
 
     def run(self) -> None:
         """Do it."""
@@ -61,7 +64,7 @@ class TrainPose(PeopleOptions):
             small = HRNetConfig(width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32)
             net = HRNet(small, self.size)
         self.begin(net)
-        persons = read_people(self.data)
+        persons = read_people(self.data, self.second_labels)
         cutouts = self.rendered_people()
         rendered = None
         if cutouts is not None:
@@ -77,6 +80,8 @@ class TrainPose(PeopleOptions):
             sigma=1.0 if self.network == "cpm" else 1.5,
             first_size=self.first_size,
             first_samples=self.first_steps * self.batch,
+            # Those who are confirmed join the first of the groups.
+            shares=(0.5, 0.15, 0.3, 0.12) if self.second_labels is None else (0.75, 0.12, 0.05, 0.1),
         )
         self.train(recipe, loop)
 

@@ -32,6 +32,7 @@ from tensorsim.training.pose_data import (
     upright,
 )
 from tensorsim.training.pose_metrics import evaluate_pose
+from tensorsim.training.second_labels import put_right, read_results
 from tensorsim.training.shards import Shards, find_shards, read_coco_shards, split
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
@@ -55,20 +56,29 @@ class PosePeople(NamedTuple):
     unsided: Sequence[Person]
 
 
-def read_people(data: Path) -> PosePeople:
+def read_people(data: Path, second_labels: Path | None = None) -> PosePeople:
     """The people to train on of a folder of shards.
 
+    Args:
+        data: the folder.
+        second_labels: keypoints of the people of LSPE by another network (:mod:`tensorsim.training.second_labels`);
+            those whom it confirms join the people whose left and right labels hold.
+
     Raises:
-        TensorsimError: shards are missing.
+        TensorsimError: shards are missing; a file that does not hold keypoints.
     """
+    results = None if second_labels is None else read_results(second_labels)
     sided = people(read_coco_shards(data)[0])
     films = people(Shards(find_shards(data, "films_teacher")))
     for person in films:
         # The teacher leaves out only what is beyond the edge of the picture.
         body = person.keypoints[:17]
         body[body[:, 2] == 0, 2] = -1
-    lspet = split(Shards(find_shards(data, "lspet")), LSPET_HELD_OUT_PERCENT)[0]
-    return PosePeople(sided, films, people(lspet))
+    unsided = people(split(Shards(find_shards(data, "lspet")), LSPET_HELD_OUT_PERCENT)[0])
+    if results is not None:
+        confirmed, unsided = put_right(unsided, results)
+        sided = sided + confirmed
+    return PosePeople(sided, films, unsided)
 
 
 def held_out_people(data: Path) -> dict[str, list[Person]]:
