@@ -1,5 +1,6 @@
 """The commands that train and judge the pose network, on made-up shards."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,21 @@ def test_nobody_held_out_is_trained_on(data: Path) -> None:
     assert len(persons.films) == 40
 
 
+def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> None:
+    before, held_out = read_people(data), held_out_people(data)["LSPE"]
+    confirmed, apart = before.unsided[0].sample.key, held_out[0].sample.key
+    left, top, right, bottom = BOX.tolist()
+    found = {"bbox": [left, top, right - left, bottom - top], "keypoints": standing()[:17].flatten().tolist()}
+    path = data / "found.json"
+    path.write_text(json.dumps([found | {"image_id": key} for key in (confirmed, apart)]))
+    after = read_people(data, path)
+    assert len(after.sided) == len(before.sided) + 1
+    assert after.sided[-1].sample.key == confirmed
+    assert {person.sample.key for person in before.unsided} - {
+        person.sample.key for person in after.unsided
+    } == {confirmed}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -82,6 +98,7 @@ def test_nobody_held_out_is_trained_on(data: Path) -> None:
         ({"rendered_seed": -1}, "--rendered-seed: got -1"),
         ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
         ({"width": 0}, "HRNetConfig"),
+        ({"second_labels": Path("none.json")}, "none.json: not a COCO file of keypoint results"),
         ({"first_steps": 1, "first_size": (192, 144)}, r"--first-size: got \(192, 144\), expected"),
     ],
 )
