@@ -46,7 +46,14 @@ class TrainPose(PeopleOptions):
         """Do it."""
         import torch
 
-        from tensorsim.training.pose import PoseRecipe, TrainedCPM, held_out_people, read_people
+        from tensorsim.training.pose import (
+            SHARES,
+            SHARES_CONFIRMED,
+            PoseRecipe,
+            TrainedCPM,
+            held_out_people,
+            read_people,
+        )
         from tensorsim.training.pose_data import RenderedPeople
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
@@ -80,8 +87,7 @@ class TrainPose(PeopleOptions):
             sigma=1.0 if self.network == "cpm" else 1.5,
             first_size=self.first_size,
             first_samples=self.first_steps * self.batch,
-            # Those who are confirmed join the first of the groups.
-            shares=(0.5, 0.15, 0.3, 0.12) if self.second_labels is None else (0.75, 0.12, 0.05, 0.1),
+            shares=SHARES if self.second_labels is None else SHARES_CONFIRMED,
         )
         self.train(recipe, loop)
 

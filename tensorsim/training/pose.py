@@ -40,6 +40,10 @@ from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Of the pictures of LSPE, never trained on, see :func:`tensorsim.training.shards.split`.
 LSPET_HELD_OUT_PERCENT = 3
+#: Shares of the people of :class:`PosePeople`, in its order, and of rendered people in the stream of samples.
+SHARES = (0.5, 0.15, 0.3, 0.12)
+#: The same where most people of LSPE are confirmed by second labels, and so among the first.
+SHARES_CONFIRMED = (0.75, 0.12, 0.05, 0.1)
 
 
 class PosePeople(NamedTuple):
@@ -65,7 +69,7 @@ def read_people(data: Path, second_labels: Path | None = None) -> PosePeople:
             those whom it confirms join the people whose left and right labels hold.
 
     Raises:
-        TensorsimError: shards are missing; a file that does not hold keypoints.
+        TensorsimError: shards are missing; a file that does not hold keypoints, or those of nobody in the shards.
     """
     results = None if second_labels is None else read_results(second_labels)
     sided = people(read_coco_shards(data)[0])
@@ -77,6 +81,10 @@ def read_people(data: Path, second_labels: Path | None = None) -> PosePeople:
     unsided = people(split(Shards(find_shards(data, "lspet")), LSPET_HELD_OUT_PERCENT)[0])
     if results is not None:
         confirmed, unsided = put_right(unsided, results)
+        if not confirmed:
+            raise TensorsimError(
+                f"{second_labels}: confirms nobody, expected image_id and bbox of the people of lspet-*.tar"
+            )
         sided = sided + confirmed
     return PosePeople(sided, films, unsided)
 
@@ -216,7 +224,7 @@ class PoseRecipe(Recipe):
         sigma: float = 1.5,
         first_size: tuple[int, int] = (96, 64),
         first_samples: int = 0,
-        shares: tuple[float, float, float, float] = (0.5, 0.15, 0.3, 0.12),
+        shares: tuple[float, float, float, float] = SHARES,
         augmentation: Augmentation | None = None,
     ) -> None:
         self.augmentation = Augmentation() if augmentation is None else augmentation

@@ -51,6 +51,8 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, tuple[Floats, Floats
             box = np.array(entry["bbox"], np.float32).reshape(4)
             boxes.append(np.concatenate([box[:2], box[:2] + box[2:]]))
             points.append(np.array(entry["keypoints"], np.float32).reshape(17, 3))
+            if not (np.isfinite(box).all() and np.isfinite(points[-1]).all()):
+                raise ValueError(f"numbers that are missing or not finite, of image_id {entry['image_id']}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TensorsimError(
             f"{path}: not a COCO file of keypoint results with image_id, bbox and 17 keypoints ({error})"
@@ -97,16 +99,16 @@ def _mean(person: Person, second: Floats) -> Floats | None:
     """Keypoints (19, 3) by both labellings; None where they contradict each other."""
     near = NEAR * float((person.box[2:] - person.box[:2]).max())
     ways = [person.keypoints[:17], person.keypoints[list(MIRRORED)]]
-    known = [way[_BODY, 2] > 0 for way in ways]
-    apart = [np.linalg.norm((way - second)[_BODY, :2], axis=-1) for way in ways]
-    agree = [int(((d <= near) & k).sum()) for d, k in zip(apart, known, strict=True)]
-    way = int(agree[1] > agree[0])
-    if agree[way] < MOST * known[way].sum():
+    agree = [
+        (way[_BODY, 2] > 0) & (np.linalg.norm((way - second)[_BODY, :2], axis=-1) <= near) for way in ways
+    ]
+    best = int(agree[1].sum() > agree[0].sum())
+    body = ways[best][_BODY].copy()
+    if agree[best].sum() < MOST * (body[:, 2] > 0).sum():
         return None
     keypoints = person.keypoints.copy()
-    body = ways[way][_BODY].copy()
     body[:, :2] = (body[:, :2] + second[_BODY, :2]) / 2
-    body[(apart[way] > near) | ~known[way]] = 0
+    body[~agree[best]] = 0
     keypoints[_BODY] = body
     face = second[: _BODY.start].copy()
     face[:, 2] = 2.0 * (face[:, 2] >= FACE_SCORE)

@@ -87,6 +87,9 @@ def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> No
     assert {person.sample.key for person in before.unsided} - {
         person.sample.key for person in after.unsided
     } == {confirmed}
+    path.write_text(json.dumps([found | {"image_id": "elsewhere"}]))
+    with pytest.raises(TensorsimError, match=r"found.json: confirms nobody, expected image_id and bbox"):
+        read_people(data, path)
 
 
 @pytest.mark.parametrize(

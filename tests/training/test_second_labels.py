@@ -103,7 +103,10 @@ def test_reads_the_results_of_coco(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points[0, 3], [1, 2, 0.5])
 
 
-@pytest.mark.parametrize("text", [None, "not json", "{}", '[{"image_id": 1}]', "[1]"])
+MISSING = json.dumps([{"image_id": 1, "bbox": [0, 0, 9, 9], "keypoints": [None] * 51}])
+
+
+@pytest.mark.parametrize("text", [None, "not json", "{}", '[{"image_id": 1}]', "[1]", MISSING])
 def test_other_files_are_refused(tmp_path: Path, text: str | None) -> None:
     path = tmp_path / "found.json"
     if text is not None:
