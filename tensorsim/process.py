@@ -4,6 +4,7 @@
 process that is not the command, nothing is changed.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -14,9 +15,9 @@ from types import FrameType
 from typing import NoReturn
 
 #: Rounds that a thread waits busily for its next work before it sleeps. OpenMP's default keeps a core busy for
-#: milliseconds, which makes everything many times slower where another process wants that core; this is the number
-#: that it takes itself once there are more threads than cores.
-SPIN_ROUNDS = 1000
+#: milliseconds, which makes everything many times slower where somebody else wants that core, such as the thread that
+#: writes a film beside the radar; 1000 is the number that it takes itself once there are more threads than cores.
+SPIN_ROUNDS = 100
 
 
 def is_command() -> bool:
@@ -70,11 +71,17 @@ def ending_cleanly() -> Iterator[None]:
 
 
 def load_torch() -> None:
-    """Import torch, which takes a second; an interrupt ends the process at once."""
+    """Import torch, which takes a second; an interrupt ends the process at once.
+
+    What is imported stays to the end: left to the garbage collector, it costs half a second more, most of it at exit.
+    """
     before = signal.signal(signal.SIGINT, _quit)
+    gc.disable()
     try:
         import torch  # noqa: F401
     finally:
+        gc.freeze()
+        gc.enable()
         signal.signal(signal.SIGINT, before)
 
 

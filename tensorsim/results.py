@@ -3,6 +3,8 @@
 import math
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -271,15 +273,19 @@ def write_overlay(
     return strip
 
 
-def simulate(
+@contextmanager
+def simulated(
     source: "Source",
     stage: PoseToDoppler,
     folder: Path,
     config: SimulationConfig,
     device: torch.device,
     quiet: bool = False,
-) -> tuple[Found, RadarMaps, FilmStrip]:
-    """Find the people of a source, choose, and simulate their maps; writes the overlay film, and returns it as well."""
+) -> Iterator[tuple[Found, RadarMaps, Future[FilmStrip]]]:
+    """Find the people of a source, choose, and simulate their maps.
+
+    The overlay film is written in another thread meanwhile, and during the block; it is complete at its end.
+    """
     found = source.find(quiet)
     pose = select_people(found.pose, config.pose.people, source.fps)
     warn_of_empty_clips(pose.valid)
@@ -297,7 +303,7 @@ def simulate(
 
     with beside(overlay, source.frames()) as film:
         maps = maps_of_pose(stage, pose, source.fps, device, quiet)
-    return found._replace(pose=pose), maps, film.result()
+        yield found._replace(pose=pose), maps, film
 
 
 def _figure_pixels(figure: Any) -> np.ndarray:

@@ -83,18 +83,17 @@ class Demo(NetworkOptions, RadarOptions):
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4"), people, device)
-                seen, maps, strip = results.simulate(source, maps_stage, folder, config, device, self.quiet)
-                pose = seen.pose
-                torch.manual_seed(config.seed)
-                rate_hz = FILM_FPS * MOMENTS_PER_FRAME
-                joints = true_pose(truth.joints, truth.valid)
-                true_maps = maps_of_pose(true_stage, joints, rate_hz, device, self.quiet)
-                somebody = bool(truth.valid.any() | pose.valid.any())
-                name = f"demo: {ACTIVITIES[activity]}"
-                done = Run(
-                    config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device, strip
-                )
-                label = self.write_results(folder, done, true_maps)
+                simulated = results.simulated(source, maps_stage, folder, config, device, self.quiet)
+                with simulated as (seen, maps, strip):
+                    pose = seen.pose
+                    torch.manual_seed(config.seed)
+                    rate_hz = FILM_FPS * MOMENTS_PER_FRAME
+                    joints = true_pose(truth.joints, truth.valid)
+                    true_maps = maps_of_pose(true_stage, joints, rate_hz, device, self.quiet)
+                    somebody = bool(truth.valid.any() | pose.valid.any())
+                    name = f"demo: {ACTIVITIES[activity]}"
+                    done = Run(config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device)
+                    label = self.write_results(folder, done, true_maps)
                 write_pose_truth(folder, film, truth.valid)
                 likeness, empty_likeness = likeness_to_truth(maps, true_maps)
                 about = {
@@ -107,7 +106,7 @@ class Demo(NetworkOptions, RadarOptions):
                     "warnings": messages,
                 }
                 summary = label | results.summary_of(source, config, seen, maps) | about
-                self.write_report(folder, done, summary, true_maps)
+                self.write_report(folder, done, strip.result(), summary, true_maps)
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)

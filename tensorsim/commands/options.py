@@ -197,17 +197,18 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         self,
         folder: Path,
         run: "Run",
+        strip: "FilmStrip",
         summary: dict[str, Any],
         truth: "RadarMaps | None" = None,
         further: Sequence[dict[str, Any]] = (),
     ) -> None:
-        """Write ``report.html`` of a run with this summary, and further maps below the others."""
+        """Write ``report.html`` of a run with its overlay film and this summary, and further maps below the others."""
         from tensorsim import report, results
 
         axes = results.axes_of(run.stage, run.maps)
         pictures = self.pictures(run.stage, summary["label"], run.film, run.somebody)
         report.write_report(
-            folder, summary, run.pose, run.fps, run.maps, axes, run.strip, pictures, truth, further
+            folder, summary, run.pose, run.fps, run.maps, axes, strip, pictures, truth, further
         )
 
     def configuration(self) -> "SimulationConfig":
@@ -267,7 +268,6 @@ class Run(NamedTuple):
         film: what the people come from, for the titles.
         somebody: whether a person is in the scene.
         device: that ``stage`` is on.
-        strip: the overlay film as a report has it.
     """
 
     config: "SimulationConfig"
@@ -279,7 +279,6 @@ class Run(NamedTuple):
     film: str
     somebody: bool
     device: "torch.device"
-    strip: "FilmStrip"
 
 
 def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "SimulationConfig":

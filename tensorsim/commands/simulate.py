@@ -124,28 +124,22 @@ class Simulate(NetworkOptions, RadarOptions):
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
-                found, maps, film = results.simulate(source, stage, folder, config, device, self.quiet)
-                pose = found.pose
-                somebody = bool(pose.valid.any())
-                done = Run(
-                    config,
-                    stage,
-                    recognizer,
-                    pose,
-                    maps,
-                    source.fps,
-                    self.source.name,
-                    somebody,
-                    device,
-                    film,
-                )
-                label = self.write_results(folder, done)
+                simulated = results.simulated(source, stage, folder, config, device, self.quiet)
+                with simulated as (found, maps, film):
+                    pose = found.pose
+                    somebody = bool(pose.valid.any())
+                    done = Run(
+                        config, stage, recognizer, pose, maps, source.fps, self.source.name, somebody, device
+                    )
+                    label = self.write_results(folder, done)
+                    alone = write_each_person(folder, done, self) if self.per_person else []
                 summary = label | results.summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
-                alone = write_each_person(folder, done, self) if self.per_person else []
                 for row, person in zip(summary["people"], alone, strict=len(alone) > 0):
                     row |= person.label
-                self.write_report(folder, done, summary, further=[person.map for person in alone])
+                self.write_report(
+                    folder, done, film.result(), summary, further=[person.map for person in alone]
+                )
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)

@@ -167,27 +167,36 @@ def fit_camera(
     fps: float,
     share: Tensor,
     rounds: int = 25,
+    first_rounds: int = 8,
+    kept: int = 3,
     outlier: float = 2.5,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt from several starts at once, with Cauchy's robust loss and normal priors.
+
+    Most starts come to the same end, so after a few steps only the best go on, until they hardly move.
 
     Args:
         start: (S, 4 + 3 P) parameters, see :func:`misfit`.
         mean, deviation: (4 + 3 P,) of the priors.
         bodies, fps: see :func:`misfit`.
         share: (P, 1, 1) how much each frame of a person counts; successive frames are not independent.
-        rounds: steps.
+        rounds: steps at most.
+        first_rounds: steps of all starts.
+        kept: how many of them, K, go on.
         outlier: residual in standard deviations beyond which a body or a speed is doubted.
 
     Returns:
-        Parameters (S, 4 + 3 P), their covariance (S, 4 + 3 P, 4 + 3 P) and cost (S,).
+        Parameters (K, 4 + 3 P), their covariance (K, 4 + 3 P, 4 + 3 P) and cost (K,).
     """
     at, residual = start, residuals(start, bodies, fps)
     cost = _cost(at, residual, mean, deviation, share, outlier)
     damping = torch.full_like(cost, 1e-2)
     precision = torch.diag(deviation.pow(-2))
     hessian = precision.expand(at.shape[0], -1, -1)
-    for _ in range(rounds):
+    for i in range(rounds):
+        if i == first_rounds:
+            best = cost.argsort()[:kept]
+            at, residual, cost, damping = at[best], residual[best], cost[best], damping[best]
         trust = share * robust(residual, outlier)[1]
         trust = torch.cat([trust[..., :1].expand(-1, -1, -1, 4), trust[..., 1:]], dim=-1)
         slope = jacobian(at, bodies, fps)
@@ -205,6 +214,8 @@ def fit_camera(
         residual = torch.where(better[:, None, None, None], new_residual, residual)
         cost = torch.where(better, new_cost, cost)
         damping = torch.where(better, damping / 4, damping * 6).clamp(1e-9, 1e9)
+        if i >= first_rounds and bool((step / deviation).abs().amax() < 1e-5):
+            break
     return at, torch.linalg.inv(hessian), cost
 
 

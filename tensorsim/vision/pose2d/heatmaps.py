@@ -104,33 +104,31 @@ def sides_apart(maps: Tensor, left: Tensor, right: Tensor, share: float = 0.7, r
         (..., K, h, w).
     """
     height, width = maps.shape[-2], maps.shape[-1]
-    found = maps.detach()
-    around = F.max_pool2d(found.reshape(-1, 1, height, width), 3, 1, 1).reshape(found.shape)
-    summits = torch.where(found >= around, found, 0.0)
+    found = maps.detach().reshape(-1, maps.shape[-3], height, width)
     u, v, score = peak(found)
+    distance = (u.index_select(1, left) - u.index_select(1, right)).square()
+    distance = distance + (v.index_select(1, left) - v.index_select(1, right)).square()
+    shared = (distance <= (radius - 1.0) ** 2).nonzero()
+    # Of S pairs with one place: both maps and their peaks, left first.
+    body = shared[:, :1]
+    number = torch.stack([left, right], dim=-1).index_select(0, shared[:, 1])
+    both, u, v, first = found[body, number], u[body, number], v[body, number], score[body, number]
+    around = F.max_pool2d(both, 3, 1, 1)
+    summits = torch.where(both >= around, both, 0.0)
     row = torch.arange(height, device=maps.device).unsqueeze(-1)
     column = torch.arange(width, device=maps.device)
     away = (column - u[..., None, None]).square() + (row - v[..., None, None]).square() > radius**2
-    distance = (u.index_select(-1, left) - u.index_select(-1, right)).square()
-    distance = distance + (v.index_select(-1, left) - v.index_select(-1, right)).square()
-    shared = distance <= (radius - 1.0) ** 2
     # What each map has beyond the peak of the other one, and what the other has there.
-    left_away, right_away = away.index_select(-3, left), away.index_select(-3, right)
-    left_maps, right_maps = found.index_select(-3, left), found.index_select(-3, right)
-    left_u, left_v, second_left = peak(summits.index_select(-3, left) * right_away)
-    right_u, right_v, second_right = peak(summits.index_select(-3, right) * left_away)
-    tiny = 1e-10
-    first_left = score.index_select(-1, left).clamp(min=tiny)
-    first_right = score.index_select(-1, right).clamp(min=tiny)
-    left_again = (second_left / first_left + pixel(right_maps, left_u, left_v) / first_right) / 2
-    right_again = (second_right / first_right + pixel(left_maps, right_u, right_v) / first_left) / 2
-    moves_left = second_left * first_right > first_left * second_right
-    left_goes = shared & moves_left & (left_again >= share)
-    right_goes = shared & ~moves_left & (right_again >= share)
-    kept = torch.ones_like(away)
-    kept = kept.index_copy(-3, left, ~left_goes[..., None, None] | right_away)
-    kept = kept.index_copy(-3, right, ~right_goes[..., None, None] | left_away)
-    return maps * kept
+    away_from_other = away.flip(1)
+    u_again, v_again, second = peak(summits * away_from_other)
+    there = pixel(both.flip(1), u_again, v_again)
+    floor = first.clamp(min=1e-10)
+    again = (second / floor + there / floor.flip(1)) / 2
+    moves_left = second[:, :1] * first[:, 1:] > first[:, :1] * second[:, 1:]
+    goes = torch.cat([moves_left, ~moves_left], dim=1) & (again >= share)
+    kept = torch.ones_like(found, dtype=torch.bool)
+    kept = kept.index_put([body, number], ~goes[..., None, None] | away_from_other)
+    return maps * kept.view(maps.shape)
 
 
 class HeatmapDecoder(nn.Module):
