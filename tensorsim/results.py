@@ -18,6 +18,7 @@ from tensorsim.array_files import save_arrays
 from tensorsim.config import CameraConfig, SimulationConfig
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
+from tensorsim.device import one_thread
 from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.progress import picture, progress_bar
@@ -284,7 +285,8 @@ def simulated(
 ) -> Iterator[tuple[Found, RadarMaps, Future[FilmStrip]]]:
     """Find the people of a source, choose, and simulate their maps.
 
-    The overlay film is written in another thread meanwhile, and during the block; it is complete at its end.
+    The overlay film is written in another thread meanwhile, and during the block; it is complete at its end. Until then
+    torch computes on one thread.
     """
     found = source.find(quiet)
     pose = select_people(found.pose, config.pose.people, source.fps)
@@ -301,7 +303,8 @@ def simulated(
     def overlay(chunks: Iterable[Tensor]) -> FilmStrip:
         return write_overlay(folder, chunks, source.fps, pose, source.threshold, quiet, camera)
 
-    with beside(overlay, source.frames()) as film:
+    # The radar is as fast on one thread as on two, and the film needs the other.
+    with beside(overlay, source.frames()) as film, one_thread():
         maps = maps_of_pose(stage, pose, source.fps, device, quiet)
         yield found._replace(pose=pose), maps, film
 
