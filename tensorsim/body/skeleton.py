@@ -15,6 +15,10 @@ from tensorsim.errors import TensorsimError, check_finite, check_points, check_p
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
 #: Segments of constant length by their ends; 14 is the middle of the hips. The neck, joint 1, is that of the shoulders.
 BONES = ((0, 1), (2, 5), *LIMBS[:4], (8, 11), *LIMBS[4:], (1, 14))
+#: For each joint, the one that takes its place in a mirror image.
+MIRRORED_JOINTS = tuple(
+    JOINTS.index(n.replace("right", "left") if "right" in n else n.replace("left", "right")) for n in JOINTS
+)
 
 
 def mid_hips(joints: Tensor) -> Tensor:
@@ -56,11 +60,7 @@ def body_height(joints: Tensor) -> Tensor:
 
 def mirror(joints: Tensor) -> Tensor:
     """The mirror image of poses (..., 14, 3): x negated, right and left joints exchanged."""
-    swapped = [
-        JOINTS.index(n.replace("right", "left") if "right" in n else n.replace("left", "right"))
-        for n in JOINTS
-    ]
-    flipped = joints[..., swapped, :]
+    flipped = joints[..., MIRRORED_JOINTS, :]
     return torch.cat([-flipped[..., :1], flipped[..., 1:]], dim=-1)
 
 

@@ -22,6 +22,7 @@ from tensorsim.vision.calibration.upright import (
     ends_of_body,
     is_upright,
     steadily,
+    still_beside_others,
     walking_share,
 )
 from tensorsim.vision.smoothing.along_time import local_linear
@@ -104,7 +105,7 @@ class CameraCalibrator(nn.Module):
     beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15
     degrees); somebody who walks through the scene tells everything. The height of the camera goes with that of the
     people. However long somebody stays at one place, that is one observation: errors of key points there do not average
-    out.
+    out. Who does not move at all while somebody else does may be a thing that looks like a person, and tells nothing.
 
     Args:
         person_height_m: standing heights by order of person; the last one serves all further people.
@@ -216,6 +217,7 @@ class CameraCalibrator(nn.Module):
         """Means, deviations and number of frames (9,) of the camera of one clip of key points (P, T, 17, 2)."""
         people, frames = valid.shape[0], valid.shape[1]
         upright = steadily(is_upright(keypoints, scores, self.keypoint_threshold), valid, fps)
+        upright = upright & ~still_beside_others(ends_of_body(keypoints), valid)[:, None]
         count = upright.sum().reshape(1).double()
         walking = walking_share(keypoints, upright, fps)
         cycles_hz, rhythm = cadence(keypoints, walking, fps)

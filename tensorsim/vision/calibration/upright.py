@@ -77,6 +77,30 @@ def steadily(upright: Tensor, valid: Tensor, fps: float, share: float = 0.8) -> 
     return upright & valid & (counts[0] >= share * counts[1])
 
 
+def still_beside_others(ends: Tensor, valid: Tensor, least: float = 0.04) -> Tensor:
+    """Who does not move at all while somebody else does: a thing, or a picture of somebody, that looks like a person.
+
+    Ankles and shoulders of a body stay within ``least`` of its size in the image about one place in nine of ten frames.
+    Where nobody moves more than that, nobody is said to be still.
+
+    Args:
+        ends: (P, T, 2, 2) pixels, see :func:`ends_of_body`.
+        valid: (P, T) bool.
+
+    Returns:
+        (P,) bool.
+    """
+    far = torch.zeros(valid.shape[0], dtype=ends.dtype, device=ends.device)
+    for person in range(valid.shape[0]):
+        seen = ends[person][valid[person]]
+        if seen.shape[0] > 0:
+            middle = seen.median(dim=0).values
+            size = torch.linalg.vector_norm(middle[0] - middle[1], dim=-1).clamp(min=1.0)
+            away = torch.linalg.vector_norm(seen - middle, dim=-1).amax(dim=-1) / size
+            far[person] = away.quantile(0.9)
+    return (far <= least) & valid.any(dim=-1) & (far > least).any()
+
+
 def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
     """How much people walk: 0 standing to 1 walking, from how the ankles move against each other within a second.
 

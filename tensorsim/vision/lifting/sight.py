@@ -36,6 +36,28 @@ class Sight(NamedTuple):
     azimuth: Tensor
 
 
+def mirror_image(sight: Sight, other_keypoint: Tensor, other_joint: Tensor) -> Sight:
+    """The same people with left and right exchanged, each where they are.
+
+    Args:
+        sight: of the people.
+        other_keypoint: (17,) int64, for each key point the one that takes its place in a mirror image.
+        other_joint: (14,) int64, the same of the joints.
+    """
+    turn = torch.tensor([-1.0, 1.0], dtype=sight.joints.dtype, device=sight.joints.device)
+    spot, scores, edges, room, rest = sight.features.split([34, 17, 4, 4, 8], dim=-1)
+    spot = spot.unflatten(-1, [17, 2]).index_select(-2, other_keypoint) * turn
+    left, right = edges[..., :1], edges[..., 1:2]
+    features = torch.cat(
+        [
+            spot.flatten(-2), scores.index_select(-1, other_keypoint), -right, -left, edges[..., 2:],
+            room[..., 1:2], room[..., :1], room[..., 2:], rest,
+        ], dim=-1,
+    )  # fmt: skip
+    joints = sight.joints.index_select(-2, other_joint) * turn
+    return Sight(features, joints, sight.elevation, sight.size, sight.azimuth)
+
+
 def windowed_mean(x: Tensor, weight: Tensor) -> Tensor:
     """Weighted mean of x (S, T, D) over ``2 RADIUS + 1`` frames about each; weight (S, T) not negative."""
     radius = 10  # RADIUS: TorchScript reads no constants of modules

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import BONES, bone_lengths, coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, MIRRORED_JOINTS, bone_lengths, coco_to_body, mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.errors import (
     TensorsimError,
@@ -24,8 +24,16 @@ from tensorsim.errors import (
 )
 from tensorsim.geometry.camera import camera_to_world, project
 from tensorsim.types import Lifted
-from tensorsim.vision.lifting.sight import RADIUS, level_sight, turned_back, windowed_mean
+from tensorsim.vision.lifting.sight import (
+    RADIUS,
+    Sight,
+    level_sight,
+    mirror_image,
+    turned_back,
+    windowed_mean,
+)
 from tensorsim.vision.lifting.temporal_net import DILATIONS, Located, TemporalNet
+from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Lengths of all bones together, in standing heights; between people they differ by 2 %.
 _ALL_BONES = 2.39
@@ -62,6 +70,9 @@ def along_axes(across: Tensor, along: Tensor, azimuth: Tensor) -> Tensor:
 class TemporalLifter(nn.Module):
     """Key points of tracked people over time -> joints about the hips, position of the hips, standard deviations.
 
+    The network sees the people and their mirror images, and the mean of both counts: a mirrored film gives the mirrored
+    motion.
+
     Args:
         network: with its weights; None is an untrained one. :meth:`from_pretrained` loads the shipped one.
         camera: where the camera stands, its tilt and focal length; None is the default one, at the radar.
@@ -85,6 +96,8 @@ class TemporalLifter(nn.Module):
     heights: Tensor
     camera_pose: Tensor
     bones: Tensor
+    other_keypoint: Tensor
+    other_joint: Tensor
     focal_px: float | None
     center_px: tuple[float, float] | None
 
@@ -118,6 +131,8 @@ class TemporalLifter(nn.Module):
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
         self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
         self.register_buffer("bones", torch.tensor(BONES).T, persistent=False)
+        self.register_buffer("other_keypoint", torch.tensor(MIRRORED), persistent=False)
+        self.register_buffer("other_joint", torch.tensor(MIRRORED_JOINTS), persistent=False)
 
     def seen_by(
         self, camera: CameraConfig, person_height_m: tuple[float, ...] | None = None, known: bool = True
@@ -248,7 +263,7 @@ class TemporalLifter(nn.Module):
             pose[2, 3] / height,
             self.keypoint_threshold,
         )
-        found: Located = self.network(sight)
+        found = self._both_ways(sight)
         if self.camera_known:
             return found, sight.azimuth
         # As seen from the camera, a body twice as far away and twice as large looks the same.
@@ -256,6 +271,19 @@ class TemporalLifter(nn.Module):
         excess = windowed_mean(excess[..., None], valid.to(excess.dtype) + 1e-3)[..., 0]
         joints = found.joints * torch.exp(-excess)[..., None, None]
         return Located(joints, found.log_spread, found.log_range_spread), sight.azimuth
+
+    def _both_ways(self, sight: Sight) -> Located:
+        """The mean of what the network finds in people and in their mirror images."""
+        found: Located = self.network(sight)
+        turned: Located = self.network(mirror_image(sight, self.other_keypoint, self.other_joint))
+        joints = turned.joints.index_select(-2, self.other_joint)
+        joints = torch.cat([-joints[..., :1], joints[..., 1:]], dim=-1)
+        spread = turned.log_spread.index_select(-2, self.other_joint)
+        return Located(
+            (found.joints + joints) / 2,
+            (found.log_spread + spread) / 2,
+            (found.log_range_spread + turned.log_range_spread) / 2,
+        )
 
     def _height_of_each(self, like: Tensor) -> Tensor:
         """Standing height of each track, (S,), of (..., P, T, N, D)."""

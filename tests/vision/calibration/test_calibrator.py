@@ -28,7 +28,15 @@ from tensorsim.vision.calibration.camera_fit import (
     residuals,
     robust,
 )
-from tensorsim.vision.calibration.upright import WALK_RATIO, cadence, is_upright, steadily, walking_share
+from tensorsim.vision.calibration.upright import (
+    WALK_RATIO,
+    cadence,
+    ends_of_body,
+    is_upright,
+    steadily,
+    still_beside_others,
+    walking_share,
+)
 from tests.film import STANDING
 from tests.stage import StageTester
 
@@ -209,6 +217,25 @@ def test_who_sits_and_looks_upright_now_and_then_does_not_count() -> None:
     assert found[0].nonzero()[:, 0].tolist() == list(range(begins, 89 - begins + 1))
     assert not bool(found[1].any())
     assert torch.equal(found[2], valid[2])
+
+
+def test_a_thing_beside_somebody_who_walks_tells_nothing() -> None:
+    """It looks like a small person low in the picture, which a camera high above the floor would see."""
+    frames = 60
+    walker = torch.stack([standing(320.0 + t, 180.0 + t) for t in range(frames)])
+    noise = torch.randn(2, frames, 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    thing = standing(470.0, 60.0) + 0.2 * noise[1]
+    both = torch.stack([walker + noise[0], thing])
+    there = torch.ones(2, frames, dtype=torch.bool)
+    assert still_beside_others(ends_of_body(both), there).tolist() == [False, True]
+    assert still_beside_others(ends_of_body(both[1:]), there[1:]).tolist() == [False]
+    seen = torch.ones(2, frames, 17, dtype=torch.float64)
+    module = CameraCalibrator(most_frames=20)
+    alone = module(both[:1], seen[:1], there[:1], HEIGHT, WIDTH, FPS)
+    beside = module(both, seen, there, HEIGHT, WIDTH, FPS)
+    assert int(beside.frames) == int(alone.frames) > 30
+    for one, other in zip(beside[:8], alone[:8], strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
 
 
 def test_a_tilt_that_is_hardly_known_is_drawn_towards_level() -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import tensorsim as ts
-from tensorsim.body.skeleton import BONES, body_to_coco, coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, MIRRORED_JOINTS, body_to_coco, coco_to_body, mid_hips, mirror
 from tensorsim.config import CameraConfig, PoseConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world, project
@@ -17,6 +17,7 @@ from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.lifting.sight import level_sight, turned_back, windowed_mean
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter, along_axes
 from tensorsim.vision.lifting.temporal_net import TemporalNet
+from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.stage import StageTester
 
 CAMERA = CameraConfig(position_m=(0.3, -1.0, 1.9), pitch_rad=-0.3, yaw_rad=0.2, horizontal_fov_rad=1.2)
@@ -143,6 +144,26 @@ def test_key_points_that_are_nearly_right_stay_and_others_move() -> None:
         far = lifter.in_picture(found, wrong, scores[..., :14], HEIGHT, WIDTH).keypoints
     torch.testing.assert_close(near, jittery, atol=1e-6, rtol=0)
     torch.testing.assert_close(far, body, atol=1e-6, rtol=0)
+
+
+def test_a_mirrored_film_gives_the_mirrored_motion() -> None:
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.9), pitch_rad=-0.3, horizontal_fov_rad=1.2)
+    lifter = TemporalLifter(network(), camera, (1.7,)).double().eval()
+    _, keypoints, scores, boxes, valid = filmed()
+    scores[0, 5:9, 9] = 0.1  # a wrist that is not seen for a while
+    other = list(MIRRORED)
+    turned = keypoints[..., other, :] * torch.tensor([-1.0, 1.0]) + torch.tensor([WIDTH - 1.0, 0.0])
+    edges = torch.stack(
+        [WIDTH - 1 - boxes[..., 2], boxes[..., 1], WIDTH - 1 - boxes[..., 0], boxes[..., 3]], -1
+    )
+    with torch.no_grad():
+        plain = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        back = lifter(turned, scores[..., other], edges, valid, HEIGHT, WIDTH, 30.0)
+    torch.testing.assert_close(mirror(back.joints), plain.joints, atol=1e-9, rtol=0)
+    torch.testing.assert_close(back.root * torch.tensor([-1.0, 1.0, 1.0]), plain.root, atol=1e-9, rtol=0)
+    spread = back.deviation[..., list(MIRRORED_JOINTS), :]
+    torch.testing.assert_close(spread, plain.deviation, atol=1e-9, rtol=0)
+    torch.testing.assert_close(back.root_deviation, plain.root_deviation, atol=1e-9, rtol=0)
 
 
 def test_tilt_turn_and_focal_length_are_taken_out() -> None:
