@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tensorsim.exceptions import TensorsimError
 
@@ -22,12 +23,14 @@ class EvaluatePose:
             of the height of their picture.
         coco: folder with one COCO annotation file (*.json) and its pictures in images/.
         flip_test: average with the mirror image.
+        engine: what runs the network, as in `tensorsim simulate`.
     """
 
     weights: Path | None = None
     data: Path | None = None
     coco: Path | None = None
     flip_test: bool = True
+    engine: Literal["onnxruntime", "int8", "torch"] = "torch"
 
     def run(self) -> None:
         """Do it."""
@@ -51,6 +54,10 @@ class EvaluatePose:
             raise TensorsimError("evaluate pose: got no pictures, expected --data or --coco")
 
         pose = pretrained_pose(self.weights, self.flip_test).eval()
+        if self.engine != "torch":
+            from tensorsim.vision.onnx_engine import in_onnxruntime
+
+            in_onnxruntime(pose, pose, int8=self.engine == "int8")
         heads = "".join(f"{head:>8s}" for head in ("body", "pairs", "seen", "ghosts"))
         print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s}{heads}")
         for name, persons in groups.items():

@@ -126,22 +126,27 @@ def peer(film: Path) -> float:
         return time.process_time() - before
 
 
-def rendered(path: Path) -> None:
-    """A film of somebody who walks."""
-    frames = film_person(7, 300, seed=0).film.frames.permute(0, 2, 3, 1).numpy()
+def rendered(path: Path, people: int) -> None:
+    """A film of somebody who walks, or of that and somebody else in the right half who punches."""
+    films = [film_person(activity, 300, seed).film.frames for activity, seed in ((7, 0), (1, 3))[:people]]
+    if people == 2:
+        quarter = films[0].shape[-1] // 4
+        films = [film[..., quarter : 3 * quarter] for film in films]
+    frames = torch.cat(films, dim=-1).permute(0, 2, 3, 1).numpy()
     write_video(path, (cv2.resize(frame, (1280, 720)) for frame in frames), 30.0)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--film", type=Path)
+    parser.add_argument("--people", type=int, choices=(1, 2), default=1)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--peer", action="store_true")
     arguments, options = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as folder:
         film = arguments.film or Path(folder) / "film.mp4"
         if arguments.film is None:
-            rendered(film)
+            rendered(film, arguments.people)
         runs = [simulate(film, options) for _ in range(arguments.runs)]
         others = [peer(film) for _ in range(arguments.runs if arguments.peer else 0)]
     stages = sorted({stage for run, _ in runs for stage in run})

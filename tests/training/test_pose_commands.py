@@ -46,6 +46,10 @@ def test_train_then_evaluate(network: str, data: Path, capsys: pytest.CaptureFix
         assert row.startswith(f"{name}, held out   ")
         assert int(row.split()[-7]) == count
         assert all(0 <= float(figure) <= 1 for figure in row.split()[-6:])
+    EvaluatePose(weights, data=data, engine="onnxruntime").run()
+    for row, other in zip(rows[1:], capsys.readouterr().out.splitlines()[1:], strict=True):
+        figures = ([float(figure) for figure in line.split()[-6:]] for line in (row, other))
+        assert next(figures) == pytest.approx(next(figures), abs=0.0011)
     # Training goes on from those weights.
     more = TrainPose(
         data,
