@@ -37,9 +37,8 @@ def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.
     """``work`` of each item, in the order of the items; on the CPU by several threads at a time.
 
     Small convolutions gain little from a second thread, while two parts of a film side by side take half as long. So
-    torch computes on one thread in each, and as many items are worked on as it had threads; one more is ready, so that
-    none of them waits. ``work`` must not depend on what it was given before. Items are taken in the thread of the
-    caller, and errors come in their place.
+    torch computes on one thread in each, and as many items are worked on as it had threads. ``work`` must not
+    depend on what it was given before. Items are taken in the thread of the caller, and errors come in their place.
     """
     count = min(torch.get_num_threads(), MOST_AT_A_TIME) if device.type == "cpu" else 1
     if count == 1:
@@ -57,7 +56,7 @@ def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.
         try:
             for item in items:
                 waiting.append(pool.submit(copy_context().run, in_mode, item))
-                if len(waiting) > count:
+                if len(waiting) == count:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -1,6 +1,7 @@
 """The 14 joints of the radar body and the 17 key points of COCO: each from the other, roots and mirror images."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -15,10 +16,18 @@ from tensorsim.errors import TensorsimError, check_finite, check_points, check_p
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
 #: Segments of constant length by their ends; 14 is the middle of the hips. The neck, joint 1, is that of the shoulders.
 BONES = ((0, 1), (2, 5), *LIMBS[:4], (8, 11), *LIMBS[4:], (1, 14))
-#: For each joint, the one that takes its place in a mirror image.
-MIRRORED_JOINTS = tuple(
-    JOINTS.index(n.replace("right", "left") if "right" in n else n.replace("left", "right")) for n in JOINTS
-)
+
+
+def other_sides(names: Sequence[str]) -> tuple[int, ...]:
+    """For each name, the number of the one that takes its place in a mirror image: left for right, right for left."""
+    return tuple(
+        names.index(name.replace("right", "left") if "right" in name else name.replace("left", "right"))
+        for name in names
+    )
+
+
+#: For each joint and each COCO key point, the one that takes its place in a mirror image.
+MIRRORED_JOINTS, MIRRORED = other_sides(JOINTS), other_sides(COCO_KEYPOINTS)
 
 
 def mid_hips(joints: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+from tensorsim.commands.networks import Engine
 from tensorsim.exceptions import TensorsimError
 
 
@@ -30,10 +30,12 @@ class EvaluatePose:
     data: Path | None = None
     coco: Path | None = None
     flip_test: bool = True
-    engine: Literal["onnxruntime", "int8", "torch"] = "torch"
+    engine: Engine = "torch"
 
     def run(self) -> None:
         """Do it."""
+        from torch import nn
+
         from tensorsim.pipeline import pretrained_pose
         from tensorsim.training.pose import held_out_people
         from tensorsim.training.pose_data import Person, large, people, upright
@@ -57,7 +59,7 @@ class EvaluatePose:
         if self.engine != "torch":
             from tensorsim.vision.onnx_engine import in_onnxruntime
 
-            in_onnxruntime(pose, pose, int8=self.engine == "int8")
+            in_onnxruntime(nn.Identity(), pose, int8=self.engine == "int8")
         heads = "".join(f"{head:>8s}" for head in ("body", "pairs", "seen", "ghosts"))
         print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s}{heads}")
         for name, persons in groups.items():

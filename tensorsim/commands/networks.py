@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 from tensorsim.exceptions import TensorsimError
 
+Engine = Literal["onnxruntime", "int8", "torch"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
@@ -20,7 +22,7 @@ class NetworkOptions:
     else the shipped one."""
     flip_test: bool = True
     """Show the pose network every person mirrored as well: better, at twice the cost."""
-    engine: Literal["onnxruntime", "int8", "torch"] = "onnxruntime"
+    engine: Engine = "onnxruntime"
     """What runs the networks on the processor: ONNX Runtime takes half the time, with networks that it exports once to
     the user's cache; "int8" is the same with the pose network in 8-bit integers. On a GPU it is always torch."""
 

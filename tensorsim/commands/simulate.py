@@ -125,7 +125,7 @@ class Simulate(NetworkOptions, RadarOptions):
             stage = PoseToDoppler.from_config(config).to(device)
             with complete_or_nothing(self.out) as folder:
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)
-                with simulated as (found, maps, film):
+                with simulated as (found, maps, strip):
                     pose = found.pose
                     somebody = bool(pose.valid.any())
                     done = Run(
@@ -138,7 +138,7 @@ class Simulate(NetworkOptions, RadarOptions):
                 for row, person in zip(summary["people"], alone, strict=len(alone) > 0):
                     row |= person.label
                 self.write_report(
-                    folder, done, film.result(), summary, further=[person.map for person in alone]
+                    folder, done, strip.result(), summary, further=[person.map for person in alone]
                 )
                 results.write_summary(folder, summary)
         for message in messages:

@@ -16,12 +16,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import mid_hips
+from tensorsim.body.skeleton import MIRRORED, mid_hips
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import Clip, activity_clips
 from tensorsim.evaluation.films import FPS, Observed, filmed, project
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Frames of a segment, frames from one segment to the next, and the frames of a segment that are compared.
 _PIECE, _STEP, _COMPARED = 12, 6, (0, 4, 8, 11)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import body_to_coco
+from tensorsim.body.skeleton import MIRRORED, body_to_coco
 from tensorsim.config import CameraConfig
 from tensorsim.evaluation.measured.motions import Draw, smooth_noise
 from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
@@ -18,7 +18,6 @@ from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Errors of each COCO key point relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
 RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2

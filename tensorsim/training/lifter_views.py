@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import rotation
-from tensorsim.body.skeleton import body_to_coco, coco_to_body, mid_hips, mirror
+from tensorsim.body.skeleton import MIRRORED, body_to_coco, coco_to_body, mid_hips, mirror
 from tensorsim.config import CameraConfig
 from tensorsim.geometry.camera import camera_to_world, focal_length
 from tensorsim.training.lifter_motion import RATE_HZ, MotionPool
 from tensorsim.vision.lifting.sight import Sight, level_sight
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Score below which a key point counts as hidden.
 THRESHOLD = 0.3

@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.training.colours import Picture, recoloured
 from tensorsim.training.loop import Batch, Recipe
@@ -36,7 +37,6 @@ from tensorsim.training.second_labels import put_right, read_results
 from tensorsim.training.shards import Shards, find_shards, read_coco_shards, split
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Of the pictures of LSPE, never trained on, see :func:`tensorsim.training.shards.split`.
 LSPET_HELD_OUT_PERCENT = 3

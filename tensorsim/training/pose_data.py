@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.shards import Floats, Sample
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 Picture = npt.NDArray[np.uint8]
 Doubles = npt.NDArray[np.float64]

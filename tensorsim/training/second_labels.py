@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.boxes import box_iou
 from tensorsim.training.pose_data import Person
 from tensorsim.training.shards import Floats
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Boxes and keypoints (n, 17, 3), x, y and score, by the key of the picture.
 Results = Mapping[str, tuple[Floats, Floats]]

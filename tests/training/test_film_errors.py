@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip, activity_clips
 from tensorsim.evaluation.films import FPS, Observed, project
 from tensorsim.training.film_errors import FilmErrors, Look, Watched, watched_films
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 KICK, WALK = ActivityClip("S3 Kicking", "0", 2), ActivityClip("S8 Walking", "0", 7)
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.loop import LoopConfig, fit
@@ -24,7 +25,6 @@ from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose,
 from tensorsim.training.shards import Sample
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
-from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.training.test_pose_data import BOX, drawn, sample, standing, write_cutouts
 from tests.training.test_shards import jpg
 

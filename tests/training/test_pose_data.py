@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.pose_data import (
@@ -23,7 +24,6 @@ from tensorsim.training.pose_data import (
 )
 from tensorsim.training.shards import Sample, split
 from tensorsim.vision.pose2d.crops import BoxCrop, crop_to_image
-from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.training.tars import write_tar
 from tests.training.test_shards import jpg
 

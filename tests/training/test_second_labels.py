@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.training.pose_data import Person
 from tensorsim.training.second_labels import put_right, read_results
 from tensorsim.training.shards import Sample
-from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.training.test_pose_data import BOX, standing
 
 LEFT_WRIST, RIGHT_WRIST, NOSE, LEFT_EYE, LEFT_ELBOW = 9, 10, 0, 1, 7

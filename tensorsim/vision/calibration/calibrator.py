@@ -217,11 +217,11 @@ class CameraCalibrator(nn.Module):
         """Means, deviations and number of frames (9,) of the camera of one clip of key points (P, T, 17, 2)."""
         people, frames = valid.shape[0], valid.shape[1]
         upright = steadily(is_upright(keypoints, scores, self.keypoint_threshold), valid, fps)
-        upright = upright & ~still_beside_others(ends_of_body(keypoints), valid)[:, None]
+        ends = ends_of_body(keypoints)
+        upright = upright & ~still_beside_others(ends, valid)[:, None]
         count = upright.sum().reshape(1).double()
         walking = walking_share(keypoints, upright, fps)
         cycles_hz, rhythm = cadence(keypoints, walking, fps)
-        ends = ends_of_body(keypoints)
         sigma = self.smoothing_s * fps
         weights = upright.double()
         smooth: list[Tensor] = []

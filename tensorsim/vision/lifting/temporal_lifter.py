@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import BONES, MIRRORED_JOINTS, bone_lengths, coco_to_body, mid_hips
+from tensorsim.body.skeleton import BONES, MIRRORED, MIRRORED_JOINTS, bone_lengths, coco_to_body, mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.errors import (
     TensorsimError,
@@ -33,7 +33,6 @@ from tensorsim.vision.lifting.sight import (
     windowed_mean,
 )
 from tensorsim.vision.lifting.temporal_net import DILATIONS, Located, TemporalNet
-from tensorsim.vision.pose2d.topdown import MIRRORED
 
 #: Lengths of all bones together, in standing heights; between people they differ by 2 %.
 _ALL_BONES = 2.39

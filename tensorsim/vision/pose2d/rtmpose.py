@@ -10,10 +10,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.errors import TensorsimError, check_floating
 from tensorsim.vision.pose2d.onnx_file import OnnxFile, is_size, open_session
-from tensorsim.vision.pose2d.topdown import MIRRORED, TopDownPose
+from tensorsim.vision.pose2d.topdown import TopDownPose
 
 
 def has_simcc(path: str | os.PathLike[str]) -> bool:

@@ -5,18 +5,11 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.errors import TensorsimError, check_finite, check_rank, check_size, is_exporting
 from tensorsim.vision.pose2d.crops import BoxCrop, check_boxes, crop_to_image
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
-
-#: For each COCO keypoint, the one that takes its place in a mirror image.
-MIRRORED = tuple(
-    COCO_KEYPOINTS.index(
-        name.replace("left", "right") if name.startswith("left") else name.replace("right", "left")
-    )
-    for name in COCO_KEYPOINTS
-)
 
 #: Left and right shoulders, elbows, wrists, hips, knees and ankles.
 SIDES = tuple((left, left + 1) for left in range(5, 17, 2))

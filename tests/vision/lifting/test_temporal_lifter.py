@@ -9,7 +9,15 @@ import torch
 from torch import Tensor, nn
 
 import tensorsim as ts
-from tensorsim.body.skeleton import BONES, MIRRORED_JOINTS, body_to_coco, coco_to_body, mid_hips, mirror
+from tensorsim.body.skeleton import (
+    BONES,
+    MIRRORED,
+    MIRRORED_JOINTS,
+    body_to_coco,
+    coco_to_body,
+    mid_hips,
+    mirror,
+)
 from tensorsim.config import CameraConfig, PoseConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world, project
@@ -17,7 +25,6 @@ from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.lifting.sight import level_sight, turned_back, windowed_mean
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter, along_axes
 from tensorsim.vision.lifting.temporal_net import TemporalNet
-from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.stage import StageTester
 
 CAMERA = CameraConfig(position_m=(0.3, -1.0, 1.9), pitch_rad=-0.3, yaw_rad=0.2, horizontal_fov_rad=1.2)

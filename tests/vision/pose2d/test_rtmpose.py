@@ -11,13 +11,13 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline.networks import pretrained_pose
 from tensorsim.vision import RtmPose, TopDownPose
 from tensorsim.vision.onnx_engine import in_onnxruntime
 from tensorsim.vision.pose2d.hrnet import IMAGENET_MEAN, IMAGENET_STD
 from tensorsim.vision.pose2d.rtmpose import OnnxSimcc, SimccDecoder
-from tensorsim.vision.pose2d.topdown import MIRRORED
 from tests.stage import StageTester
 
 #: Colour that a key point looks for; left and right look for the same one.
