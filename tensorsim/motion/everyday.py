@@ -146,7 +146,11 @@ def swing_fist(time: Tensor, who: People) -> Act:
 
 
 def kick_ball(time: Tensor, who: People) -> Act:
-    """Walks or runs up to a ball, kicks it at time 0 with a straight swing of the leg, and comes to rest."""
+    """Walks or runs up to a ball, kicks it at time 0 with a straight swing of the leg, and stops or runs on a little.
+
+    In captured kicks of a ball people run up for one to two seconds, the hips at 2 to 3.5 m/s at the kick, the
+    foot at 10 m/s, and come to rest within a second.
+    """
     v = Vary(who)
     tempo = who.tempo[:, None]
     back, through, down = v(0.30) / tempo, v(0.22) / tempo, v(0.5) / tempo
@@ -165,9 +169,17 @@ def kick_ball(time: Tensor, who: People) -> Act:
         abduction=(8 + v(15.0) * poised, 8 + v(25.0) * poised),
         elbow=(12 + 20 * poised, 12 + 20 * poised),
     )
-    stop, still = -back - 0.2, 0.1 + 0.0 * back
-    pace = 1 - segment(time, stop, still)
-    act = with_gait(time, who, base, pace, who.speed_m_s[:, None] * (time - travel(time, stop, still)))
+    leg_m = (who.proportions.thigh + who.proportions.shank) * who.height_m
+    quick = who.speed_m_s * (1 + _share_of(who, 29.0)[:, 0])
+    # The gait is known up to 3 leg lengths a second.
+    runner = who._replace(speed_m_s=torch.minimum(quick, 2.9 * leg_m))
+    start = -1.2 - 1.5 * _share_of(who, 7.0) + 0.0 * back
+    stop, still = -back - 0.2, 0.1 + 0.9 * _share_of(who, 13.0) + 0.0 * back
+    pace = segment(time, start, start + 0.5) - segment(time, stop, still)
+    gone_s = travel(time, start, start + 0.5) - travel(time, stop, still)
+    act = with_gait(time, runner, base, pace, runner.speed_m_s[:, None] * gone_s)
     aloft = segment(time, -back - 0.15, -back) - segment(time, through + 0.6 * down, through + down)
     free = torch.stack([1 - aloft, torch.ones_like(aloft)], dim=-1)
-    return act._replace(hold=act.hold * free, lift=act.lift * free)
+    # The standing leg carries the body, not the one that kicks.
+    support = torch.stack([0 * time, 0 * time + 1], dim=-1)
+    return act._replace(hold=act.hold * free, lift=act.lift * free, support=support, level=1 - aloft)

@@ -20,6 +20,7 @@ from tensorsim.evaluation.measured.motions import (
 )
 from tensorsim.motion import everyday, exercises, scripts
 from tensorsim.motion.act import Act
+from tensorsim.motion.footwork import step_about
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 
 #: Bodies and manners: untrained people, in every heading.
@@ -28,6 +29,8 @@ PEOPLE = PeopleConfig(
 )
 #: Where the middle of a path is: x to either side, and nearest and farthest y, in metres.
 SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
+#: Steps per second of those who step about while they do something.
+_STEPS_HZ = 1.0
 
 
 class Variant(NamedTuple):
@@ -39,6 +42,7 @@ class Variant(NamedTuple):
         lasts_s: how long it takes; None for what goes on for as long as it is watched.
         share: of the clips of its activity.
         rate: lowest and highest speed of the script's clock.
+        steps: share of those who step about meanwhile.
     """
 
     script: Callable[[Tensor, People], Act]
@@ -46,17 +50,21 @@ class Variant(NamedTuple):
     lasts_s: float | None
     share: float
     rate: tuple[float, float] = (0.75, 1.2)
+    steps: float = 0.0
 
 
 #: Variants by index of the activity; nobody is there in the first.
 VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (),
     (
-        Variant(scripts.punch, 0.4, None, 0.4),
-        Variant(exercises.box, 0.0, None, 0.25),
-        Variant(everyday.swing_fist, 0.0, None, 0.35),
+        Variant(scripts.punch, 0.4, None, 0.4, steps=0.5),
+        Variant(exercises.box, 0.0, None, 0.25, steps=0.5),
+        Variant(everyday.swing_fist, 0.0, None, 0.35, steps=0.4),
     ),
-    (Variant(scripts.kick, 0.4, None, 0.6), Variant(everyday.kick_ball, -0.5, 1.2, 0.4, (0.65, 1.0))),
+    (
+        Variant(scripts.kick, 0.4, None, 0.5, steps=0.5),
+        Variant(everyday.kick_ball, -0.8, 1.6, 0.5, (0.75, 1.15)),
+    ),
     (Variant(scripts.grab, 0.3, None, 0.4), Variant(exercises.pick_up, 0.0, 2.5, 0.6, (0.9, 2.8))),
     (Variant(scripts.sit_down, 0.8, 1.9, 1.0, (0.8, 1.7)),),
     (Variant(scripts.stand_up, 0.7, 2.0, 1.0, (0.8, 1.7)),),
@@ -91,7 +99,16 @@ def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, d
         return to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
     rate = draw(*variant.rate)
     clock = (time - _began(variant, duration_s, rate, draw)) * rate + variant.first_s
-    return act_out(variant.script, clock, people)
+    joints = act_out(variant.script, clock, people)
+    if variant.steps == 0:
+        return joints
+    steps = round(_STEPS_HZ * float(duration_s.max()))
+    # Mostly along the heading, to and fro.
+    angle = people.heading_rad[:, None] + draw(-0.6, 0.6, steps)
+    ahead = torch.stack([-torch.sin(angle), torch.cos(angle)], dim=-1)
+    length = draw(-0.5, 0.8, steps) * draw(0.2, 1.0) * (draw(0.0, 1.0) < variant.steps)
+    start = (torch.arange(steps) + draw(0.0, 0.5, steps)) / _STEPS_HZ
+    return step_about(joints, time, start, draw(0.35, 0.7, steps), length[..., None] * ahead)
 
 
 def everyday_motion(

@@ -32,8 +32,8 @@ def test_bones_keep_their_length_and_nobody_is_too_fast(moved):
         length = (joint(joints, a) - joint(joints, b)).norm(dim=-1)
         assert float((length.amax(1) - length.amin(1)).max()) < 1e-9
     speed = joints.diff(dim=1).norm(dim=-1) * RATE
-    # The foot of a ball player reaches 15 m/s. One knee in a hundred kicks of a ball flips as its foot is released.
-    assert 1.5 < float(speed.amax((1, 2)).quantile(0.9)) < 15
+    # The foot of a ball player reaches 15 m/s.
+    assert 1.5 < float(speed.amax((1, 2)).max()) < 15
     assert float(joints[..., 2].min()) > 0.0
 
 
@@ -65,7 +65,12 @@ def test_a_ball_is_kicked_after_walking_up():
     time = torch.arange(round(3.5 * RATE), dtype=torch.float64) / RATE - 2.0
     joints = perform(everyday.kick_ball, time.expand(8, -1), people)
     way = joint(joints, "neck")[..., 1]
-    assert bool((way[:, round(1.4 * RATE)] - way[:, 0] > 0.4).all())
+    assert bool((way[:, round(1.8 * RATE)] - way[:, 0] > 0.4).all())
+    # Captured people who kick a ball: hips at 1 to 3.5 m/s, wrists at 3 to 5.
+    hips = (joint(joints, "right_hip") + joint(joints, "left_hip")) / 2
+    assert 1.0 < float((hips.diff(dim=1).norm(dim=-1) * RATE).amax(1).median()) < 3.5
+    wrist = joint(joints, "left_wrist").diff(dim=1).norm(dim=-1) * RATE
+    assert float(wrist.max()) < 6.0
     foot = joint(joints, "right_ankle").diff(dim=1).norm(dim=-1) * RATE
     kick = foot[:, round(1.8 * RATE) : round(2.4 * RATE)].amax(1)
     assert bool((kick > 3.0).all())
