@@ -65,7 +65,10 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
         Variant(scripts.kick, 0.4, None, 0.5, steps=0.5),
         Variant(everyday.kick_ball, -0.8, 1.6, 0.5, (0.75, 1.15)),
     ),
-    (Variant(scripts.grab, 0.3, None, 0.4), Variant(exercises.pick_up, 0.0, 2.5, 0.6, (0.9, 2.8))),
+    (
+        Variant(scripts.grab, 0.3, None, 0.4, steps=0.2),
+        Variant(exercises.pick_up, 0.0, 2.5, 0.6, (0.9, 2.8), 0.2),
+    ),
     (Variant(scripts.sit_down, 0.8, 1.9, 1.0, (0.8, 1.7)),),
     (Variant(scripts.stand_up, 0.7, 2.0, 1.0, (0.8, 1.7)),),
     (Variant(scripts.rotate, 0.0, None, 1.0, (0.7, 1.3)),),
