@@ -71,6 +71,11 @@ class Vary:
         return nominal * self.factor[:, self.used - 1 : self.used]
 
 
+def share_of(who: People, factor: float) -> Tensor:
+    """A number (B, 1) in [0, 1) of each person's own, another one for another ``factor``."""
+    return torch.remainder(who.gait_phase * factor, 1.0)[:, None]
+
+
 def make_pose(
     time: Tensor,
     who: People,

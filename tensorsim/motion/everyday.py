@@ -1,4 +1,4 @@
-"""Movements of everyday people that count as one of the twelve activities: falls any way, fists swung, balls kicked.
+"""Movements of everyday people that count as one of the twelve activities: falls any way, balls kicked.
 
 Scripts as in :mod:`.scripts`. Each happens from time 0 on; before it the person stands, or walks up.
 """
@@ -8,15 +8,10 @@ import math
 import torch
 from torch import Tensor
 
-from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, with_gait
+from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, share_of, with_gait
 from tensorsim.motion.people import People
 from tensorsim.motion.scripts import toppling
 from tensorsim.motion.timing import bell, minimum_jerk, segment, travel
-
-
-def _share_of(who: People, factor: float) -> Tensor:
-    """A number (B, 1) in [0, 1) of each person's own."""
-    return torch.remainder(who.gait_phase * factor, 1.0)[:, None]
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
@@ -27,10 +22,10 @@ def fall_any_way(time: Tensor, who: People) -> Act:
     v = Vary(who)
     tempo = who.tempo[:, None]
     down = toppling(tempo * time, who.height_m) / 88
-    way = 2 * math.pi * _share_of(who, 7.0)
-    sinking = _share_of(who, 13.0)
+    way = 2 * math.pi * share_of(who, 7.0)
+    sinking = share_of(who, 13.0)
     give = bell(time, 0.0 * v(1.0), v(1.3) / tempo)
-    arms = v(100.0) * _share_of(who, 29.0)
+    arms = v(100.0) * share_of(who, 29.0)
     bent = 100 * sinking * give + v(30.0) * down
     hip = REST_HIP * (1 - down) + 0.55 * bent
     pose = make_pose(
@@ -58,7 +53,7 @@ def fall_on_knees(time: Tensor, who: People) -> Act:
     drop, wait, over = v(0.55) / tempo, v(0.25), v(0.7) / tempo
     kneel = ((time / drop).clamp(0.0, 1.0)) ** 2
     prone = minimum_jerk(((time - drop - wait) / over).clamp(0.0, 1.0))
-    far = 0.55 + 0.45 * (_share_of(who, 13.0) > 0.3)
+    far = 0.55 + 0.45 * (share_of(who, 13.0) > 0.3)
     arms = 2 + v(25.0) * kneel + v(110.0) * prone
     pose = make_pose(
         time,
@@ -79,14 +74,46 @@ def fall_on_knees(time: Tensor, who: People) -> Act:
     return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
 
 
+def fall_onto_seat(time: Tensor, who: People) -> Act:
+    """The knees give way, the person lands on the seat and rolls onto the back or a side; stays down.
+
+    So people fall who know the mat behind them.
+    """
+    v = Vary(who)
+    tempo = who.tempo[:, None]
+    drop, over = v(0.75) / tempo, v(0.6) / tempo
+    seated = ((time / drop).clamp(0.0, 1.0)) ** 2
+    lying = minimum_jerk(((time - 0.9 * drop) / over).clamp(0.0, 1.0))
+    aside = 2 * share_of(who, 7.0) - 1
+    hip = REST_HIP + (v(100.0) - REST_HIP) * seated - v(60.0) * lying
+    knee = REST_KNEE + (v(95.0) - REST_KNEE) * seated - v(45.0) * lying
+    back, spread = v(30.0) * seated * (1 - lying), v(20.0) * seated + v(40.0) * lying
+    pose = make_pose(
+        time,
+        who,
+        lean=-(28 * seated + 60 * lying) * (1 - 0.3 * aside.square()),
+        pitch=v(30.0) * seated * (1 - lying),
+        nod=v(15.0) * seated,
+        hip=(hip, v(0.95) * hip),
+        knee=(knee, v(0.95) * knee),
+        flexion=(2 - back, 2 - v(0.9) * back),
+        abduction=(8 + spread, 8 + v(0.8) * spread),
+        elbow=(12 + v(30.0) * seated, 12 + v(30.0) * seated),
+    )
+    pose = pose._replace(roll=pose.roll + math.radians(70.0) * aside**3 * lying)
+    upright = 1 - segment(time, 0.3 * drop, drop)
+    act = on_the_spot(time, pose)
+    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+
+
 def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
     """Walks up, loses hold at time 0 and falls forward or to a side; stays down."""
     v = Vary(who)
     tempo = who.tempo[:, None]
     down = toppling(tempo * time, who.height_m) / 88
-    way = math.pi * (_share_of(who, 7.0) - 0.5)
+    way = math.pi * (share_of(who, 7.0) - 0.5)
     give = bell(time, 0.0 * v(1.0), v(1.2) / tempo)
-    bent = v(60.0) * _share_of(who, 13.0) * give
+    bent = v(60.0) * share_of(who, 13.0) * give
     rest = 1 - 0.4 * down
     arms = 2 + v(110.0) * minimum_jerk(down)
     base = make_pose(
@@ -104,45 +131,6 @@ def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
     act = with_gait(time, who, base, pace, path)
     upright = 1 - segment(time, 0.4 / tempo, 0.9 / tempo)
     return act._replace(hold=act.hold * upright[..., None], lift=act.lift * upright[..., None], level=upright)
-
-
-def swing_fist(time: Tensor, who: People) -> Act:
-    """Swings one fist out sideways (a backfist) or round to the front (a hook), the trunk turning along, and back.
-
-    Some do it with one arm all the time and some with both in turn.
-    """
-    v = Vary(who)
-    every = v(1.5) / who.tempo[:, None]
-    both = _share_of(who, 13.0) < 0.5
-    hook = _share_of(who, 29.0) < 0.4
-
-    def fist(start: Tensor) -> Tensor:
-        since = time - start
-        since = torch.where(since < 0, since, torch.remainder(since, torch.where(both, 2 * every, every)))
-        out, back = 0.16 * every, 0.26 * every
-        return segment(since, 0 * out, out) - segment(since, out + 0.1 * every, out + 0.1 * every + back)
-
-    right = fist(0 * every)
-    left = torch.where(both, fist(every), 0 * right)
-    twist = v(35.0) * (left - right) * torch.where(hook, -1.0, 1.0)
-    guard, fold = v(45.0), v(120.0)
-    bent = v(20.0)
-    aside, ahead = torch.where(hook, v(35.0), v(80.0)), torch.where(hook, v(75.0), v(20.0))
-    straight = torch.where(hook, v(75.0), v(15.0))
-    pose = make_pose(
-        time,
-        who,
-        pitch=v(6.0),
-        twist=twist,
-        look=-twist,
-        hip=(bent / 2, bent / 2),
-        knee=(bent, bent),
-        flexion=(guard + (ahead - guard) * right, guard + (ahead - guard) * left),
-        abduction=(14 + (aside - 14) * right, 14 + (aside - 14) * left),
-        inward=(25 * (1 - right), 25 * (1 - left)),
-        elbow=(fold + (straight - fold) * right, fold + (straight - fold) * left),
-    )
-    return on_the_spot(time, pose)
 
 
 def kick_ball(time: Tensor, who: People) -> Act:
@@ -170,11 +158,11 @@ def kick_ball(time: Tensor, who: People) -> Act:
         elbow=(12 + 20 * poised, 12 + 20 * poised),
     )
     leg_m = (who.proportions.thigh + who.proportions.shank) * who.height_m
-    quick = who.speed_m_s * (1 + _share_of(who, 29.0)[:, 0])
+    quick = who.speed_m_s * (1 + share_of(who, 29.0)[:, 0])
     # The gait is known up to 3 leg lengths a second.
     runner = who._replace(speed_m_s=torch.minimum(quick, 2.9 * leg_m))
-    start = -1.2 - 1.5 * _share_of(who, 7.0) + 0.0 * back
-    stop, still = -back - 0.2, 0.1 + 0.9 * _share_of(who, 13.0) + 0.0 * back
+    start = -1.2 - 1.5 * share_of(who, 7.0) + 0.0 * back
+    stop, still = -back - 0.2, 0.1 + 0.9 * share_of(who, 13.0) + 0.0 * back
     pace = segment(time, start, start + 0.5) - segment(time, stop, still)
     gone_s = travel(time, start, start + 0.5) - travel(time, stop, still)
     act = with_gait(time, runner, base, pace, runner.speed_m_s[:, None] * gone_s)

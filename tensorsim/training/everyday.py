@@ -15,10 +15,12 @@ from tensorsim.evaluation.measured.motions import (
     Unrest,
     act_out,
     add_unrest,
+    along,
     at_instants,
+    smooth_noise,
     to_and_fro,
 )
-from tensorsim.motion import everyday, exercises, scripts
+from tensorsim.motion import everyday, exercises, martial_arts, scripts
 from tensorsim.motion.act import Act
 from tensorsim.motion.footwork import step_about
 from tensorsim.motion.people import People, PeopleConfig, draw_people
@@ -29,6 +31,8 @@ PEOPLE = PeopleConfig(
 )
 #: Where the middle of a path is: x to either side, and nearest and farthest y, in metres.
 SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
+#: Share of those who walk in curves.
+_STROLLING = 0.35
 #: Steps per second of those who step about while they do something.
 _STEPS_HZ = 1.0
 
@@ -57,13 +61,15 @@ class Variant(NamedTuple):
 VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (),
     (
-        Variant(scripts.punch, 0.4, None, 0.4, steps=0.5),
-        Variant(exercises.box, 0.0, None, 0.25, steps=0.5),
-        Variant(everyday.swing_fist, 0.0, None, 0.35, steps=0.4),
+        Variant(scripts.punch, 0.4, None, 0.3, steps=0.5),
+        Variant(exercises.box, 0.0, None, 0.2, steps=0.5),
+        Variant(martial_arts.swing_fist, 0.0, None, 0.3, steps=0.4),
+        Variant(martial_arts.punch_once, 0.0, 1.0, 0.2, steps=0.7),
     ),
     (
-        Variant(scripts.kick, 0.4, None, 0.5, steps=0.5),
-        Variant(everyday.kick_ball, -0.8, 1.6, 0.5, (0.75, 1.15)),
+        Variant(scripts.kick, 0.4, None, 0.35, steps=0.5),
+        Variant(martial_arts.kick_round, 0.0, 1.2, 0.25, steps=0.5),
+        Variant(everyday.kick_ball, -0.8, 1.6, 0.4, (0.75, 1.15)),
     ),
     (
         Variant(scripts.grab, 0.3, None, 0.4, steps=0.2),
@@ -77,10 +83,11 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (Variant(scripts.walk_to_sit, 0.8, 2.8, 1.0, (0.8, 1.15)),),
     (Variant(scripts.fall_to_walk, 0.25, 2.6, 1.0, (0.7, 1.2)),),
     (
-        Variant(scripts.walk_to_fall, 1.3, 1.8, 0.2, (0.9, 1.1)),
-        Variant(everyday.walk_and_fall_any_way, -0.2, 1.8, 0.25, (0.9, 1.1)),
-        Variant(everyday.fall_any_way, 0.0, 1.8, 0.35, (0.9, 1.1)),
-        Variant(everyday.fall_on_knees, 0.0, 1.8, 0.2, (0.8, 1.2)),
+        Variant(scripts.walk_to_fall, 1.3, 1.8, 0.15, (0.8, 1.2)),
+        Variant(everyday.walk_and_fall_any_way, -0.2, 1.8, 0.25, (0.8, 1.2)),
+        Variant(everyday.fall_any_way, 0.0, 1.8, 0.3, (0.75, 1.2)),
+        Variant(everyday.fall_onto_seat, 0.0, 1.4, 0.15, (0.8, 1.3)),
+        Variant(everyday.fall_on_knees, 0.0, 1.8, 0.15, (0.8, 1.3)),
     ),
 )
 
@@ -93,13 +100,26 @@ def _began(variant: Variant, duration_s: Tensor, rate: Tensor, draw: Draw) -> Te
     return draw(0.0, 1.0) * spare + draw(-0.1, 0.0)
 
 
+def _stroll(time: Tensor, people: People, draw: Draw) -> Tensor:
+    """Joints (N, K, 14, 3) of people who walk in curves, some round and round, at a pace that changes."""
+    knots = time.shape[1]
+    band = torch.full((len(time), 1), 0.15, dtype=torch.float64)
+    bent, unsteady = smooth_noise(draw, knots, KNOT_HZ, band, 2).unbind(-1)
+    rate = draw(-0.7, 0.7) + draw(0.0, 0.6) * bent  # rad/s
+    heading = torch.cumsum(rate, dim=1) / KNOT_HZ
+    pace = (1 - draw(0.0, 0.4) * unsteady).clamp(0.3, 1.25)
+    return along(scripts.walk, heading, pace, people)
+
+
 def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, draw: Draw) -> Tensor:
     """Joints (N, K, 14, 3) at ``KNOT_HZ`` about the origin, turned to the people's headings."""
     if variant.script is scripts.walk:
-        # Half go straight on, half turn round within some metres.
+        # Half of those who do not stroll go straight on, half turn round within some metres.
         long = torch.where(draw(0.0, 1.0) < 0.5, 20.0, draw(1.5, 4.5))
         first = torch.where(long > 10, 0.0 * long, draw(0.0, 1.0) * long)
-        return to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
+        straight = to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
+        strolls = draw(0.0, 1.0)[..., None, None] < _STROLLING
+        return torch.where(strolls, _stroll(time, people, draw), straight)
     rate = draw(*variant.rate)
     clock = (time - _began(variant, duration_s, rate, draw)) * rate + variant.first_s
     joints = act_out(variant.script, clock, people)

@@ -60,7 +60,9 @@ def draw_camera(hips: Tensor, draw: Draw) -> Filming:
     half = math.atan(math.tan(fov / 2) * height / width)
     thought = towards + float(draw(-0.45, 0.45)) * half
     pitch = thought + math.radians(4.0) * float(draw.normal(1))
-    stretch = math.exp(0.12 * float(draw.normal(1)))
+    # Where nobody walks far, the focal length is hardly known.
+    unsure = 0.12 if float(draw(0.0, 1.0)) < 0.75 else 0.3
+    stretch = math.exp(unsure * float(draw.normal(1)))
     lifted = max(0.3, above * stretch + 0.1 * float(draw.normal(1)))
     camera = CameraConfig(horizontal_fov_rad=fov, position_m=(0.0, 0.0, above), pitch_rad=pitch)
     believed = CameraConfig(

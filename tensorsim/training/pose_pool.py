@@ -10,7 +10,7 @@ from torch import Tensor
 from tensorsim.body.skeleton import mirror
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_positive
-from tensorsim.motion import everyday, exercises
+from tensorsim.motion import everyday, exercises, martial_arts
 from tensorsim.motion.activities import ActivityGenerator, perform
 from tensorsim.motion.people import PeopleConfig, draw_people
 from tensorsim.motion.pose_sampler import sample_poses
@@ -31,7 +31,7 @@ _EVERYDAY = (
     exercises.crawl,
     everyday.fall_any_way,
     everyday.fall_on_knees,
-    everyday.swing_fist,
+    martial_arts.swing_fist,
     everyday.kick_ball,
 )
 

@@ -1,29 +1,34 @@
-"""Everyday variants: bones keep their length, nobody is too fast, who falls lies, who kicks has walked up."""
+"""Everyday variants: bones keep their length, nobody is too fast, who falls lies, blows reach out and come back."""
 
 import pytest
 import torch
 
 from tensorsim.config import JOINTS
-from tensorsim.motion import everyday
+from tensorsim.motion import everyday, martial_arts
 from tensorsim.motion.activities import perform
 from tensorsim.motion.people import PeopleConfig, draw_people
 
 RATE = 120.0
-FALLS = ("fall_any_way", "fall_on_knees", "walk_and_fall_any_way")
+FALLS = ("fall_any_way", "fall_on_knees", "fall_onto_seat", "walk_and_fall_any_way")
+BLOWS = ("swing_fist", "punch_once", "kick_round")
 BONES = [("right_hip", "right_knee"), ("left_knee", "left_ankle"), ("neck", "right_shoulder"),
          ("left_elbow", "left_wrist")]  # fmt: skip
+
+
+def script(name):
+    return getattr(martial_arts if name in BLOWS else everyday, name)
 
 
 def joint(joints, name):
     return joints[..., JOINTS.index(name), :]
 
 
-@pytest.fixture(scope="module", params=[*FALLS, "swing_fist", "kick_ball"])
+@pytest.fixture(scope="module", params=[*FALLS, *BLOWS, "kick_ball"])
 def moved(request):
     """Sixteen people from 1.5 s before the movement begins to 4 s after."""
     people = draw_people(16, PeopleConfig(tempo=(0.6, 0.9)), torch.Generator().manual_seed(5))
     time = torch.arange(round(5.5 * RATE), dtype=torch.float64) / RATE - 1.5
-    return request.param, people, perform(getattr(everyday, request.param), time.expand(16, -1), people)
+    return request.param, people, perform(script(request.param), time.expand(16, -1), people)
 
 
 def test_bones_keep_their_length_and_nobody_is_too_fast(moved):
@@ -81,10 +86,42 @@ def test_a_ball_is_kicked_after_walking_up():
 def test_a_fist_is_swung_out_and_back():
     people = draw_people(8, PeopleConfig(), torch.Generator().manual_seed(2))
     time = torch.arange(round(3 * RATE), dtype=torch.float64) / RATE - 0.5
-    joints = perform(everyday.swing_fist, time.expand(8, -1), people)
+    joints = perform(martial_arts.swing_fist, time.expand(8, -1), people)
     reach = torch.stack(
         [(joint(joints, f"{side}_wrist") - joint(joints, "neck")).norm(dim=-1) for side in ("right", "left")]
     ).amax(0)
     assert bool((reach.amax(1) > reach[:, 0] + 0.1).all())
     still = joint(joints, "right_ankle").diff(dim=1).norm(dim=-1)
     assert float(still.max()) < 1e-6
+
+
+def test_who_lands_on_the_seat_is_low_before_the_head_is():
+    people = draw_people(12, PeopleConfig(), torch.Generator().manual_seed(3))
+    time = torch.arange(round(3 * RATE), dtype=torch.float64) / RATE
+    joints = perform(everyday.fall_onto_seat, time.expand(12, -1), people)
+    hips, head = joint(joints, "right_hip")[..., 2], joint(joints, "head")[..., 2]
+    landed = (hips < 0.25 * people.height_m[:, None]).double().argmax(1)
+    assert bool((head.gather(1, landed[:, None])[:, 0] > 0.3 * people.height_m).all())
+    assert bool((head[:, -1] < 0.25 * people.height_m).all())
+
+
+def test_single_blows_hit_once_or_seldom_and_come_back():
+    people = draw_people(24, PeopleConfig(), torch.Generator().manual_seed(4))
+    time = torch.arange(round(9 * RATE), dtype=torch.float64) / RATE - 1.0
+    reach = {}
+    for name, end, root in (("punch_once", "wrist", "shoulder"), ("kick_round", "ankle", "hip")):
+        joints = perform(script(name), time.expand(24, -1), people)
+        speed = joint(joints, f"right_{end}").diff(dim=1).norm(dim=-1) * RATE
+        assert bool((speed[:, round(RATE) : round(2 * RATE)].amax(1) > 3.5).all())
+        late = speed[:, round(4 * RATE) :].amax(1)
+        # Some strike again, some do not.
+        assert bool((late < 0.5).any())
+        assert bool((late > 3.5).any())
+        apart = joint(joints, f"right_{end}") - joint(joints, f"right_{root}")
+        reach[name] = (apart[..., 2], apart[..., :2].norm(dim=-1))
+    # The fist goes out level with the shoulder, the foot knee high or higher, to the side of the leg that stands.
+    drop, out = reach["punch_once"]
+    assert bool((drop.gather(1, out.argmax(1, keepdim=True)).abs() < 0.35).all())
+    drop, out = reach["kick_round"]
+    assert bool((drop.gather(1, out.argmax(1, keepdim=True))[:, 0] > -0.35 * people.height_m).all())
+    assert bool((out.amax(1) > 0.3 * people.height_m).all())

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from tensorsim.motion import everyday
+from tensorsim.motion import everyday, martial_arts
 from tensorsim.motion.activities import ActivityGenerator, perform
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.body_scatterers import BodyScatterers
@@ -54,8 +54,17 @@ MOVEMENTS: dict[str, Callable[[], Tensor]] = {
     **{script.__name__: lambda script=script: moved(script) for script in SCRIPTS},  # type: ignore[misc]
     **{name: lambda script=script: moved(script) for name, script in EXERCISES.items()},  # type: ignore[misc]
     **{
-        name: lambda name=name: moved(getattr(everyday, name))  # type: ignore[misc]
-        for name in ("fall_any_way", "fall_on_knees", "walk_and_fall_any_way", "swing_fist", "kick_ball")
+        script.__name__: lambda script=script: moved(script)  # type: ignore[misc]
+        for script in (
+            everyday.fall_any_way,
+            everyday.fall_on_knees,
+            everyday.fall_onto_seat,
+            everyday.walk_and_fall_any_way,
+            everyday.kick_ball,
+            martial_arts.swing_fist,
+            martial_arts.punch_once,
+            martial_arts.kick_round,
+        )
     },
     "people": lambda: numbers(people(30)),
     "nominal people": lambda: numbers(nominal_people(3)),
@@ -105,9 +114,12 @@ EXPECTED: dict[str, tuple[float, float, float]] = {
     "crawling": (1.242472388, 2.483013016, 0.007960659),
     "fall_any_way": (0.233381749, 0.642258535, -0.004731516),
     "fall_on_knees": (0.429530171, 0.685101111, -0.000149816),
+    "fall_onto_seat": (-0.046714123, 0.588084500, -0.005393686),
     "walk_and_fall_any_way": (0.262503877, 0.703761625, -0.004787920),
-    "swing_fist": (0.373928282, 0.665195583, -0.005567543),
     "kick_ball": (1.020780261, 1.386874659, 0.001949471),
+    "swing_fist": (0.373928282, 0.665195583, -0.005567543),
+    "punch_once": (0.349301063, 0.635562337, -0.004892133),
+    "kick_round": (0.363499693, 0.652581189, -0.004914497),
     "people": (2.598692943, 11.314073570, 0.274158704),
     "nominal people": (2.639910796, 11.299597557, -0.122049055),
     "generated": (1.354291850, 2.048837490, 0.018859477),

@@ -38,6 +38,21 @@ def test_walks_have_all_headings_and_half_of_them_turn():
     assert float(hips[..., 1].min()) > 1.0
 
 
+def test_some_walk_in_curves_and_go_where_they_face():
+    joints, _ = motion(7, 60)
+    hips = joints[:, :, (8, 11), :2].mean(2)
+    # Half a second is longer than a step, so that the hips' own to and fro is left out.
+    way = hips[:, 60::60] - hips[:, :-60:60]
+    heading = torch.atan2(way[..., 1], way[..., 0])
+    turned = torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi
+    curved = (turned.abs() > 0.1).double().mean(1) > 0.5
+    assert 0.1 < float(curved.double().mean()) < 0.7
+    across = joints[:, 30::60, 8, :2] - joints[:, 30::60, 11, :2]
+    facing = torch.stack([-across[..., 1], across[..., 0]], dim=-1)[:, : way.shape[1]]
+    ahead = torch.nn.functional.cosine_similarity(facing[curved], way[curved], dim=-1)
+    assert float(ahead.median()) > 0.9
+
+
 @pytest.mark.parametrize(("activity", "change"), [(4, -0.3), (5, 0.3), (11, -0.8)])
 def test_heads_go_down_and_up_as_the_activity_says(activity, change):
     joints, height = motion(activity, 24)

@@ -136,17 +136,30 @@ def to_and_fro(
     eased = turning**2 * (3 - 2 * turning)
     sense = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0)
     heading = math.pi * (number + eased) * sense
-    # Slower through the turn: the clock of the gait runs at this pace.
+    # Slower through the turn.
     pace = 1 - draw(0.55, 0.9) * torch.sin(math.pi * turning).square()
+    return along(script, heading, pace, people)
+
+
+def along(script: Script, heading_rad: Tensor, pace: Tensor, people: People) -> Tensor:
+    """People (N, K, 14, 3) who go wherever they head: their own heading plus ``heading_rad`` (N, K).
+
+    Args:
+        script: a gait along +y at the person's speed.
+        heading_rad: (N, K) counter-clockwise seen from above, at ``KNOT_HZ``.
+        pace: (N, K) share of the person's speed; the clock of the gait runs at this pace.
+        people: N people.
+    """
+    speed = people.speed_m_s[:, None]
     step = 1 / KNOT_HZ
     clock = torch.cumsum(pace, dim=1) * step
     joints = perform(script, clock, people)
     gone = speed * clock
     velocity = speed * pace
-    x = torch.cumsum(-velocity * torch.sin(heading), dim=1) * step
-    y = torch.cumsum(velocity * torch.cos(heading), dim=1) * step
+    x = torch.cumsum(-velocity * torch.sin(heading_rad), dim=1) * step
+    y = torch.cumsum(velocity * torch.cos(heading_rad), dim=1) * step
     back = torch.stack([torch.zeros_like(gone), -gone, torch.zeros_like(gone)], dim=-1)
-    turned = (rotation(2, heading)[:, :, None] @ (joints + back[:, :, None])[..., None])[..., 0]
+    turned = (rotation(2, heading_rad)[:, :, None] @ (joints + back[:, :, None])[..., None])[..., 0]
     path = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
     joints = turned + path[:, :, None]
     return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
