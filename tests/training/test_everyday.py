@@ -8,6 +8,7 @@ import torch
 from tensorsim.config import ACTIVITIES, CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.motions import KNOT_HZ, Draw
+from tensorsim.motion.people import draw_people
 from tensorsim.training import everyday
 from tensorsim.training.everyday import at_rate, bystander, everyday_motion
 from tensorsim.training.key_point_errors import FilmedMotion, Filming, draw_camera, find_key_points
@@ -38,19 +39,20 @@ def test_walks_have_all_headings_and_half_of_them_turn():
     assert float(hips[..., 1].min()) > 1.0
 
 
-def test_some_walk_in_curves_and_go_where_they_face():
-    joints, _ = motion(7, 60)
+def test_those_who_stroll_walk_in_curves_and_go_where_they_face():
+    generator = torch.Generator().manual_seed(0)
+    people = draw_people(12, everyday.PEOPLE, generator)
+    time = torch.arange(4 * 120, dtype=torch.float64).expand(12, -1) / KNOT_HZ
+    joints = everyday._stroll(time, people, Draw(12, generator))
     hips = joints[:, :, (8, 11), :2].mean(2)
-    # Half a second is longer than a step, so that the hips' own to and fro is left out.
-    way = hips[:, 60::60] - hips[:, :-60:60]
+    # Over a second, so that the hips' own to and fro is left out.
+    way = hips[:, 120::120] - hips[:, :-120:120]
     heading = torch.atan2(way[..., 1], way[..., 0])
     turned = torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi
-    curved = (turned.abs() > 0.1).double().mean(1) > 0.5
-    assert 0.1 < float(curved.double().mean()) < 0.7
-    across = joints[:, 30::60, 8, :2] - joints[:, 30::60, 11, :2]
+    assert float(turned.abs().mean(1).median()) > 0.2
+    across = joints[:, 60::120, 8, :2] - joints[:, 60::120, 11, :2]
     facing = torch.stack([-across[..., 1], across[..., 0]], dim=-1)[:, : way.shape[1]]
-    ahead = torch.nn.functional.cosine_similarity(facing[curved], way[curved], dim=-1)
-    assert float(ahead.median()) > 0.9
+    assert float(torch.nn.functional.cosine_similarity(facing, way, dim=-1).min()) > 0.8
 
 
 @pytest.mark.parametrize(("activity", "change"), [(4, -0.3), (5, 0.3), (11, -0.8)])
