@@ -57,9 +57,9 @@ class EvaluatePose:
 
         pose = pretrained_pose(self.weights, self.flip_test).eval()
         if self.engine != "torch":
-            from tensorsim.vision.onnx_engine import in_onnxruntime
+            from tensorsim.vision.engines import run_by
 
-            in_onnxruntime(nn.Identity(), pose, int8=self.engine == "int8")
+            run_by(self.engine, nn.Identity(), pose)
         heads = "".join(f"{head:>8s}" for head in ("body", "pairs", "seen", "ghosts"))
         print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s}{heads}")
         for name, persons in groups.items():

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tensorsim.exceptions import TensorsimError
 
-Engine = Literal["onnxruntime", "int8", "torch"]
+Engine = Literal["auto", "bfloat16", "onnxruntime", "int8", "torch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +22,10 @@ class NetworkOptions:
     else the shipped one."""
     flip_test: bool = True
     """Show the pose network every person mirrored as well: better, at twice the cost."""
-    engine: Engine = "onnxruntime"
-    """What runs the networks on the processor: ONNX Runtime takes half the time, with networks that it exports once to
-    the user's cache; "int8" is the same with the pose network in 8-bit integers. On a GPU it is always torch."""
+    engine: Engine = "auto"
+    """What runs the networks on the processor. ONNX Runtime takes half the time of torch, with networks that it exports
+    once to the user's cache; "bfloat16" and "int8" are the same with the pose network in that precision. "auto" is
+    "bfloat16" where the processor has instructions for it, elsewhere "onnxruntime". On a GPU it is always torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:
@@ -63,6 +64,6 @@ def load_networks(detector: Path, pose: Path, flip_test: bool, engine: str = "to
     networks = pretrained_detector(detector), pretrained_pose(pose, flip_test)
     if engine == "torch":
         return networks
-    from tensorsim.vision.onnx_engine import in_onnxruntime
+    from tensorsim.vision.engines import run_by
 
-    return in_onnxruntime(*networks, int8=engine == "int8")
+    return run_by(engine, *networks)

@@ -19,8 +19,6 @@ from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
-from tensorsim.vision.pose2d.onnx_file import OnnxFile
-from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 #: Held while a session is opened: parts of a film come in several threads, and the exporter stands only one.
 _OPENING = Lock()
@@ -100,20 +98,6 @@ class _Dense(nn.Module):
     def forward(self, images: Tensor) -> list[Tensor]:
         logits, distances = self.detector.dense(images)
         return logits + distances
-
-
-def in_onnxruntime(detector: nn.Module, pose: nn.Module, int8: bool = False) -> tuple[nn.Module, nn.Module]:
-    """The same two stages with their networks in ONNX Runtime, as far as they are of this package.
-
-    With ``int8`` the pose network is in 8-bit integers. The detector is not: its boxes would move.
-    """
-    if isinstance(detector, RTMDet):
-        detector = OnnxDetector(detector).eval()
-    if isinstance(pose, TopDownPose):
-        holder = pose.network if isinstance(pose.network, FlipTest) else pose
-        if not isinstance(holder.network, OnnxFile | OnnxPose):
-            holder.network = OnnxPose(holder.network, int8).eval()
-    return detector, pose
 
 
 def _flat(outputs: Any) -> list[Tensor]:

@@ -10,9 +10,8 @@ import tensorsim as ts
 from tensorsim.errors import TensorsimError
 from tensorsim.render.crops import rendered_crops
 from tensorsim.vision import onnx_engine
-from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose, in_onnxruntime
+from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
-from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 
 @pytest.fixture(autouse=True)
@@ -62,18 +61,6 @@ def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -
         assert torch.allclose(OnnxEngine(network, (8, 9))(images)[0], found[0])
         assert torch.allclose(found[0], network(images), atol=1e-5)
         assert OnnxEngine(network, (8, 9))(images.double().float())[0].dtype == torch.float32
-
-
-def test_only_networks_of_this_package_are_replaced() -> None:
-    other = torch.nn.Identity()
-    pose = TopDownPose(ts.vision.HRNet.from_pretrained(), flip_test=True)
-    detector, same = in_onnxruntime(other, pose)
-    assert detector is other
-    assert same is pose
-    assert isinstance(pose.network, FlipTest)
-    assert isinstance(pose.network.network, OnnxPose)
-    in_onnxruntime(other, pose)
-    assert isinstance(pose.network.network.engine.network, ts.vision.HRNet)
 
 
 def test_without_the_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline.networks import pretrained_pose
 from tensorsim.vision import RtmPose, TopDownPose
-from tensorsim.vision.onnx_engine import in_onnxruntime
+from tensorsim.vision.engines import run_by
 from tensorsim.vision.pose2d.hrnet import IMAGENET_MEAN, IMAGENET_STD
 from tensorsim.vision.pose2d.rtmpose import OnnxSimcc, SimccDecoder
 from tests.stage import StageTester
@@ -173,7 +173,9 @@ def test_files_with_these_outputs_are_taken_for_rtmpose(tmp_path: Path) -> None:
     assert isinstance(pose, TopDownPose)
     assert isinstance(pose.network, OnnxSimcc)
     assert pose.network.flip_test
-    assert in_onnxruntime(nn.Identity(), pose)[1].network is pose.network, "ONNX Runtime runs it already"
+    assert run_by("onnxruntime", nn.Identity(), pose)[1].network is pose.network, (
+        "ONNX Runtime runs it already"
+    )
     images, valid = picture(PLACES), torch.ones(2, 1, dtype=torch.bool)
     restored = pickle.loads(pickle.dumps(pose))
     assert torch.equal(restored(images, BOXES, valid)[0], pose(images, BOXES, valid)[0])
