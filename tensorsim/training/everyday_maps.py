@@ -46,7 +46,7 @@ _FARTHEST_M = 12.0
 #: Bodies with the share of each.
 BODIES = {"joints": 0.35, "limbs": 0.15, "surface": 0.5}
 #: Share of films with a second person, who stands or sits.
-_COMPANY = 0.16
+_COMPANY = 0.22
 #: Share of clips of an activity done towards the radar, at the moments of a clip of 4 s, as in generated data sets.
 _REHEARSED = 0.25
 

@@ -143,13 +143,13 @@ def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: D
     lying = tilted > 0.7
     if bool(lying.any()):
         chance = float(draw(0.0, 1.0))
-        if chance < 0.3:  # lost for good some time after
-            lost = int(torch.nonzero(lying)[0]) + float(draw(0.0, 1.2)) * fps
+        if chance < 0.35:  # lost for good on the way down or some time after
+            lost = int(torch.nonzero(lying)[0]) + float(draw(-0.25, 1.2)) * fps
             if bool(lying[-1]):
                 followed &= time < lost
             else:  # found again when up
                 followed &= (time < lost) | (time > int(torch.nonzero(lying)[-1]))
-        elif chance < 0.4:
+        elif chance < 0.45:
             followed &= ~lying
     return followed
 
