@@ -68,6 +68,7 @@ def letterbox(images: Tensor, side: int) -> Tensor:
     Returns:
         (B, C, side, side) int32 in 0 to 255.
     """
+    # Equal to cv2.resize and cv2.copyMakeBorder, which are not scripted: see OnnxDetector.
     height, width = letterbox_size(images.shape[-2], images.shape[-1], side)
     scaled = resize_8bit(images, height, width)
     return F.pad(scaled, [0, side - width, 0, side - height], value=114.0)

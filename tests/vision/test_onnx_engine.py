@@ -48,6 +48,19 @@ def test_detector_answers_as_in_torch() -> None:
         assert float((found - wanted).abs().max()) < 1e-4 * float(wanted.abs().max())
 
 
+@pytest.mark.parametrize("shape", [(720, 1280), (97, 41), (300, 500)])
+def test_pictures_are_prepared_to_the_bit_as_in_torch(shape: tuple[int, int]) -> None:
+    detector = ts.vision.RTMDet.from_pretrained()
+    images = torch.randint(0, 256, (2, *shape, 3), dtype=torch.uint8).permute(0, 3, 1, 2)
+    assert torch.equal(OnnxDetector(detector).preprocess(images), detector.preprocess(images))
+    floats = images[:1] / 255
+    assert torch.equal(OnnxDetector(detector).preprocess(floats), detector.preprocess(floats))
+    with pytest.raises(TensorsimError, match="images"):
+        OnnxDetector(detector).preprocess(images[0])
+    with pytest.raises(TensorsimError, match="images"):
+        OnnxDetector(detector).preprocess(images[:, :2])
+
+
 def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -> None:
     with torch.no_grad():
         network = torch.nn.Conv2d(3, 4, 3).eval()

@@ -165,10 +165,14 @@ class RTMDet(nn.Module):
                     )
         elif images.dtype != torch.uint8:
             raise TensorsimError(f"images: got dtype {images.dtype}, expected uint8 or floating point")
-        x = letterbox(images, self.input_size).to(self.mean.dtype)
         # Channels last, because the convolutions of the CPU run faster on it.
-        x = ((x - self.mean) / self.std).flip(1)
+        x = self.normalise(letterbox(images, self.input_size))
         return x.contiguous(memory_format=torch.channels_last)
+
+    @torch.jit.export
+    def normalise(self, square: Tensor) -> Tensor:
+        """RGB (B, 3, h, w) from 0 to 255 to BGR without the mean and deviation of the training pictures."""
+        return ((square.to(self.mean.dtype) - self.mean) / self.std).flip(1)
 
     @torch.jit.export
     def dense(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:

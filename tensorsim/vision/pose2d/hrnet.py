@@ -28,6 +28,8 @@ from tensorsim.errors import (
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
+# Sums and rectifiers work in place, on what a layer has just made: copies take a sixth of the time of bfloat16.
+
 _STEM_CHANNELS = 64
 _EXPANSION = 4
 
@@ -89,8 +91,8 @@ class _BasicBlock(nn.Module):
         self.conv2, self.bn2 = _conv_bn(channels, channels, 3)
 
     def forward(self, x: Tensor) -> Tensor:
-        y = F.relu(self.bn1(self.conv1(x)))
-        return F.relu(self.bn2(self.conv2(y)) + x)
+        y = F.relu(self.bn1(self.conv1(x)), inplace=True)
+        return F.relu(self.bn2(self.conv2(y)).add_(x), inplace=True)
 
 
 class _Bottleneck(nn.Module):
@@ -106,9 +108,9 @@ class _Bottleneck(nn.Module):
         self.downsample = nn.Identity() if same else nn.Sequential(*_conv_bn(channels_in, channels_out, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        y = F.relu(self.bn1(self.conv1(x)))
-        y = F.relu(self.bn2(self.conv2(y)))
-        return F.relu(self.bn3(self.conv3(y)) + self.downsample(x))
+        y = F.relu(self.bn1(self.conv1(x)), inplace=True)
+        y = F.relu(self.bn2(self.conv2(y)), inplace=True)
+        return F.relu(self.bn3(self.conv3(y)).add_(self.downsample(x)), inplace=True)
 
 
 def _exchange(source: int, target: int, width: int) -> nn.Module:
@@ -120,7 +122,7 @@ def _exchange(source: int, target: int, width: int) -> nn.Module:
         upsample = nn.Upsample(scale_factor=float(2 ** (source - target)), mode="nearest")
         return nn.Sequential(*_conv_bn(channels_in, channels_out, 1), upsample)
     halvings = [
-        nn.Sequential(*_conv_bn(channels_in, channels_in, 3, stride=2), nn.ReLU())
+        nn.Sequential(*_conv_bn(channels_in, channels_in, 3, stride=2), nn.ReLU(inplace=True))
         for _ in range(target - source - 1)
     ]
     return nn.Sequential(*halvings, nn.Sequential(*_conv_bn(channels_in, channels_out, 3, stride=2)))
@@ -136,10 +138,10 @@ class _Fusion(nn.ModuleList):
         terms: list[Tensor] = []
         for i, layer in enumerate(self):
             terms.append(layer(features[i]))
-        total = terms[0]
-        for term in terms[1:]:
-            total = total + term
-        return F.relu(total)
+        total = terms[0] + terms[1]
+        for term in terms[2:]:
+            total.add_(term)
+        return F.relu(total, inplace=True)
 
 
 class _ExchangeModule(nn.Module):
@@ -181,7 +183,7 @@ class _Transition(nn.ModuleList):
     """Adds a branch, computed from the last one at half its resolution; the others are unchanged."""
 
     def __init__(self, first: nn.Module, kept: int, channels_in: int, channels_out: int) -> None:
-        new = nn.Sequential(*_conv_bn(channels_in, channels_out, 3, stride=2), nn.ReLU())
+        new = nn.Sequential(*_conv_bn(channels_in, channels_out, 3, stride=2), nn.ReLU(inplace=True))
         super().__init__([first, *(nn.Identity() for _ in range(kept - 1)), nn.Sequential(new)])
 
     def forward(self, x: list[Tensor]) -> list[Tensor]:
@@ -229,7 +231,9 @@ class HRNet(nn.Module):
         self.layer1 = nn.Sequential(
             *(_Bottleneck(stage1 if i else _STEM_CHANNELS, config.planes) for i in range(config.bottlenecks))
         )
-        self.transition1 = _Transition(nn.Sequential(*_conv_bn(stage1, c, 3), nn.ReLU()), 1, stage1, 2 * c)
+        self.transition1 = _Transition(
+            nn.Sequential(*_conv_bn(stage1, c, 3), nn.ReLU(inplace=True)), 1, stage1, 2 * c
+        )
         self.stage2 = _Stage(2, 2, config.modules[0], config)
         self.transition2 = _Transition(nn.Identity(), 2, 2 * c, 4 * c)
         self.stage3 = _Stage(3, 3, config.modules[1], config)
@@ -254,8 +258,8 @@ class HRNet(nn.Module):
         if crops.shape[2] % 32 != 0 or crops.shape[3] % 32 != 0 or crops.shape[2] * crops.shape[3] == 0:
             raise TensorsimError(f"HRNet crops: got shape {list(crops.shape)}, expected {layout}")
         x = normalise(crops, self.mean, self.std)
-        x = F.relu(self.bn1(self.conv1(x)))
-        x = F.relu(self.bn2(self.conv2(x)))
+        x = F.relu(self.bn1(self.conv1(x)), inplace=True)
+        x = F.relu(self.bn2(self.conv2(x)), inplace=True)
         x = self.layer1(x)
         branches = self.stage2(self.transition1([x]))
         branches = self.stage3(self.transition2(branches))
