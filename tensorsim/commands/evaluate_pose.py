@@ -41,6 +41,7 @@ class EvaluatePose:
         from tensorsim.training.pose_data import Person, large, people, upright
         from tensorsim.training.pose_metrics import evaluate_cut, evaluate_pose
         from tensorsim.training.shards import read_coco_folder
+        from tensorsim.vision.engines import run_by
 
         groups: dict[str, list[Person]] = {}
         if self.data is not None:
@@ -55,11 +56,7 @@ class EvaluatePose:
         if not groups:
             raise TensorsimError("evaluate pose: got no pictures, expected --data or --coco")
 
-        pose = pretrained_pose(self.weights, self.flip_test).eval()
-        if self.engine != "torch":
-            from tensorsim.vision.engines import run_by
-
-            run_by(self.engine, nn.Identity(), pose)
+        _, pose = run_by(self.engine, nn.Identity(), pretrained_pose(self.weights, self.flip_test).eval())
         heads = "".join(f"{head:>8s}" for head in ("body", "pairs", "seen", "ghosts"))
         print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s}{heads}")
         for name, persons in groups.items():

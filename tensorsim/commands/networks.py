@@ -24,8 +24,9 @@ class NetworkOptions:
     """Show the pose network every person mirrored as well: better, at twice the cost."""
     engine: Engine = "auto"
     """What runs the networks on the processor. ONNX Runtime takes half the time of torch, with networks that it exports
-    once to the user's cache; "bfloat16" and "int8" are the same with the pose network in that precision. "auto" is
-    "bfloat16" where the processor has instructions for it, elsewhere "onnxruntime". On a GPU it is always torch."""
+    once to the user's cache; "int8" has the pose network in 8-bit integers there, "bfloat16" has it in torch in that
+    precision. "auto" is "bfloat16" where the processor has instructions for it, elsewhere "onnxruntime". On a GPU it is
+    always torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:
@@ -60,10 +61,6 @@ def load_networks(detector: Path, pose: Path, flip_test: bool, engine: str = "to
         TensorsimError: files that are damaged, unsafe or of another network.
     """
     from tensorsim.pipeline.networks import pretrained_detector, pretrained_pose
-
-    networks = pretrained_detector(detector), pretrained_pose(pose, flip_test)
-    if engine == "torch":
-        return networks
     from tensorsim.vision.engines import run_by
 
-    return run_by(engine, *networks)
+    return run_by(engine, pretrained_detector(detector), pretrained_pose(pose, flip_test))

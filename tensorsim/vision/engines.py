@@ -1,5 +1,8 @@
 """What runs the networks on a processor: ONNX Runtime, torch in bfloat16, or torch as it is."""
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import nn
 
@@ -11,16 +14,23 @@ from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose
 from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
-ENGINES = ("auto", "bfloat16", "onnxruntime", "int8", "torch")
+#: What runs a heat-map network in the place of torch, by engine.
+_POSE_BY: dict[str, Callable[[nn.Module], nn.Module]] = {
+    "bfloat16": Bfloat16Pose,
+    "onnxruntime": OnnxPose,
+    "int8": partial(OnnxPose, int8=True),
+}
+ENGINES = ("auto", *_POSE_BY, "torch")
 
 
 def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.Module]:
     """The same two stages with their networks run by an engine, as far as they are of this package.
 
     Args:
-        engine: ``"torch"``; ``"onnxruntime"``; ``"int8"`` or ``"bfloat16"``, which are ONNX Runtime with the pose
-            network in 8-bit integers or in bfloat16 (the detector is not: its boxes would move); ``"auto"``, which is
-            ``"bfloat16"`` where the processor has instructions for it, elsewhere ``"onnxruntime"``.
+        engine: ``"torch"`` changes nothing. The others run the detector in ONNX Runtime in float32, as its boxes would
+            move otherwise, and the pose network in ONNX Runtime in float32 (``"onnxruntime"``) or in 8-bit integers
+            (``"int8"``), or in torch in bfloat16 (``"bfloat16"``). ``"auto"`` is ``"bfloat16"`` where the processor
+            has instructions for it, elsewhere ``"onnxruntime"``.
         detector, pose: the stages; networks inside of ``pose`` are replaced.
 
     Raises:
@@ -36,10 +46,6 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
         detector = OnnxDetector(detector).eval()
     if isinstance(pose, TopDownPose):
         holder = pose.network if isinstance(pose.network, FlipTest) else pose
-        network = holder.network
-        if not isinstance(network, OnnxFile | OnnxPose | Bfloat16Pose):
-            small = (
-                Bfloat16Pose(network) if engine == "bfloat16" else OnnxPose(network, int8=engine == "int8")
-            )
-            holder.network = small.eval()
+        if not isinstance(holder.network, OnnxFile | OnnxPose | Bfloat16Pose):
+            holder.network = _POSE_BY[engine](holder.network).eval()
     return detector, pose

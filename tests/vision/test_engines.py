@@ -1,16 +1,19 @@
 """Engines run the networks of this package and no others; in bfloat16 people have the key points of float32."""
 
+import copy
 import pickle
+from typing import get_args
 
 import pytest
 import torch
 from torch import nn
 
 import tensorsim as ts
+from tensorsim.commands.networks import Engine
 from tensorsim.errors import TensorsimError
 from tensorsim.render.crops import rendered_crops
 from tensorsim.vision.bfloat16 import Bfloat16Pose, fold_batch_norm
-from tensorsim.vision.engines import run_by
+from tensorsim.vision.engines import ENGINES, run_by
 from tensorsim.vision.onnx_engine import OnnxPose
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
@@ -49,6 +52,10 @@ def test_only_networks_of_this_package_are_replaced(
     inside = pose.network.network
     run_by(engine, other, pose)
     assert pose.network.network is inside, "it is run by the engine already"
+
+
+def test_commands_offer_the_engines_that_there_are() -> None:
+    assert get_args(Engine) == ENGINES
 
 
 def test_torch_leaves_them_alone_and_other_names_are_refused(network: ts.vision.HRNet) -> None:
@@ -90,5 +97,5 @@ def test_in_bfloat16_key_points_stay_where_they_are(network: ts.vision.HRNet) ->
     assert small(crops[:0]).shape[0] == 0
     again = pickle.loads(pickle.dumps(small))
     assert torch.equal(again(crops[:2]), found[:2])
-    assert torch.equal(small.double()(crops[:1].double()), network.double()(crops[:1].double()))
-    network.float()
+    exact = copy.deepcopy(small).double()
+    assert torch.equal(exact(crops[:1].double()), exact.network(crops[:1].double()))
