@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tensorsim.exceptions import TensorsimError
 
-Engine = Literal["auto", "bfloat16", "onnxruntime", "int8", "torch"]
+Engine = Literal["onnxruntime", "bfloat16", "int8", "torch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,11 +22,10 @@ class NetworkOptions:
     else the shipped one."""
     flip_test: bool = True
     """Show the pose network every person mirrored as well: better, at twice the cost."""
-    engine: Engine = "auto"
+    engine: Engine = "onnxruntime"
     """What runs the networks on the processor. ONNX Runtime takes half the time of torch, with networks that it exports
     once to the user's cache; "int8" has the pose network in 8-bit integers there, "bfloat16" has it in torch in that
-    precision. "auto" is "bfloat16" where the processor has instructions for it, elsewhere "onnxruntime". On a GPU it is
-    always torch."""
+    precision, for processors with instructions for it. Both are faster and less exact. On a GPU it is always torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:

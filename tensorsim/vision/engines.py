@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from functools import partial
 
-import torch
 from torch import nn
 
-from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.bfloat16 import Bfloat16Pose
 from tensorsim.vision.detection.rtmdet import RTMDet
@@ -16,11 +14,11 @@ from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 #: What runs a heat-map network in the place of torch, by engine.
 _POSE_BY: dict[str, Callable[[nn.Module], nn.Module]] = {
-    "bfloat16": Bfloat16Pose,
     "onnxruntime": OnnxPose,
+    "bfloat16": Bfloat16Pose,
     "int8": partial(OnnxPose, int8=True),
 }
-ENGINES = ("auto", *_POSE_BY, "torch")
+ENGINES = (*_POSE_BY, "torch")
 
 
 def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.Module]:
@@ -29,8 +27,7 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
     Args:
         engine: ``"torch"`` changes nothing. The others run the detector in ONNX Runtime in float32, as its boxes would
             move otherwise, and the pose network in ONNX Runtime in float32 (``"onnxruntime"``) or in 8-bit integers
-            (``"int8"``), or in torch in bfloat16 (``"bfloat16"``). ``"auto"`` is ``"bfloat16"`` where the processor
-            has instructions for it, elsewhere ``"onnxruntime"``.
+            (``"int8"``), or in torch in bfloat16 (``"bfloat16"``).
         detector, pose: the stages; networks inside of ``pose`` are replaced.
 
     Raises:
@@ -38,8 +35,6 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
     """
     if engine not in ENGINES:
         raise TensorsimError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
-    if engine == "auto":
-        engine = "bfloat16" if multiplies_bfloat16(torch.device("cpu")) else "onnxruntime"
     if engine == "torch":
         return detector, pose
     if isinstance(detector, RTMDet):
