@@ -47,6 +47,7 @@ class Variant(NamedTuple):
         share: of the clips of its activity.
         rate: lowest and highest speed of the script's clock.
         steps: share of those who step about meanwhile.
+        lunges: share of those who step far forward into the first blow, at time 0 of the script.
     """
 
     script: Callable[[Tensor, People], Act]
@@ -55,21 +56,22 @@ class Variant(NamedTuple):
     share: float
     rate: tuple[float, float] = (0.75, 1.2)
     steps: float = 0.0
+    lunges: float = 0.0
 
 
 #: Variants by index of the activity; nobody is there in the first.
 VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (),
     (
-        Variant(scripts.punch, 0.4, None, 0.3, steps=0.5),
-        Variant(exercises.box, 0.0, None, 0.2, steps=0.5),
-        Variant(martial_arts.swing_fist, 0.0, None, 0.3, steps=0.4),
-        Variant(martial_arts.punch_once, 0.0, 1.0, 0.2, steps=0.7),
+        Variant(scripts.punch, 0.4, None, 0.25, (0.6, 1.2), steps=0.5),
+        Variant(exercises.box, 0.0, None, 0.2, (0.6, 1.2), steps=0.5),
+        Variant(martial_arts.swing_fist, 0.0, None, 0.3, (0.5, 1.2), steps=0.4),
+        Variant(martial_arts.punch_once, 0.0, 1.0, 0.25, (0.6, 1.2), steps=0.5, lunges=0.6),
     ),
     (
-        Variant(scripts.kick, 0.4, None, 0.35, steps=0.5),
-        Variant(martial_arts.kick_round, 0.0, 1.2, 0.25, steps=0.5),
-        Variant(everyday.kick_ball, -0.8, 1.6, 0.4, (0.75, 1.15)),
+        Variant(scripts.kick, 0.4, None, 0.35, (0.6, 1.2), steps=0.5),
+        Variant(martial_arts.kick_round, 0.0, 1.2, 0.25, (0.6, 1.2), steps=0.5),
+        Variant(everyday.kick_ball, -0.8, 1.6, 0.4, (0.4, 1.15)),
     ),
     (
         Variant(scripts.grab, 0.3, None, 0.4, steps=0.2),
@@ -111,6 +113,15 @@ def _stroll(time: Tensor, people: People, draw: Draw) -> Tensor:
     return along(scripts.walk, heading, pace, people)
 
 
+def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:
+    """Clocks (N, K) of which half run unevenly: the person now and then slows down or holds still."""
+    band = draw(0.2, 0.5)
+    uneven = smooth_noise(draw, clock.shape[1], KNOT_HZ, band, 1)[..., 0]
+    pace = torch.where(draw(0.0, 1.0) < 0.5, (0.8 + 0.6 * uneven).clamp(0.0, 1.2), 1.0)
+    ticks = torch.diff(clock, dim=1, prepend=clock[:, :1]) * pace
+    return clock[:, :1] + torch.cumsum(ticks, dim=1)
+
+
 def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, draw: Draw) -> Tensor:
     """Joints (N, K, 14, 3) at ``KNOT_HZ`` about the origin, turned to the people's headings."""
     if variant.script is scripts.walk:
@@ -121,17 +132,30 @@ def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, d
         strolls = draw(0.0, 1.0)[..., None, None] < _STROLLING
         return torch.where(strolls, _stroll(time, people, draw), straight)
     rate = draw(*variant.rate)
-    clock = (time - _began(variant, duration_s, rate, draw)) * rate + variant.first_s
+    began = _began(variant, duration_s, rate, draw)
+    clock = (time - began) * rate + variant.first_s
+    if variant.lasts_s is None:
+        clock = _with_pauses(clock, draw)
     joints = act_out(variant.script, clock, people)
-    if variant.steps == 0:
+    if variant.steps == 0 and variant.lunges == 0:
         return joints
     steps = round(_STEPS_HZ * float(duration_s.max()))
     # Mostly along the heading, to and fro.
     angle = people.heading_rad[:, None] + draw(-0.6, 0.6, steps)
-    ahead = torch.stack([-torch.sin(angle), torch.cos(angle)], dim=-1)
     length = draw(-0.5, 0.8, steps) * draw(0.2, 1.0) * (draw(0.0, 1.0) < variant.steps)
     start = (torch.arange(steps) + draw(0.0, 0.5, steps)) / _STEPS_HZ
-    return step_about(joints, time, start, draw(0.35, 0.7, steps), length[..., None] * ahead)
+    lasts = draw(0.35, 0.7, steps)
+    if variant.lunges > 0:
+        lunges = draw(0.0, 1.0) < variant.lunges
+        blow = began - variant.first_s / rate
+        length = torch.where(lunges & ((start - blow).abs() < 1.0), 0.0, length)
+        # The front foot comes down about when the fist arrives.
+        angle = torch.cat([people.heading_rad[:, None], angle], 1)
+        length = torch.cat([lunges * draw(0.4, 1.4), length], 1)
+        start = torch.cat([blow - draw(0.25, 0.5) / rate, start], 1)
+        lasts = torch.cat([draw(0.6, 0.85) / rate, lasts], 1)
+    ahead = torch.stack([-torch.sin(angle), torch.cos(angle)], dim=-1)
+    return step_about(joints, time, start, lasts, length[..., None] * ahead)
 
 
 def everyday_motion(

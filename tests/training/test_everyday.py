@@ -55,6 +55,41 @@ def test_those_who_stroll_walk_in_curves_and_go_where_they_face():
     assert float(torch.nn.functional.cosine_similarity(facing, way, dim=-1).min()) > 0.8
 
 
+def test_who_lunges_goes_forward_and_the_front_foot_lands_with_the_blow():
+    generator = torch.Generator().manual_seed(1)
+    people = draw_people(16, everyday.PEOPLE, generator)
+    time = torch.arange(4 * KNOT_HZ, dtype=torch.float64).expand(16, -1) / KNOT_HZ
+    blow = next(v for v in everyday.VARIANTS[1] if v.lunges > 0)._replace(lunges=1.0, steps=0.0)
+    joints = everyday._acted(blow, time, torch.full((16, 1), 4.0).double(), people, Draw(16, generator))
+    angle = people.heading_rad
+    ahead = torch.stack([-torch.sin(angle), torch.cos(angle), torch.zeros_like(angle)], dim=-1)
+    hips = joints[:, :, (8, 11)].mean(2)
+    gone = ((hips[:, -1] - hips[:, 0]) * ahead).sum(-1)
+    assert float(gone.min()) > 0.3
+    assert float(gone.max()) < 1.5
+    strikes = (joints[:, :, 4] - joints[:, :, 2]).diff(dim=1).norm(dim=-1).argmax(1)
+    foot = joints[:, :, 10, :2].diff(dim=1).norm(dim=-1).cumsum(1)
+    at_the_blow = foot.gather(1, strikes[:, None])[:, 0] / foot[:, -1]
+    assert float(at_the_blow.median()) > 0.6, (
+        "most of the way is behind the front foot when the fist is fastest"
+    )
+    for upper, lower in ((8, 9), (9, 10), (11, 12), (12, 13)):
+        bone = (joints[:, :, upper] - joints[:, :, lower]).norm(dim=-1)
+        torch.testing.assert_close(bone, bone[:, :1].expand_as(bone))
+
+
+def test_half_of_those_who_repeat_slow_down_or_hold_still():
+    clock = torch.arange(6 * KNOT_HZ, dtype=torch.float64).expand(40, -1) / KNOT_HZ - 1.0
+    uneven = everyday._with_pauses(clock, Draw(40, torch.Generator().manual_seed(0)))
+    torch.testing.assert_close(uneven[:, 0], clock[:, 0])
+    ticks = uneven.diff(dim=1) * KNOT_HZ
+    assert float(ticks.min()) >= 0.0
+    assert float(ticks.max()) <= 1.2 + 1e-9
+    even = (uneven - clock).abs().amax(1) < 1e-9
+    assert 8 < int(even.sum()) < 32
+    assert bool((ticks[~even].amin(1) < 0.7).all())
+
+
 @pytest.mark.parametrize(("activity", "change"), [(4, -0.3), (5, 0.3), (11, -0.8)])
 def test_heads_go_down_and_up_as_the_activity_says(activity, change):
     joints, height = motion(activity, 24)
