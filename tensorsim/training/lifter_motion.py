@@ -20,6 +20,7 @@ from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.data.motion_files import load_motion, motion_keys
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
+from tensorsim.motion import everyday, martial_arts
 from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import EXERCISES
@@ -62,7 +63,14 @@ class MotionPool(NamedTuple):
 
 
 #: Kinds of motion and the share of each.
-KINDS = {"activities": 0.34, "exercises": 0.16, "falls": 0.16, "joined poses": 0.20, "captures": 0.14}
+KINDS = {
+    "activities": 0.31, "exercises": 0.15, "falls": 0.15, "joined poses": 0.16, "captures": 0.13, "everyday": 0.10,
+}  # fmt: skip
+#: Blows, kicks and falls of everyday people, which happen at time 0 of their scripts.
+_EVERYDAY = (
+    everyday.kick_ball, everyday.fall_onto_seat, everyday.fall_on_knees, everyday.walk_and_fall_any_way,
+    martial_arts.punch_once, martial_arts.kick_round, martial_arts.swing_fist,
+)  # fmt: skip
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
@@ -103,11 +111,14 @@ def fall_any_way(time: Tensor, who: People) -> Act:
 
 
 def _performed(
-    script: Callable[[Tensor, People], Act], count: int, earliest_s: float, generator: torch.Generator
+    script: Callable[[Tensor, People], Act], count: int, farthest_s: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Joints (count, FRAMES, 14, 3) of people who follow a script, from a random moment on, and their heights."""
+    """Joints (count, FRAMES, 14, 3) of people who follow a script, and their heights.
+
+    The motion begins at a moment of its own, between time 0 of the script and ``farthest_s``.
+    """
     who = draw_people(count, _PEOPLE, generator)
-    start = earliest_s * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    start = farthest_s * torch.rand(count, 1, generator=generator, dtype=torch.float64)
     time = torch.arange(FRAMES, dtype=torch.float64) / RATE_HZ + start
     return perform(script, time, who), who.height_m
 
@@ -226,6 +237,8 @@ def _batches(
             yield torch.where(back[:, None, None, None], joints.flip(1), joints), heights
         elif kind == "captures":
             yield _captured(sequences, size, generator)
+        elif kind == "everyday":
+            yield _performed(_EVERYDAY[i % len(_EVERYDAY)], size, -3.0, generator)
         else:
             yield _joined(size, generator)
 
