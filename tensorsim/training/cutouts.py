@@ -169,19 +169,19 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     elif not any(folder.glob("cutouts-*.tar")):
         with complete_file(described) as scratch:
             scratch.write_text(json.dumps(settings), encoding="utf-8")
-    shards = []
-    with tqdm(total=count, desc="people", disable=quiet) as progress:
-        for first in range(0, count, PER_SHARD):
-            shard = folder / f"cutouts-{first // PER_SHARD:03d}.tar"
-            shards.append(shard)
-            last = min(first + PER_SHARD, count)
-            if not shard.exists():
-                with complete_file(shard) as scratch, tarfile.open(scratch, "w") as tar:
-                    for index in range(first, last):
+    shards = [folder / f"cutouts-{k:03d}.tar" for k in range(math.ceil(count / PER_SHARD))]
+    rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    with tqdm(total=count, desc="people", disable=quiet or rank > 0) as progress:
+        # Processes that torchrun starts together each begin with shards of their own.
+        for k in sorted(range(len(shards)), key=lambda k: (k - rank) % processes):
+            people = range(k * PER_SHARD, min((k + 1) * PER_SHARD, count))
+            if not shards[k].exists():
+                with complete_file(shards[k]) as scratch, tarfile.open(scratch, "w") as tar:
+                    for index in people:
                         _add(tar, f"{index:06d}", render_cutout(poses[index], seed * 1_000_003 + index))
                         progress.update()
             else:
-                progress.update(last - first)
+                progress.update(len(people))
     return shards
 
 

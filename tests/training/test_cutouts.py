@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.pose_sampler import sample_poses
@@ -59,6 +60,26 @@ def test_shards_are_repeatable_and_go_on(tmp_path: Path, monkeypatch: pytest.Mon
         render_cutouts(26, 3, tmp_path, quiet=True)
     other = render_cutouts(26, 4, tmp_path / "other", quiet=True)
     assert other[0].read_bytes() != data[0]
+
+
+def test_processes_begin_with_shards_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PER_SHARD", 8)
+    small = render_cutout
+    drawn: list[int] = []
+
+    def draw(pose: torch.Tensor, seed: int) -> module.Cutout:
+        drawn.append(seed % 1_000_003)
+        return small(pose, seed, side=40)
+
+    monkeypatch.setattr(module, "render_cutout", draw)
+    alone = render_cutouts(26, 3, tmp_path / "alone", quiet=True)
+    assert drawn == list(range(26))
+    drawn.clear()
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    second = render_cutouts(26, 3, tmp_path / "second", quiet=True)
+    assert drawn == [*range(8, 16), 24, 25, *range(8), *range(16, 24)]
+    assert [path.read_bytes() for path in second] == [path.read_bytes() for path in alone]
 
 
 def test_another_tar_is_refused(tmp_path: Path) -> None:
