@@ -26,7 +26,7 @@ class EvaluateLifter:
     motion: tuple[Path, ...] = ()
     films: Path | None = None
     weights: str | None = None
-    motions: int = 400
+    motions: int = 1200
     seed: int = 1234
     quiet: bool = False
 
@@ -49,7 +49,11 @@ class EvaluateLifter:
             "videopose3d": scores.video_pose(VideoPose3D.from_pretrained()),
         }
         pool = build_pool(None, self.motions, self.motion, self.seed, held_out=True, quiet=self.quiet)
-        rows = {"generated, errors": (("activities", "exercises"), True), "falls, errors": (("falls",), True)}
+        rows = {
+            "generated, errors": (("activities", "exercises"), True),
+            "falls, errors": (("falls",), True),
+            "blows, kicks, other falls, errors": (("everyday",), True),
+        }
         if self.motion:
             rows = {
                 "captured, exact": (("captures",), False),

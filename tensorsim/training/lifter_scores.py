@@ -22,7 +22,7 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
 
 #: Frames of a window, 3 s, and people before each camera at a time.
-FRAMES, PEOPLE = 90, 16
+FRAMES, PEOPLE = 90, 48
 #: Cameras: degrees below level, metres above the floor, horizontal field of view in degrees.
 CAMERAS = ((0.0, 1.0, 60.0), (12.0, 1.8, 75.0), (28.0, 2.8, 60.0))
 #: Wrists and ankles, whose speeds the radar shows most.
