@@ -1,5 +1,6 @@
 """Which device to run on, and how many threads."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -51,3 +52,8 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def rank_and_processes() -> tuple[int, int]:
+    """Number of this process among those that ``torchrun`` started together, and how many there are: 0 and 1 alone."""
+    return int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))

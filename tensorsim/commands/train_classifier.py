@@ -1,6 +1,5 @@
 """``tensorsim train classifier``: train a classifier on maps of generated people, or on a data set of your own."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -72,6 +71,7 @@ class TrainClassifier(TrainOptions):
             self._train_on_data(self.data)
 
     def _train_on_data(self, data: Path) -> None:
+        from tensorsim.device import rank_and_processes
         from tensorsim.training.map_classifier import MapRecipe, write_outcome
 
         self.loop(steps=1, batch=self.batch)  # refuses what cannot work before the data are read
@@ -89,7 +89,7 @@ class TrainClassifier(TrainOptions):
         )
         loop = self.epochs_loop(self.epochs, len(recipe.training), self.batch, ema_decay=0.0)
         best = self.train(recipe, loop)
-        if int(os.environ.get("RANK", 0)) == 0:
+        if rank_and_processes()[0] == 0:
             write_outcome(recipe, best)
 
     def _train_on_activities(self, maps: Path) -> None:

@@ -1,6 +1,5 @@
 """Options that all training commands share, and the run that they describe."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -72,11 +71,12 @@ class TrainOptions:
 
     def train(self, recipe: "Recipe", loop: "LoopConfig") -> Path:
         """Train, or go on; the first process prints the figures of the best weights. Returns their file."""
+        from tensorsim.device import rank_and_processes
         from tensorsim.training.loop import fit
 
         figures = fit(recipe, loop)
         best = self.out / "best.safetensors"
-        if int(os.environ.get("RANK", 0)) == 0:  # the others do not validate
+        if rank_and_processes()[0] == 0:  # the others do not validate
             print(f"{best}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
         return best
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tensorsim.body.kinematics import rest_on_floor, rotation
 from tensorsim.config import CameraConfig
+from tensorsim.device import rank_and_processes
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.geometry.camera import camera_to_world
@@ -170,7 +171,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
         with complete_file(described) as scratch:
             scratch.write_text(json.dumps(settings), encoding="utf-8")
     shards = [folder / f"cutouts-{k:03d}.tar" for k in range(math.ceil(count / PER_SHARD))]
-    rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    rank, processes = rank_and_processes()
     with tqdm(total=count, desc="people", disable=quiet or rank > 0) as progress:
         # Processes that torchrun starts together each begin with shards of their own.
         for k in sorted(range(len(shards)), key=lambda k: (k - rank) % processes):

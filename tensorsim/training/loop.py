@@ -22,7 +22,7 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset, default_collate
 from tqdm import tqdm
 
-from tensorsim.device import usable_device
+from tensorsim.device import rank_and_processes, usable_device
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.weights import save_weights
@@ -199,7 +199,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
             missing.
     """
     # Long, for nearly every line needs the state of the run.
-    rank, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    rank, processes = rank_and_processes()
     device = _joined(config, processes)
     recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
     averaged = AveragedModel(

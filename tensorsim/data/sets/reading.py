@@ -20,7 +20,7 @@ from tensorsim.data.sets.samples import sample_id
 from tensorsim.data.sets.scene import Scene
 from tensorsim.data.sets.stored import StoredArrays
 from tensorsim.data.sets.variations import Variation
-from tensorsim.device import usable_device
+from tensorsim.device import rank_and_processes, usable_device
 from tensorsim.errors import TensorsimError
 
 #: Outputs that a classifier can look at.
@@ -32,7 +32,7 @@ def share_of_worker() -> tuple[int, int]:
 
     Ranks are those of ``torchrun``, workers those of a ``DataLoader``.
     """
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    rank, world = rank_and_processes()
     worker = get_worker_info()
     if worker is None:
         return rank, world
