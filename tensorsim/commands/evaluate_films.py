@@ -3,7 +3,7 @@
 import csv
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,6 +36,9 @@ class EvaluateFilms(NetworkOptions):
     """How joints get their depths, as in `tensorsim simulate`."""
     stride: int = 1
     """Keep every n-th frame."""
+    variants: bool = False
+    """Label each film in five variants as well (mirrored, shortened at either end, key points a little off), and print
+    means over all six. It takes six times as long without the networks, which run once."""
     calibrate: bool = True
     """Estimate the camera of each film from its people; otherwise it is level, with a field of view of 60 degrees."""
     seed: int = 0
@@ -102,10 +105,12 @@ class EvaluateFilms(NetworkOptions):
         """Everything of one film; writes its contact sheet."""
         from tensorsim import plot, results
         from tensorsim.evaluation.film_sheet import contact_sheet
+        from tensorsim.evaluation.film_variants import variants
         from tensorsim.evaluation.labelled_films import film_row, followed, judged
 
         video = reader.open(film)
-        found = reader.people(film, video, device, self.quiet)
+        seen = reader.observed(film, video, device, self.quiet)
+        found = reader.lifted(seen, video.fps)
         pose = found.pose
         shown = []
         for name, how in scenes.items():
@@ -115,7 +120,17 @@ class EvaluateFilms(NetworkOptions):
         figure = contact_sheet(film, video, pose, found.camera, reader.stage.keypoint_threshold, shown)
         plot.save_figure(figure, self.out / f"{film.path.stem}.png")
         verdicts = [verdict for verdict, _, _ in shown]
-        return film_row(film, found, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
+        row = film_row(film, found, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
+        if not self.variants:
+            return row
+        of_variants = {}
+        for variant, of_variant in variants(seen, video.fps).items():
+            changed = reader.lifted(of_variant, video.fps).pose
+            of_variants[variant] = {
+                name: asdict(judged(film, changed, video.fps, name, how, self.seed, device, self.quiet)[0])
+                for name, how in scenes.items()
+            }
+        return row | {"variants": of_variants}
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -27,6 +27,8 @@ class TrainPose(PeopleOptions):
         steps: optimiser steps.
         batch: crops per step.
         learning_rate: highest learning rate.
+        augmentation: how far crops are turned, scaled, shifted and cut: "full", or "mild" to end a training with crops
+            nearer to those of films.
         second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
             agree with the labels, they put them right and add the face.
     """
@@ -40,6 +42,7 @@ class TrainPose(PeopleOptions):
     steps: int = 12000
     batch: int = 32
     learning_rate: float = 2e-3
+    augmentation: Literal["full", "mild"] = "full"
     second_labels: Path | None = None
 
     def run(self) -> None:
@@ -54,7 +57,7 @@ class TrainPose(PeopleOptions):
             held_out_people,
             read_people,
         )
-        from tensorsim.training.pose_data import RenderedPeople
+        from tensorsim.training.pose_data import MILD_AUGMENTATION, Augmentation, RenderedPeople
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 
@@ -88,6 +91,7 @@ class TrainPose(PeopleOptions):
             first_size=self.first_size,
             first_samples=self.first_steps * self.batch,
             shares=SHARES if self.second_labels is None else SHARES_CONFIRMED,
+            augmentation=Augmentation() if self.augmentation == "full" else MILD_AUGMENTATION,
         )
         self.train(recipe, loop)
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from tensorsim.config import ACTIVITIES
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.film_variants import Observed, over_variants
 from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
@@ -55,6 +56,7 @@ class Verdict:
         label: the most probable activity; None where the simulation refused the film.
         probability: of the label.
         right: whether the label is accepted.
+        right_probability: of all accepted labels together; 0 where there is no label.
         error: why there is no label.
     """
 
@@ -62,6 +64,7 @@ class Verdict:
     label: str | None
     probability: float | None
     right: bool
+    right_probability: float = 0.0
     error: str | None = None
 
 
@@ -137,7 +140,13 @@ class FilmReader:
     def people(
         self, film: LabelledFilm, reader: VideoReader, device: torch.device, quiet: bool = False
     ) -> Found:
-        """The people of a film and its camera, if that is estimated.
+        """The people of a film and its camera, if that is estimated; arguments of :meth:`observed`."""
+        return self.lifted(self.observed(film, reader, device, quiet), reader.fps)
+
+    def observed(
+        self, film: LabelledFilm, reader: VideoReader, device: torch.device, quiet: bool = False
+    ) -> Observed:
+        """What the networks find in a film, from the cache where it is there.
 
         Args:
             film: of which.
@@ -171,13 +180,17 @@ class FilmReader:
         keypoints, scores, size = keypoints.to(device), scores.to(device), (reader.height, reader.width)
         if reader.uneven_times_s is not None:
             tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s[None], reader.fps)
-        camera = None
-        if self.calibrate:
-            stage, camera = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
-        pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
-        warn_of_empty_clips(pose.valid)
         shift = None if bool(shift_px_s.isnan()) else float(shift_px_s)
-        return Found(Pose(*(field.cpu() for field in pose)), camera, shift)
+        return Observed(tracks, keypoints, scores, size, shift)
+
+    def lifted(self, seen: Observed, fps: float) -> Found:
+        """The people in metres, and the camera if that is estimated, of :meth:`observed`."""
+        stage, camera = self.stage, None
+        if self.calibrate:
+            stage, camera = calibrated(stage, seen.keypoints, seen.scores, seen.tracks.valid, seen.size, fps)
+        pose = stage.lift(seen.tracks, seen.keypoints, seen.scores, *seen.size, fps)
+        warn_of_empty_clips(pose.valid)
+        return Found(Pose(*(field.cpu() for field in pose)), camera, seen.background_px_s)
 
     def _kept(self, name: str, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Tensors of a file of the cache, made and written first if it is not there."""
@@ -210,10 +223,11 @@ def judged(
     try:
         maps = maps_of_pose(how.stage, pose, fps, device, quiet)
     except TensorsimError as error:
-        return Verdict(scene, None, None, False, str(error)), None
+        return Verdict(scene, None, None, False, error=str(error)), None
     found = label_of(how.recognizer, maps, pose.valid.shape[2] / fps)
-    label = found["label"]
-    return Verdict(scene, label, found["probabilities"][label], label in film.accept), maps
+    label, probabilities = found["label"], found["probabilities"]
+    of_accepted = round(sum(probabilities.get(name, 0.0) for name in film.accept), 4)
+    return Verdict(scene, label, probabilities[label], label in film.accept, of_accepted), maps
 
 
 def followed(pose: Pose, fps: float) -> list[dict[str, Any]]:
@@ -249,7 +263,7 @@ def film_row(
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The table of the films, and how many are right in each scene."""
+    """The table of the films, how many are right in each scene, and over their variants if they have been labelled."""
     scenes = list(rows[0]["scenes"])
     heads = ["film", "right is", *scenes, "followed"]
     lines = [heads, ["---"] * len(heads)]
@@ -260,6 +274,14 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         lines.append([row["file"], right, *verdicts, f"{followed_s} of {row['seconds']:.1f} s"])
     counts = [f"**{sum(row['scenes'][scene]['right'] for row in rows)} of {len(rows)}**" for scene in scenes]
     lines.append(["right", "", *counts, ""])
+    if "variants" in rows[0]:
+        means = [over_variants(rows, scene) for scene in scenes]
+        lines.append(
+            ["right, mean over variants", "", *(f"{right:.1f} of {len(rows)}" for right, _ in means), ""]
+        )
+        lines.append(
+            ["mean log of the right label's probability", "", *(f"{log:.2f}" for _, log in means), ""]
+        )
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

@@ -91,6 +91,10 @@ class Augmentation:
     cut: float = 0.25
 
 
+#: Crops nearer to those that the network will see, for the end of a training.
+MILD_AUGMENTATION = Augmentation(scale=0.1, turn_deg=8.0, shift=0.03, edge=0.03, lay=0.08, half=0.1, cut=0.2)
+
+
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
     """The people of pictures with at least so many labelled COCO keypoints and such a longest side."""
     found = []

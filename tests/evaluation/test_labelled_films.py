@@ -106,6 +106,28 @@ def test_the_command_labels_films_and_runs_the_networks_once(
     assert other["scenes"] != walk["scenes"]
 
 
+def test_variants_of_films_are_labelled_without_the_networks(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = tmp_path / "w.onnx"
+    weights.write_text("")
+    monkeypatch.setattr(evaluate_films, "load_networks", lambda *_: (CountingDetector(), StandingPose()))
+    out = tmp_path / "out"
+    arguments = ["evaluate", "films", "--data", str(data), "--out", str(out), "--scenes", "through-wall"]
+    arguments += ["--detector", str(weights), "--pose", str(weights), "--lifter", "nearest", "--quiet"]
+    CountingDetector.frames = 0
+    cli.main([*arguments, "--only", "walk", "--variants"])
+    assert CountingDetector.frames == 10
+    (walk,) = json.loads((out / "films.json").read_text())
+    assert len(walk["variants"]) == 6
+    assert walk["variants"]["as it is"] == walk["scenes"]
+    probabilities = {of["through-wall"]["right_probability"] for of in walk["variants"].values()}
+    assert len(probabilities) > 3
+    assert all(0 <= probability <= 1 for probability in probabilities)
+    right = sum(of["through-wall"]["right"] for of in walk["variants"].values()) / 6
+    assert f"| right, mean over variants |  | {right:.1f} of 1 |" in capsys.readouterr().out
+
+
 @pytest.mark.filterwarnings("ignore:.* its frames are up to")
 def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -> None:
     """Somebody walks away for 2 s; the film pauses 1 s after 1 s, and its last frames come late."""
@@ -198,6 +220,7 @@ def test_a_verdict_is_right_where_the_label_is_accepted() -> None:
         assert maps is not None
         assert (verdict.label, verdict.right) == (ACTIVITIES[index], right)
         assert verdict.probability == pytest.approx(np.exp(4) / (np.exp(4) + 11), abs=1e-3)
+        assert verdict.right_probability == pytest.approx(np.exp(4 * right) / (np.exp(4) + 11), abs=1e-3)
     verdict, maps = judged(known, somebody(10.0), FPS, "through-wall", how, 0, cpu, quiet=True)
     assert maps is None
     assert not verdict.right

@@ -60,6 +60,7 @@ def test_train_then_evaluate(network: str, data: Path, capsys: pytest.CaptureFix
         workers=0,
         quiet=True,
         init=weights,
+        augmentation="mild",
         **options,
     )  # type: ignore[arg-type]
     more.run()

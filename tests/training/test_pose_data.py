@@ -11,6 +11,7 @@ from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.pose_data import (
+    MILD_AUGMENTATION,
     Augmentation,
     RenderedPeople,
     box_matrix,
@@ -102,6 +103,21 @@ def test_points_stay_on_what_they_label_and_sides_are_exchanged_in_the_mirror() 
             if (np.abs(place - np.array([48, 64])) < (30, 46)).all():  # a dot cut by the border has moved
                 np.testing.assert_allclose(crop.points[joint], place, atol=0.35)
     assert min(straight, mirrored) > 15
+
+
+def test_mild_crops_are_nearer_to_those_of_the_pipeline() -> None:
+    image, keypoints = np.zeros((*SIZE, 3), np.uint8), standing()
+    plain = crop_person(image, BOX, keypoints, SIZE).points
+
+    def strays(augmentation: Augmentation) -> float:
+        found = []
+        for seed in range(200):
+            crop = crop_person(image, BOX, keypoints, SIZE, augmentation, np.random.default_rng(seed))
+            of_mirror = plain[list(MIRRORED)] * np.float32([-1, 1]) + np.float32([SIZE[1] - 1, 0])
+            found.append(min(np.abs(crop.points - way).max() for way in (plain, of_mirror)))
+        return float(np.median(found))
+
+    assert 0 < strays(MILD_AUGMENTATION) < 0.7 * strays(Augmentation())
 
 
 def test_the_mirror_image_is_the_crop_turned_over() -> None:

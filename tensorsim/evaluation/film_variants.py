@@ -1,0 +1,108 @@
+"""Variants of a film that show the same activity: how much a label depends on small things.
+
+With few labelled films, one that is nearly even between two labels decides a whole figure. The variants of a film are
+it mirrored, without its first or its last quarter of a second, and with key points that are a little off. They are
+made of what the networks found, so the networks run once.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensorsim.body.skeleton import MIRRORED
+from tensorsim.types import Tracks
+
+#: Seconds left out at the beginning or at the end.
+CUT_S = 0.25
+#: Standard deviation of the key points' errors, share of the diagonal of the box.
+KEY_POINT_ERROR = 0.007
+#: Probability that is counted where the right label has a lower one, or the simulation refuses the film.
+LEAST_PROBABILITY = 1e-3
+
+
+class Observed(NamedTuple):
+    """What the networks found in a film, at even times.
+
+    Attributes:
+        tracks: of one clip (B = 1).
+        keypoints: (1, P, T, 17, 2) pixels.
+        scores: (1, P, T, 17).
+        size: (height, width) of the pictures.
+        background_px_s: as in :class:`~tensorsim.streaming.Found`.
+    """
+
+    tracks: Tracks
+    keypoints: Tensor
+    scores: Tensor
+    size: tuple[int, int]
+    background_px_s: float | None = None
+
+
+def variants(seen: Observed, fps: float) -> dict[str, Observed]:
+    """The film as it is, first, and its variants, by name.
+
+    Args:
+        seen: of the film; one no longer than a second is not shortened.
+        fps: frames per second.
+    """
+    found = {"as it is": seen, "mirrored": mirrored(seen)}
+    frames, cut = seen.tracks.valid.shape[2], round(CUT_S * fps)
+    if frames > 4 * cut:
+        found["begins later"] = _part(seen, slice(cut, None))
+        found["ends earlier"] = _part(seen, slice(None, frames - cut))
+    for seed in (0, 1):
+        found[f"key points off, seed {seed}"] = _displaced(seen, seed)
+    return found
+
+
+def mirrored(seen: Observed) -> Observed:
+    """What would be found in the mirror image: left is right, for the picture and for the people."""
+    edge = seen.size[1] - 1
+    left, top, right, bottom = seen.tracks.boxes.unbind(-1)
+    boxes = torch.stack([edge - right, top, edge - left, bottom], -1)
+    boxes = torch.where(seen.tracks.valid.unsqueeze(-1), boxes, seen.tracks.boxes)
+    order = list(MIRRORED)
+    u, v = seen.keypoints[..., order, :].unbind(-1)
+    return seen._replace(
+        tracks=seen.tracks._replace(boxes=boxes),
+        keypoints=torch.stack([edge - u, v], -1),
+        scores=seen.scores[..., order],
+    )
+
+
+def _part(seen: Observed, frames: slice) -> Observed:
+    return seen._replace(
+        tracks=Tracks(*(part[:, :, frames] for part in seen.tracks)),
+        keypoints=seen.keypoints[:, :, frames],
+        scores=seen.scores[:, :, frames],
+    )
+
+
+def _displaced(seen: Observed, seed: int) -> Observed:
+    boxes = seen.tracks.boxes
+    diagonal = (boxes[..., 2:] - boxes[..., :2]).norm(dim=-1)
+    noise = torch.randn(seen.keypoints.shape, generator=torch.Generator().manual_seed(seed))
+    error = KEY_POINT_ERROR * diagonal[..., None, None] * noise.to(seen.keypoints)
+    return seen._replace(keypoints=seen.keypoints + error)
+
+
+def over_variants(rows: Iterable[Mapping[str, Any]], scene: str) -> tuple[float, float]:
+    """What the variants of films say of a scene.
+
+    Args:
+        rows: of films, with their ``variants``: those of ``films.json``.
+        scene: name of the scene.
+
+    Returns:
+        How many of the films are right, mean over their variants, and the mean logarithm of the probability of the
+        right labels.
+    """
+    right, logarithms = 0.0, []
+    for row in rows:
+        verdicts = [verdict[scene] for verdict in row["variants"].values()]
+        right += sum(verdict["right"] for verdict in verdicts) / len(verdicts)
+        logarithms += [math.log(max(verdict["right_probability"], LEAST_PROBABILITY)) for verdict in verdicts]
+    return right, sum(logarithms) / len(logarithms)
