@@ -10,6 +10,9 @@ from torch import Tensor
 
 from tensorsim.errors import is_exporting, is_writing_onnx
 
+#: Grey level around a picture that does not fill its square, as RTMDet was trained with.
+LETTERBOX_GREY = 114
+
 
 def resize_8bit(images: Tensor, height: int, width: int) -> Tensor:
     """Resize as ``cv2.resize`` (INTER_LINEAR, uint8) does, to the bit.
@@ -58,12 +61,13 @@ def letterbox_size(height: int, width: int, side: int) -> tuple[int, int]:
     return max(int(height * scale + 0.5), 1), max(int(width * scale + 0.5), 1)
 
 
-def letterbox(images: Tensor, side: int) -> Tensor:
-    """Scale images into a square and pad it at the right and at the bottom with grey level 114.
+def letterbox(images: Tensor, side: int, grey: float = LETTERBOX_GREY) -> Tensor:
+    """Scale images into a square and pad it at the right and at the bottom.
 
     Args:
         images: (B, C, H, W) uint8, or floating point in [0, 1].
         side: of the square, pixels.
+        grey: level of the padding, 0 to 255.
 
     Returns:
         (B, C, side, side) int32 in 0 to 255.
@@ -71,7 +75,7 @@ def letterbox(images: Tensor, side: int) -> Tensor:
     # Equal to cv2.resize and cv2.copyMakeBorder, which are not scripted: see OnnxDetector.
     height, width = letterbox_size(images.shape[-2], images.shape[-1], side)
     scaled = resize_8bit(images, height, width)
-    return F.pad(scaled, [0, side - width, 0, side - height], value=114.0)
+    return F.pad(scaled, [0, side - width, 0, side - height], value=grey)
 
 
 def undo_letterbox(boxes: Tensor, height: int, width: int, side: int) -> Tensor:

@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import numpy.typing as npt
 
+from tensorsim.geometry.boxes import LETTERBOX_GREY
 from tensorsim.training.colours import Picture
 from tensorsim.training.shards import Floats, Sample
 from tensorsim.training.views import Doubles, warp_boxes, warp_points
@@ -20,7 +21,6 @@ KNOWN_CELLS = 40
 SURROUNDINGS = 0.15
 #: What is cut off by the edge of a picture is nobody's box if less than this is left.
 LEAST_VISIBLE = 0.25
-GREY = 114
 #: A picture with people is this often about as large as where it is put, not as large as one of its people wants.
 AS_IT_IS = 0.5
 
@@ -41,7 +41,7 @@ class Canvas:
     """A square picture that others are put into, and what is known of it."""
 
     def __init__(self, size: int) -> None:
-        self.image = np.full((size, size, 3), GREY, np.uint8)
+        self.image = np.full((size, size, 3), LETTERBOX_GREY, np.uint8)
         self.known = np.ones((KNOWN_CELLS, KNOWN_CELLS), bool)
         self.boxes: list[Floats] = []
         self.pasted: list[int] = []  # pixels of each cut-out before others covered it
@@ -89,7 +89,7 @@ class Canvas:
         if scale < 0.6:
             picture = cv2.blur(picture, (round(1 / scale),) * 2)  # type: ignore[assignment]
         self.image[top:bottom, left:right] = cv2.warpPerspective(
-            picture, matrix, tuple(room.tolist()), flags=cv2.INTER_LINEAR, borderValue=(GREY,) * 3
+            picture, matrix, tuple(room.tolist()), flags=cv2.INTER_LINEAR, borderValue=(LETTERBOX_GREY,) * 3
         )
         boxes = boxes + np.array([left, top, left, top])
         if not sample.all_labelled:

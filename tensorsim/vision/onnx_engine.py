@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
-from tensorsim.geometry.boxes import letterbox_size
+from tensorsim.geometry.boxes import LETTERBOX_GREY, letterbox_size
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
 
@@ -96,7 +96,7 @@ class OnnxDetector(nn.Module):
             return self.detector.preprocess(images)
         side = self.detector.input_size
         height, width = letterbox_size(images.shape[-2], images.shape[-1], side)
-        squares = np.full((len(images), side, side, 3), 114, np.uint8)
+        squares = np.full((len(images), side, side, 3), LETTERBOX_GREY, np.uint8)
         for square, image in zip(squares, images.permute(0, 2, 3, 1).numpy(), strict=True):
             square[:height, :width] = cv2.resize(image, (width, height))
         return self.detector.normalise(torch.from_numpy(squares).permute(0, 3, 1, 2))

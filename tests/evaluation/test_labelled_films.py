@@ -62,16 +62,22 @@ def data(tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_command_labels_films_and_runs_the_networks_once(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def arguments(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Of the command, which writes into ``out``, with networks for the films of :func:`data` that count."""
     weights = tmp_path / "w.onnx"
     weights.write_text("")
     monkeypatch.setattr(evaluate_films, "load_networks", lambda *_: (CountingDetector(), StandingPose()))
-    out = tmp_path / "out"
-    arguments = ["evaluate", "films", "--data", str(data), "--out", str(out), "--scenes", "through-wall"]
-    arguments += ["--detector", str(weights), "--pose", str(weights), "--lifter", "nearest", "--quiet"]
     CountingDetector.frames = 0
+    paths = ["--data", str(data), "--out", str(tmp_path / "out")]
+    networks = ["--detector", str(weights), "--pose", str(weights), "--lifter", "nearest"]
+    return ["evaluate", "films", *paths, *networks, "--scenes", "through-wall", "--quiet"]
+
+
+def test_the_command_labels_films_and_runs_the_networks_once(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
     cli.main(arguments)
     walk, room = json.loads((out / "films.json").read_text())
     assert walk["seconds"] == pytest.approx(1.8)
@@ -107,18 +113,11 @@ def test_the_command_labels_films_and_runs_the_networks_once(
 
 
 def test_variants_of_films_are_labelled_without_the_networks(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    weights = tmp_path / "w.onnx"
-    weights.write_text("")
-    monkeypatch.setattr(evaluate_films, "load_networks", lambda *_: (CountingDetector(), StandingPose()))
-    out = tmp_path / "out"
-    arguments = ["evaluate", "films", "--data", str(data), "--out", str(out), "--scenes", "through-wall"]
-    arguments += ["--detector", str(weights), "--pose", str(weights), "--lifter", "nearest", "--quiet"]
-    CountingDetector.frames = 0
     cli.main([*arguments, "--only", "walk", "--variants"])
     assert CountingDetector.frames == 10
-    (walk,) = json.loads((out / "films.json").read_text())
+    (walk,) = json.loads((tmp_path / "out" / "films.json").read_text())
     assert len(walk["variants"]) == 6
     assert walk["variants"]["as it is"] == walk["scenes"]
     probabilities = {of["through-wall"]["right_probability"] for of in walk["variants"].values()}
