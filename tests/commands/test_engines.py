@@ -51,6 +51,7 @@ def test_key_points_and_maps_of_the_engines_agree(
     away, _, decibels = compared("bfloat16")
     assert 0 < np.median(away) < 0.1
     assert np.quantile(away, 0.98) < 0.5
-    assert decibels < 0.1
+    # Processors add bfloat16 products in different orders; README gives up to 0.24 dB on real films.
+    assert decibels < 0.3
     away, _, _ = compared("int8")
     assert 0 < np.median(away) < 0.5
