@@ -19,7 +19,6 @@ from tensorsim.vision.lifting.floor import (
     lowest_ankle,
     range_on_floor,
     upright_share,
-    within_reach,
 )
 from tensorsim.vision.smoothing.along_time import (
     fill_gaps,
@@ -85,9 +84,9 @@ class MetricPose(nn.Module):
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
     joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm.
-    The less upright a body is, the more its range is that at which its lowest joint rests on the floor where the person
-    stood, and never further from there than their height (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on
-    its line of sight at its own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not
+    The less upright a body is, the more where the person stood has a say in its range, and at which range its lowest
+    joint rests on the floor (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on its line of sight at its own
+    depth. Frames with fewer than ten visible joints, or whose pose the lifter does not
     know (people who lie), do not give a reliable size: they take that of the others, and one of few joints that would
     make a body of less than 0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The
     floor is a low running quantile of the height of the lower ankle where they stand, so that it stays through a jump
@@ -320,14 +319,9 @@ class MetricPose(nn.Module):
         )
         rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
         by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
-        # Nobody falls further than by two fifths of the range, or out of reach of where they stood.
-        stood, known = fill_gaps(smooth, rests), rests.any(dim=-1, keepdim=True)
-        by_size = torch.where(known, within_reach(by_size, stood, height, upright), by_size)
-        near = known & ((by_floor - stood).abs() < 0.4 * stood)
-        by_floor = torch.where(near, by_floor, torch.full_like(by_floor, float("inf")))
-        error_m = torch.full_like(floor, 0.06)
-        fused, share, precision = fused_range(by_size, upright, by_floor, gain, error_m)
-        return fused, whole | (seen.any(dim=-1) & (share > 0.5)), stands, precision
+        stood = torch.where(rests.any(dim=-1, keepdim=True), fill_gaps(smooth, rests), float("inf"))
+        fused, share, precision = fused_range(by_size, upright, by_floor, gain, stood, height.expand_as(stood))
+        return fused, whole | (seen.any(dim=-1) & (share < 0.5)), stands, precision
 
 
 def cut_off_beside(boxes: Tensor, width: int) -> Tensor:
