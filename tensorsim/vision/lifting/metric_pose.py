@@ -320,7 +320,9 @@ class MetricPose(nn.Module):
         rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
         by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
         stood = torch.where(rests.any(dim=-1, keepdim=True), fill_gaps(smooth, rests), float("inf"))
-        fused, share, precision = fused_range(by_size, upright, by_floor, gain, stood, height.expand_as(stood))
+        fused, share, precision = fused_range(
+            by_size, upright, by_floor, gain, stood, height.expand_as(stood)
+        )
         return fused, whole | (seen.any(dim=-1) & (share < 0.5)), stands, precision
 
 
