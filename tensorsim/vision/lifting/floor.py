@@ -118,7 +118,7 @@ def fused_range(
     gain = torch.where(usable, gain, torch.ones_like(gain))
     bent = 1.0 - upright
     size = 1.0 / (by_size * (0.03 + 0.12 * bent)).square().clamp(min=1e-4)
-    floor = usable * bent / (gain * (0.06**2 + (0.12 * (by_floor - stood)).square()).sqrt()).square()
+    floor = usable * bent / (gain.square() * (0.06**2 + (0.12 * (by_floor - stood)).square()))
     place = known * bent / (0.3 * height).square()
     total = size + floor + place
     fused = (size * by_size + floor * by_floor + place * stood) / total
