@@ -86,10 +86,11 @@ class MetricPose(nn.Module):
     joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm.
     The less upright a body is, the more its range depends on where the person stood last, and on the range at which its
     lowest joint rests on the floor (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on its line of sight at its
-    own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not know (people who lie), do not
-    give a reliable size: they take that of the others, and one of few joints that would make a body of less than 0.65
-    of it is discarded (a leg at the edge of the picture, taken for a whole person). The floor is a low running quantile
-    of the height of the lower ankle where they stand, so that it stays through a jump and an outlier does not move it.
+    own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not know (people who lie), do
+    not give a reliable size: they take that of the others, and one of few joints that would make a body of less than
+    0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The floor is a low running
+    quantile of the height of the lower ankle where they stand, so that it stays through a jump and an outlier does not
+    move it.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
     joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
