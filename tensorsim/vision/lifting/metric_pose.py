@@ -319,7 +319,8 @@ class MetricPose(nn.Module):
         )
         rise = (ahead * pose[..., None, 2, :3]).sum(dim=-1)
         by_floor, gain = range_on_floor(rise, depth, floor - pose[..., 2, 3], seen & feet[..., None])
-        stood = torch.where(rests.any(dim=-1, keepdim=True), fill_gaps(smooth, rests), float("inf"))
+        stood = torch.where(stands.any(dim=-1, keepdim=True), fill_gaps(smooth, stands), float("inf"))
+        by_floor = torch.where(rests.any(dim=-1, keepdim=True), by_floor, float("inf"))
         fused, share, precision = fused_range(
             by_size, upright, by_floor, gain, stood, height.expand_as(stood)
         )

@@ -43,24 +43,32 @@ def brief_gaps(seen: Tensor, longest: int) -> Tensor:
     return ~seen & (after - before - 1 <= longest) & (before >= 0) & (after < frames)
 
 
-def local_linear(x: Tensor, weights: Tensor, sigma: float) -> Tensor:
+def _kernel(sigma: float, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Offsets in frames, and the Gaussian kernel there, truncated at 4 sigma and at the length of a film."""
+    radius = min(int(4.0 * sigma) + 1, frames - 1)
+    offset = torch.arange(-radius, radius + 1, dtype=like.dtype, device=like.device)
+    return offset, torch.exp(-0.5 * (offset / sigma).square())
+
+
+def local_linear(x: Tensor, weights: Tensor, sigma: float, ridge: Tensor | None = None) -> Tensor:
     """Local linear regression along time with a Gaussian kernel (Fan and Gijbels, 1996, section 3.1).
 
-    Reproduces straight lines exactly, up to the ends, for any weights. The kernel is truncated at 4 sigma;
-    where all weights under it are zero, the result is the value itself.
+    Reproduces straight lines exactly, up to the ends, for any weights, if there is no ridge. The kernel is truncated
+    at 4 sigma; where all weights under it are zero, the result is the value itself.
 
     Args:
         x: (..., T) values.
         weights: (..., T) >= 0.
         sigma: standard deviation of the kernel in frames.
+        ridge: (..., T) >= 0, draws the slope of each frame towards 0 (ridge regression): added to the variance of the
+            times under the kernel, in sigma^2.
 
     Returns:
         (..., T). Differentiable.
     """
     frames = x.shape[-1]
-    radius = min(int(4.0 * sigma) + 1, frames - 1)
-    offset = torch.arange(-radius, radius + 1, dtype=x.dtype, device=x.device)
-    kernel = torch.exp(-0.5 * (offset / sigma).square())
+    offset, kernel = _kernel(sigma, frames, x)
+    radius = (offset.shape[0] - 1) // 2
     moments = torch.stack([kernel, kernel * offset, kernel * offset.square()])[:, None]
     flat, w = x.reshape(-1, 1, frames), weights.reshape(-1, 1, frames)
     s = F.conv1d(w, moments, padding=radius)
@@ -68,9 +76,30 @@ def local_linear(x: Tensor, weights: Tensor, sigma: float) -> Tensor:
     total = s[:, 0].clamp(min=1e-12)
     where, mean = s[:, 1] / total, t[:, 0] / total  # centres of gravity in time and value
     spread = s[:, 2] / total - where.square()
-    # Ridge term: with a single frame under the kernel there is no slope.
-    slope = (t[:, 1] / total - where * mean) / (spread.clamp(min=0.0) + 1e-6 * sigma**2)
+    # With a single frame under the kernel there is no slope.
+    least = torch.full_like(spread, 1e-6)
+    if ridge is not None:
+        least = least + ridge.reshape(-1, frames)
+    slope = (t[:, 1] / total - where * mean) / (spread.clamp(min=0.0) + least * sigma**2)
     return torch.where(s[:, 0] > 1e-12, mean - slope * where, flat[:, 0]).reshape(x.shape)
+
+
+def ridge_in_gaps(weights: Tensor, sigma: float) -> Tensor:
+    """Ridge (..., T) of :func:`local_linear` where less than half of the weight is there that all 1 would give.
+
+    A line does not go on through a long gap: with a hundredth of the weight it loses a tenth of its slope.
+
+    Args:
+        weights: (..., T) > 0.
+        sigma: standard deviation of the kernel in frames.
+    """
+    frames = weights.shape[-1]
+    offset, kernel = _kernel(sigma, frames, weights)
+    radius = (offset.shape[0] - 1) // 2
+    w = weights.reshape(-1, 1, frames)
+    there = F.conv1d(w, kernel[None, None], padding=radius)
+    whole = F.conv1d(torch.ones_like(w), kernel[None, None], padding=radius)
+    return 1e-3 * (whole / there.clamp(min=1e-12) - 2.0).clamp(min=0.0).reshape(weights.shape)
 
 
 def masked_median(x: Tensor, valid: Tensor) -> Tensor:
@@ -104,12 +133,13 @@ def robust_smooth(
     if precision is not None:
         base, unit = base * precision, precision.sqrt()
     base = base + 1e-4
-    smooth = local_linear(x, base, sigma)
+    ridge = ridge_in_gaps(base, sigma)
+    smooth = local_linear(x, base, sigma, ridge)
     for _ in range(rounds):
         residual = unit * (x - smooth).abs()
         spread = 6.0 * masked_median(residual, valid)
         bisquare = (1.0 - (residual / spread.clamp(min=1e-9)).clamp(max=1.0).square()).square()
-        smooth = local_linear(x, base * (bisquare + 1e-4), sigma)
+        smooth = local_linear(x, base * (bisquare + 1e-4), sigma, ridge)
     return smooth
 
 

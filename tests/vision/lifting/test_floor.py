@@ -151,6 +151,28 @@ def test_somebody_who_lies_is_on_the_floor() -> None:
     assert float(placed[35:, :, 2].max()) < 0.7
 
 
+@pytest.mark.parametrize("feet", [True, False])
+def test_somebody_who_lies_is_near_where_they_stood_even_if_feet_were_out_of_sight(feet: bool) -> None:
+    """The size of the lying body is wrong by a half; without feet no floor is known, but where they stood is."""
+    joints = forward_kinematics(BodyPose.standing((60,)), TALL)
+    turn = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
+    lying = (joints - mid_hips(joints)[:, None]) @ turn.T
+    world = torch.where(torch.arange(60)[:, None, None] < 30, joints, lying)
+    lowest = torch.zeros(60, 3, dtype=torch.float64)
+    lowest[:, 2] = world[..., 2].amin(dim=1)
+    world = world - lowest[:, None] + torch.tensor([0.0, 4.0, 0.0], dtype=torch.float64)
+    image, lifted = film(world, CAMERA)
+    size = torch.where(torch.arange(60) < 30, 1.0, 1 / 1.5)
+    fields = Lifted(*(field[None, None] for field in lifted._replace(scale=lifted.scale * size)))
+    scores = torch.ones(1, 1, 60, 14, dtype=torch.float64)
+    scores[..., :30, [10, 13]] = float(feet)
+    there = scores[..., 0] > 0
+    placed, _ = MetricPose(CAMERA, (TALL,))(image[None, None], scores, fields, there, HEIGHT, WIDTH, FPS)
+    off = (mid_hips(placed[0, 0]) - mid_hips(world))[40:, 1]
+    # By its size alone the body would be 2 m too far away.
+    assert float(off.abs().max()) < (0.15 if feet else 0.7)
+
+
 # ---- thresholds, from both sides -----------------------------------------------------------------------------
 
 

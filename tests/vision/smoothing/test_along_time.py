@@ -9,6 +9,7 @@ from tensorsim.vision.smoothing.along_time import (
     fill_gaps,
     local_linear,
     masked_median,
+    ridge_in_gaps,
     robust_smooth,
     running_quantile,
 )
@@ -36,6 +37,44 @@ def test_straight_lines_stay(sigma: float) -> None:
     valid[20:26] = False
     smooth = robust_smooth(torch.where(valid, line, torch.zeros_like(line)), valid, max(sigma, 3.0))
     torch.testing.assert_close(smooth[valid], line[valid], atol=2e-2, rtol=0)
+
+
+def test_the_ridge_is_that_of_ridge_regression() -> None:
+    generator = np.random.default_rng(1)
+    sigma, t = 3.0, np.arange(40)
+    x, w, ridge = generator.standard_normal(40), generator.uniform(0.1, 1.0, 40), generator.uniform(0, 1, 40)
+    expected = []
+    for centre in t:
+        kernel = w * np.exp(-0.5 * ((t - centre) / sigma) ** 2) * (np.abs(t - centre) <= 13)
+        a = np.stack([np.ones(40), t - centre], axis=1)
+        least = ridge[centre] * kernel.sum() * sigma**2
+        expected.append(
+            np.linalg.solve(a.T @ (kernel[:, None] * a) + np.diag([0.0, least]), a.T @ (kernel * x))[0]
+        )
+    actual = local_linear(torch.tensor(x), torch.tensor(w), sigma, torch.tensor(ridge))
+    np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
+
+
+def test_only_gaps_have_a_ridge() -> None:
+    weights = torch.ones(80, dtype=torch.float64)
+    assert float(ridge_in_gaps(weights, 5.0).max()) == 0.0
+    assert float(ridge_in_gaps(0.51 * weights, 5.0).max()) == 0.0
+    assert ridge_in_gaps(0.01 * weights, 5.0).tolist() == pytest.approx([0.098] * 80)
+    weights[30:70] = 1e-4
+    ridge = ridge_in_gaps(weights, 5.0)
+    assert float(ridge[:28].max()) == 0.0
+    assert float(ridge[50]) > 1.0
+
+
+def test_a_line_does_not_go_on_through_a_long_gap() -> None:
+    """Somebody comes nearer for a second, then nothing is known of the range for two."""
+    t = torch.arange(90, dtype=torch.float64) / 30
+    coming = 5.0 - 1.5 * t.clamp(max=1.0)
+    noise = 0.02 * torch.randn(90, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    smooth = robust_smooth(coming + noise, t < 1.0, 9.0)
+    assert float((smooth - coming)[:30].abs().max()) < 0.04
+    # With the last slope it would be 1.5 m nearer one second later.
+    assert float((smooth - coming)[60:].abs().max()) < 0.1
 
 
 def test_outliers_do_not_bend_it() -> None:
