@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 import tensorsim as ts
+from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
@@ -410,3 +411,32 @@ def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
             assert_same([result[index]], [expected[index]], atol=1e-2)
         assert expected.valid.shape[1] >= 1
         assert expected.valid.any(dim=-1).all()
+
+
+@pytest.mark.filterwarnings("ignore:positions. some scatterer is beyond")
+def test_who_is_beyond_twice_the_range_axis_does_not_appear_at_the_radar() -> None:
+    """A beat frequency above the sample rate would; the receiver's filter keeps it out."""
+    radar = ts.RadarConfig.free_space(prf_hz=1024.0)
+    stage = PoseToDoppler(ts.radar.RadarSimulator(radar, snr_db=None)).eval()
+    reach = radar.range_resolution_m * (radar.samples_per_chirp // 2)
+    body = forward_kinematics(BodyPose.standing((1,)), 1.75)
+    t = torch.arange(20, dtype=torch.float64) / FPS
+    loudest = []
+    for range_m in (4.0, 2 * reach + 0.3, 2.5 * reach):
+        joints = body.expand(20, -1, -1) + torch.stack([0 * t, range_m - 0.3 * t, 0 * t], -1)[:, None]
+        with torch.no_grad():
+            maps = stage(joints[None, None], torch.ones(1, 1, 20, dtype=torch.bool), FPS)
+        loudest.append(float(maps.doppler_time.max()))
+    assert max(loudest[1:]) < 1e-4 * loudest[0]
+
+
+def test_the_receiver_hears_everybody_on_the_range_axis() -> None:
+    radar = ts.RadarConfig.free_space()
+    stage = PoseToDoppler(ts.radar.RadarSimulator(radar))
+    reach = radar.range_resolution_m * (radar.samples_per_chirp // 2)
+    radius = torch.tensor([0.1, 1.0, 1.49, 1.7, 1.9, 30.0], dtype=torch.float64) * reach
+    way = torch.stack([0.6 * radius, 0.8 * radius, 0 * radius], -1)
+    there = way + torch.tensor([radar.tx_m, radar.rx_m], dtype=torch.float64).mean(0)
+    heard = stage.heard(there[:, None].expand(-1, 14, -1))
+    assert heard.tolist() == pytest.approx([1, 1, 1, 0.5, 1e-4, 1e-4], rel=1e-3)
+    assert heard[:3].eq(1.0).all()

@@ -142,7 +142,7 @@ class LiveRadar:
         )
         scale = self.stage.rcs_scale
         order = torch.tensor([p.order for p in shown], dtype=torch.int64).clamp(max=scale.shape[0] - 1)
-        fade = fade * scale[order].sqrt()[:, None]
+        fade = fade * scale[order].sqrt()[:, None] * self.stage.heard(joints)
         points, rcs = self.stage.scatterers(joints[None], fade[None])
         return points, rcs
 
