@@ -1,0 +1,111 @@
+"""Which part of the way from a film to a label costs accuracy, on everyday motion whose truth is known.
+
+python -m tests.benchmarks.eval_losses [GROUPS]
+
+The shipped classifier on clips of 4 s: of the pipeline's motion, of the same with one part replaced by the truth, and
+of the true motion; the share that is labelled rightly in each scene. Groups have four clips of each activity, before
+cameras that are known to 4 degrees and 12 %.
+"""
+
+import sys
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from tensorsim.body.skeleton import body_to_coco, mid_hips
+from tensorsim.config import ACTIVITIES
+from tensorsim.evaluation.measured.motions import Draw
+from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
+from tensorsim.geometry.framing import keypoint_boxes
+from tensorsim.radar.presets import PRESETS
+from tensorsim.recognition import ActivityRecognizer
+from tensorsim.recognition.map_image import scaled
+from tensorsim.training.everyday import at_rate, everyday_motion
+from tensorsim.training.everyday_maps import BODIES, Radars, Watched
+from tensorsim.training.key_point_errors import FilmedMotion, Filming, Seen, draw_camera, find_key_points
+from tensorsim.training.maps import SCENES
+from tensorsim.types import Tracks
+
+CLIPS, SECONDS, STORED, SPEED_M_S = 4, 4.0, 64, 3.8
+RATES_HZ = (15.0, 18.0, 20.0, 25.0)
+
+#: Joints (P, T, 14, 3) and presence (P, T) of people.
+Motion = tuple[Tensor, Tensor]
+
+
+def exact_key_points(joints: Tensor, filming: Filming) -> Seen:
+    """Where the key points of joints (T, 14, 3) are, all those in the picture."""
+    focal = focal_length(filming.camera, filming.width)
+    center = principal_point(filming.camera, filming.height, filming.width)
+    where, depth = project(body_to_coco(joints), focal, center, camera_to_world(filming.camera))
+    size = torch.tensor([filming.width, filming.height])
+    inside = ((where >= -0.5) & (where < size)).all(-1) & (depth > NEAR_M)
+    return Seen(where, 0.9 * inside.double(), inside.sum(-1) >= 4)
+
+
+def lifted(seen: list[Seen], filming: Filming, fps: float, films: FilmedMotion) -> Motion:
+    """What the pipeline makes of key points before a camera that is believed to be as ``filming`` says."""
+    keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
+    boxes = keypoint_boxes(keypoints, scores, margin=0.08)
+    tracks = Tracks(boxes.float()[None], valid[None], valid[None])
+    stage = films.stage.seen_by(filming.believed, known=False)
+    size = filming.height, filming.width
+    pose = stage.lift(tracks, keypoints.float()[None], scores.float()[None], *size, fps)
+    return pose.joints[0].double(), pose.valid[0]
+
+
+def ways(activity: int, fps: float, generator: torch.Generator, films: FilmedMotion) -> dict[str, Motion]:
+    """The motion of the same people by what of it is true."""
+    draw = Draw(1, generator)
+    motion, heights = everyday_motion(activity, CLIPS, torch.full((CLIPS,), SECONDS), generator)
+    truth = torch.stack([at_rate(joints, round(SECONDS * fps), fps) for joints in motion])
+    filming = draw_camera(mid_hips(truth).mean(0), draw)
+    seen = [
+        find_key_points(joints, height, fps, filming, draw)
+        for joints, height in zip(truth, heights.tolist(), strict=True)
+    ]
+    known = filming._replace(believed=filming.camera)
+    found, valid = lifted(seen, filming, fps, films)
+    apart = (mid_hips(truth) - mid_hips(found))[..., None, :]
+    return {
+        "as found in films": (found, valid),
+        "camera known": lifted(seen, known, fps, films),
+        "key points exact": lifted([exact_key_points(one, filming) for one in truth], filming, fps, films),
+        "hips true": (found + apart, valid),
+        "limbs true": (truth - apart, valid),
+        "all true, while found": (truth, valid),
+        "all true": (truth, torch.ones_like(valid)),
+    }
+
+
+@torch.no_grad()
+def main() -> None:
+    torch.set_num_threads(1)
+    groups = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    films, radars = FilmedMotion(), Radars(STORED, SPEED_M_S)
+    recognizer = ActivityRecognizer.from_pretrained(PRESETS["free-space"].radar).eval()
+    right: dict[str, list[Tensor]] = {}
+    for group in range(groups):
+        generator = torch.Generator().manual_seed(7000 + group)
+        fps, body = RATES_HZ[group % len(RATES_HZ)], list(BODIES)[group % len(BODIES)]
+        for activity in range(1, len(ACTIVITIES)):
+            for name, (joints, valid) in ways(activity, fps, generator, films).items():
+                for k in range(CLIPS):
+                    if int(valid[k].sum()) <= 0.2 * valid.shape[1]:
+                        continue
+                    clip = Watched(joints[k : k + 1], valid[k : k + 1], fps)
+                    power = radars(clip, body, alive=False, seed=group)[:, None].float()
+                    picture = scaled(
+                        F.avg_pool2d(power, STORED // recognizer.size), "db", recognizer.range_db
+                    )
+                    logits = recognizer.network(picture) + recognizer.network(picture.flip(-2))
+                    right.setdefault(name, []).append(logits.argmax(-1) == activity)
+    print(f"{'':24s}", *SCENES, "clips")
+    for name, hits in right.items():
+        share = torch.stack(hits).double().mean(0)
+        print(f"{name:24s}", *(f"{x:10.3f}" for x in share.tolist()), f"{len(hits):6d}")
+
+
+if __name__ == "__main__":
+    main()
