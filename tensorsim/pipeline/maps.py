@@ -176,7 +176,7 @@ class PoseToDoppler(nn.Module):
         Receivers filter before they sample: here the amplitude falls as a raised cosine, by 80 dB from 1.5 to 1.9
         times the range of the last bin. What is there does not appear in the maps in any case.
         """
-        distance = (mid_hips(joints) - self.radar_m.to(joints)).norm(dim=-1)
+        distance = torch.linalg.vector_norm(mid_hips(joints) - self.radar_m.to(joints), dim=-1)
         beyond = ((distance / self.reach_m - 1.5) / 0.4).clamp(0.0, 1.0)
         filtered = 1e-4 + (1.0 - 1e-4) * (0.5 + 0.5 * torch.cos(math.pi * beyond))
         return torch.where(beyond > 0, filtered, torch.ones_like(filtered))
