@@ -131,6 +131,11 @@ class RadarConfig:
         return SPEED_OF_LIGHT_M_S / (2 * self.bandwidth_hz)
 
     @property
+    def reach_m(self) -> float:
+        """Range at half the sample rate, where the N / 2 range bins end."""
+        return self.range_resolution_m * (self.samples_per_chirp // 2)
+
+    @property
     def unambiguous_speed_m_s(self) -> float:
         """Largest radial speed without Doppler aliasing, lambda PRF / 4 (7.8 m/s and 3.8 m/s in the presets)."""
         return self.doppler_wavelength_m * self.prf_hz / 4

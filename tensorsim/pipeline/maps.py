@@ -83,7 +83,7 @@ class PoseToDoppler(nn.Module):
         radar = simulator.radar
         antennas = torch.tensor([radar.tx_positions_m[0], radar.rx_positions_m[0]], dtype=torch.float64)
         self.register_buffer("radar_m", antennas.mean(0), persistent=False)
-        self.reach_m = radar.range_resolution_m * (radar.samples_per_chirp // 2)
+        self.reach_m = radar.reach_m
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "PoseToDoppler":

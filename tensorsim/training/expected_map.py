@@ -98,8 +98,7 @@ class ExpectedMap:
         power = rcs.double() / (away[0] * away[1]).square().clamp(min=1e-3)
         echo = power.sum(1).mean()
         # Beyond the last range bin nothing is kept.
-        reach = self.radar.samples_per_chirp // 2 * self.radar.range_resolution_m
-        power = power * (range_m < reach)
+        power = power * (range_m < self.radar.reach_m)
         place = speed * 2 / self.radar.doppler_wavelength_m / self.radar.prf_hz * self.bins
         place = torch.remainder(torch.round(place).long() + self.bins // 2, self.bins)
         histogram = torch.zeros(len(points), self.bins, dtype=torch.float64).scatter_add_(1, place, power)

@@ -81,13 +81,18 @@ def _spell(frames: int, rate: float, shortest: float, longest: float, draw: Draw
     return (draw(0.0, 1.0) < rate) & (time >= start) & (time < start + length)
 
 
+def project_key_points(joints: Tensor, filming: Filming) -> tuple[Tensor, Tensor]:
+    """Key points of joints (T, 14, 3) m in the pictures, (T, 17, 2) pixels, and their depths (T, 17) m."""
+    focal = focal_length(filming.camera, filming.width)
+    center = principal_point(filming.camera, filming.height, filming.width)
+    return project(body_to_coco(joints), focal, center, camera_to_world(filming.camera))
+
+
 def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filming, draw: Draw) -> Seen:
     """What networks find of a person with joints (T, 14, 3) m and this height; ``draw`` is for one."""
     frames = len(joints)
-    body = body_to_coco(joints)
+    true, depth = project_key_points(joints, filming)
     focal = focal_length(filming.camera, filming.width)
-    center = principal_point(filming.camera, filming.height, filming.width)
-    true, depth = project(body, focal, center, camera_to_world(filming.camera))
     unit = (focal * height_m / depth[:, 11:13].mean(1).clamp(min=0.5))[:, None, None]
 
     level = torch.exp(0.5 * draw.normal(1))[..., 0] * torch.tensor(RELATIVE, dtype=torch.float64)[:, None]
@@ -170,6 +175,11 @@ class FilmedMotion:
         hips = torch.stack([(joints[:, 8] + joints[:, 11]) / 2 for joints, _ in people])
         filming = draw_camera(hips.mean(0), draw)
         seen = [find_key_points(joints, height, fps, filming, draw) for joints, height in people]
+        return self.lifted(seen, filming, fps)
+
+    @torch.no_grad()
+    def lifted(self, seen: list[Seen], filming: Filming, fps: float) -> tuple[Tensor, Tensor]:
+        """What the pipeline makes of key points before a camera: joints (P, T, 14, 3) and presence (P, T)."""
         keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
         boxes = keypoint_boxes(keypoints, scores, margin=0.08)
         if not bool(valid.any()):

@@ -13,19 +13,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tensorsim.body.skeleton import body_to_coco, mid_hips
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import ACTIVITIES
 from tensorsim.evaluation.measured.motions import Draw
-from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
-from tensorsim.geometry.framing import keypoint_boxes
+from tensorsim.geometry.camera import NEAR_M
 from tensorsim.radar.presets import PRESETS
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.recognition.map_image import scaled
 from tensorsim.training.everyday import at_rate, everyday_motion
 from tensorsim.training.everyday_maps import BODIES, Radars, Watched
-from tensorsim.training.key_point_errors import FilmedMotion, Filming, Seen, draw_camera, find_key_points
+from tensorsim.training.key_point_errors import (
+    FilmedMotion,
+    Filming,
+    Seen,
+    draw_camera,
+    find_key_points,
+    project_key_points,
+)
 from tensorsim.training.maps import SCENES
-from tensorsim.types import Tracks
 
 CLIPS, SECONDS, STORED, SPEED_M_S = 4, 4.0, 64, 3.8
 RATES_HZ = (15.0, 18.0, 20.0, 25.0)
@@ -36,23 +41,10 @@ Motion = tuple[Tensor, Tensor]
 
 def exact_key_points(joints: Tensor, filming: Filming) -> Seen:
     """Where the key points of joints (T, 14, 3) are, all those in the picture."""
-    focal = focal_length(filming.camera, filming.width)
-    center = principal_point(filming.camera, filming.height, filming.width)
-    where, depth = project(body_to_coco(joints), focal, center, camera_to_world(filming.camera))
+    where, depth = project_key_points(joints, filming)
     size = torch.tensor([filming.width, filming.height])
     inside = ((where >= -0.5) & (where < size)).all(-1) & (depth > NEAR_M)
     return Seen(where, 0.9 * inside.double(), inside.sum(-1) >= 4)
-
-
-def lifted(seen: list[Seen], filming: Filming, fps: float, films: FilmedMotion) -> Motion:
-    """What the pipeline makes of key points before a camera that is believed to be as ``filming`` says."""
-    keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
-    boxes = keypoint_boxes(keypoints, scores, margin=0.08)
-    tracks = Tracks(boxes.float()[None], valid[None], valid[None])
-    stage = films.stage.seen_by(filming.believed, known=False)
-    size = filming.height, filming.width
-    pose = stage.lift(tracks, keypoints.float()[None], scores.float()[None], *size, fps)
-    return pose.joints[0].double(), pose.valid[0]
 
 
 def ways(activity: int, fps: float, generator: torch.Generator, films: FilmedMotion) -> dict[str, Motion]:
@@ -65,13 +57,12 @@ def ways(activity: int, fps: float, generator: torch.Generator, films: FilmedMot
         find_key_points(joints, height, fps, filming, draw)
         for joints, height in zip(truth, heights.tolist(), strict=True)
     ]
-    known = filming._replace(believed=filming.camera)
-    found, valid = lifted(seen, filming, fps, films)
+    found, valid = films.lifted(seen, filming, fps)
     apart = (mid_hips(truth) - mid_hips(found))[..., None, :]
     return {
         "as found in films": (found, valid),
-        "camera known": lifted(seen, known, fps, films),
-        "key points exact": lifted([exact_key_points(one, filming) for one in truth], filming, fps, films),
+        "camera known": films.lifted(seen, filming._replace(believed=filming.camera), fps),
+        "key points exact": films.lifted([exact_key_points(one, filming) for one in truth], filming, fps),
         "hips true": (found + apart, valid),
         "limbs true": (truth - apart, valid),
         "all true, while found": (truth, valid),

@@ -82,7 +82,7 @@ class SpeedCheck:
 
     def judge(self) -> None:
         """Raise TensorsimError or warn; see the class."""
-        reach_m = self.radar.range_resolution_m * (self.radar.samples_per_chirp // 2)
+        reach_m = self.radar.reach_m
         if self.farthest > reach_m:
             warnings.warn(
                 f"positions: some scatterer is beyond the {reach_m:.2f} m of this radar's range axis and does not "

@@ -68,7 +68,7 @@ def local_linear(x: Tensor, weights: Tensor, sigma: float, ridge: Tensor | None 
     """
     frames = x.shape[-1]
     offset, kernel = _kernel(sigma, frames, x)
-    radius = (offset.shape[0] - 1) // 2
+    radius = offset.shape[0] // 2
     moments = torch.stack([kernel, kernel * offset, kernel * offset.square()])[:, None]
     flat, w = x.reshape(-1, 1, frames), weights.reshape(-1, 1, frames)
     s = F.conv1d(w, moments, padding=radius)
@@ -94,8 +94,8 @@ def ridge_in_gaps(weights: Tensor, sigma: float) -> Tensor:
         sigma: standard deviation of the kernel in frames.
     """
     frames = weights.shape[-1]
-    offset, kernel = _kernel(sigma, frames, weights)
-    radius = (offset.shape[0] - 1) // 2
+    _, kernel = _kernel(sigma, frames, weights)
+    radius = kernel.shape[0] // 2
     w = weights.reshape(-1, 1, frames)
     there = F.conv1d(w, kernel[None, None], padding=radius)
     whole = F.conv1d(torch.ones_like(w), kernel[None, None], padding=radius)
