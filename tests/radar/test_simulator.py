@@ -360,6 +360,21 @@ def test_warns_of_what_the_range_axis_cannot_show():
     check_unambiguous(far, torch.ones(64, 2), THROUGH)  # 30 m
 
 
+def test_says_that_a_scatterer_beyond_twice_the_range_axis_appears_too_near() -> None:
+    radar = RadarConfig.free_space()
+    far_m = 2 * radar.reach_m + 2.0
+    far = torch.tensor([0.0, far_m, 0.0], dtype=torch.float64).expand(900, 1, 3).clone()
+    rcs = torch.ones(900, 1, dtype=torch.float64)
+    with pytest.warns(TensorsimWarning, match="beyond 14.99 m, twice the range axis .* appears too near"):
+        maps = RadarSimulator(radar)(far[None], rcs[None])
+    peak = int(maps.range_time[0].mean(-1).argmax())
+    assert peak * radar.range_resolution_m == pytest.approx(2.0, abs=0.2)
+    # One that the receiver has filtered out does not, beside one that is heard.
+    both = torch.cat([far, far - torch.tensor([0.0, 5.0, 0.0])], dim=1)
+    with pytest.warns(TensorsimWarning, match="does not appear in the maps"):
+        check_unambiguous(both, torch.cat([1e-8 * rcs, rcs], dim=1), radar)
+
+
 @pytest.mark.parametrize(("near_m", "far_m"), [(0.0, 0.0), (0.5, 0.0), (0.0, -0.5)])
 def test_warning_when_somebody_leaves_a_fixed_gate(near_m, far_m):
     p, rcs = mover(3.5, 128), torch.ones(4)

@@ -10,6 +10,9 @@ from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_finite, check_not_empty
 from tensorsim.radar.synthesis.legs import leg_length
 
+#: A scatterer with a smaller share of the largest RCS has been filtered out by the receiver.
+_FILTERED = 1e-6
+
 
 def mean_range(positions: Tensor, radar: RadarConfig) -> Tensor:
     """Range ``(|P - Ptx| + |P - Prx|) / 2`` as on the range axis: (..., 3) metres -> (...) float64 metres.
@@ -52,9 +55,9 @@ class SpeedCheck:
     Doppler is ambiguous modulo the PRF, so a speed above ``lambda PRF / 4`` appears at a wrong frequency. If the
     RCS-weighted mean of the absolute radial speed (over scatterers and pulses of a clip) is above this limit, the
     whole map is wrong: an error. If only some scatterers are, a foot for instance: a warning. A scatterer at a range
-    larger than that of the last bin has a beat frequency above half the sample rate and is not in the map: a warning.
-    A scatterer outside of a fixed range gate is cut off: a warning. Scatterers with RCS 0, such as people before they
-    appear, are ignored.
+    larger than that of the last bin has a beat frequency above half the sample rate and is not in the map; beyond
+    twice that range it is above the sample rate and the scatterer appears too near: warnings. A scatterer outside of a
+    fixed range gate is cut off: a warning. Scatterers with RCS 0, such as people before they appear, are ignored.
 
     Args:
         radar: the radar.
@@ -65,6 +68,7 @@ class SpeedCheck:
         self.radar, self.gate_m = radar, gate_m
         self.weighted, self.weight = torch.zeros(()), torch.zeros(())
         self.fastest, self.farthest, self.nearest = 0.0, 0.0, math.inf
+        self.strongest, self.folded = 0.0, 0.0
 
     def add(self, positions: Tensor, rcs: Tensor) -> None:
         """Add positions (..., M, S, 3) m and the RCS per pulse (..., M, S) m^2."""
@@ -74,6 +78,8 @@ class SpeedCheck:
         distance = mean_range(positions.detach(), self.radar)
         self.farthest = max(self.farthest, float(torch.where(rcs > 0, distance, 0.0).max()))
         self.nearest = min(self.nearest, float(torch.where(rcs > 0, distance, math.inf).min()))
+        self.strongest = max(self.strongest, float(rcs.max()))
+        self.folded = max(self.folded, float(torch.where(distance > 2 * self.radar.reach_m, rcs, 0.0).max()))
         weight = torch.minimum(rcs[..., 1:, :], rcs[..., :-1, :])
         speed = torch.where(weight > 0, distance.diff(dim=-2).abs() * self.radar.prf_hz, 0.0)
         self.weighted = self.weighted + (weight * speed).sum((-2, -1)).cpu()
@@ -83,7 +89,14 @@ class SpeedCheck:
     def judge(self) -> None:
         """Raise TensorsimError or warn; see the class."""
         reach_m = self.radar.reach_m
-        if self.farthest > reach_m:
+        if self.folded > _FILTERED * self.strongest:
+            warnings.warn(
+                f"positions: some scatterer is beyond {2 * reach_m:.2f} m, twice the range axis of this radar: its "
+                "beat frequency is above the sample rate, and it appears too near; leave out who is that far away",
+                TensorsimWarning,
+                stacklevel=3,
+            )
+        elif self.farthest > reach_m:
             warnings.warn(
                 f"positions: some scatterer is beyond the {reach_m:.2f} m of this radar's range axis and does not "
                 "appear in the maps",
