@@ -373,6 +373,15 @@ def test_says_that_a_scatterer_beyond_twice_the_range_axis_appears_too_near() ->
     both = torch.cat([far, far - torch.tensor([0.0, 5.0, 0.0])], dim=1)
     with pytest.warns(TensorsimWarning, match="does not appear in the maps"):
         check_unambiguous(both, torch.cat([1e-8 * rcs, rcs], dim=1), radar)
+    # Nor does one beyond three times the range axis, which is as far above the sample rate as one beyond the axis.
+    farther = far + torch.tensor([0.0, radar.reach_m, 0.0])
+    with pytest.warns(TensorsimWarning, match="does not appear in the maps"):
+        maps = RadarSimulator(radar)(
+            torch.cat([farther, far - torch.tensor([0.0, 12.0, 0.0])], 1)[None], torch.ones(1, 900, 2)
+        )
+    shown = maps.range_time[0].double().square().mean(-1)
+    at = torch.arange(len(shown)) * radar.range_resolution_m
+    assert float(shown[at < 3.0].sum()) < 0.01 * float(shown.sum())
 
 
 @pytest.mark.parametrize(("near_m", "far_m"), [(0.0, 0.0), (0.5, 0.0), (0.0, -0.5)])

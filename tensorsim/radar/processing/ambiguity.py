@@ -55,9 +55,10 @@ class SpeedCheck:
     Doppler is ambiguous modulo the PRF, so a speed above ``lambda PRF / 4`` appears at a wrong frequency. If the
     RCS-weighted mean of the absolute radial speed (over scatterers and pulses of a clip) is above this limit, the
     whole map is wrong: an error. If only some scatterers are, a foot for instance: a warning. A scatterer at a range
-    larger than that of the last bin has a beat frequency above half the sample rate and is not in the map; beyond
-    twice that range it is above the sample rate and the scatterer appears too near: warnings. A scatterer outside of a
-    fixed range gate is cut off: a warning. Scatterers with RCS 0, such as people before they appear, are ignored.
+    larger than that of the last bin has a beat frequency above half the sample rate and is not in the map; from twice
+    to three times that range the frequency is above the sample rate and the scatterer appears too near: warnings. A
+    scatterer outside of a fixed range gate is cut off: a warning. Scatterers with RCS 0, such as people before they
+    appear, are ignored.
 
     Args:
         radar: the radar.
@@ -79,7 +80,11 @@ class SpeedCheck:
         self.farthest = max(self.farthest, float(torch.where(rcs > 0, distance, 0.0).max()))
         self.nearest = min(self.nearest, float(torch.where(rcs > 0, distance, math.inf).min()))
         self.strongest = max(self.strongest, float(rcs.max()))
-        self.folded = max(self.folded, float(torch.where(distance > 2 * self.radar.reach_m, rcs, 0.0).max()))
+        reach_m = self.radar.reach_m
+        if self.farthest > 2 * reach_m:
+            # Beat frequencies are known up to multiples of the sample rate: the range axis is seen again and again.
+            folded = (distance > 2 * reach_m) & (torch.remainder(distance, 2 * reach_m) < reach_m)
+            self.folded = max(self.folded, float(torch.where(folded, rcs, 0.0).max()))
         weight = torch.minimum(rcs[..., 1:, :], rcs[..., :-1, :])
         speed = torch.where(weight > 0, distance.diff(dim=-2).abs() * self.radar.prf_hz, 0.0)
         self.weighted = self.weighted + (weight * speed).sum((-2, -1)).cpu()
