@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.skeleton import mid_hips
-from tensorsim.vision.smoothing.along_time import fill_gaps, local_linear, running_quantile
+from tensorsim.vision.smoothing.along_time import fill_gaps, local_linear, masked_median, running_quantile
 
 
 def lowest_ankle(joints: Tensor) -> Tensor:
@@ -139,3 +139,27 @@ def floor_under(joints: Tensor, valid: Tensor, fps: float, window_s: float) -> T
     window = int(window_s * fps)
     low = running_quantile(low, window, 0.15)
     return local_linear(low, torch.ones_like(low), max(0.2 * window, 0.5))
+
+
+def on_the_same_floor(floor: Tensor, hips_range: Tensor, valid: Tensor) -> Tensor:
+    """Whether people stand on the floor of the nearest one, as far as a wrong tilt of the camera leaves that open.
+
+    What is taken for a person but is small, such as a post, seems far away by its size, and then its feet are far below
+    the floor. On the floor it would be less than a third as tall as a person; children are half as tall as adults.
+
+    Args:
+        floor: (..., P, T) height of the floor under each, above the camera (so negative), m.
+        hips_range: (..., P, T) m.
+        valid: (..., P, T) bool.
+
+    Returns:
+        (..., P) bool. True of the nearest one, and of all if its feet are above the camera.
+    """
+    if valid.shape[-2] == 0:
+        return valid.any(dim=-1)
+    away = masked_median(hips_range, valid)[..., 0]
+    away = torch.where(valid.any(dim=-1), away, torch.full_like(away, float("inf")))
+    level = masked_median(floor, valid)[..., 0]
+    nearest = level.gather(-1, away.argmin(dim=-1, keepdim=True))
+    # Of two metres below, 8 degrees of tilt are 14 m of range.
+    return (nearest >= 0.0) | (level > 3.0 * nearest) | (level > nearest - 2.0)

@@ -17,6 +17,7 @@ from tensorsim.vision.lifting.floor import (
     looks_bent,
     lowered,
     lowest_ankle,
+    on_the_same_floor,
     range_on_floor,
     upright_share,
 )
@@ -90,7 +91,8 @@ class MetricPose(nn.Module):
     not give a reliable size: they take that of the others, and one of few joints that would make a body of less than
     0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The floor is a low running
     quantile of the height of the lower ankle where they stand, so that it stays through a jump and an outlier does not
-    move it.
+    move it. Where sizes tell ranges, who would stand far below the floor of the nearest person is a small thing and
+    nobody: none of its joints is seen.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
     joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
@@ -246,7 +248,12 @@ class MetricPose(nn.Module):
             joints = back_project(image, hips_range[..., None] + depth, focal, center, pose)
             if not self.calibrated:
                 stands = torch.where(stands.any(dim=-1, keepdim=True), stands & valid, valid)
-                joints = lowered(joints, floor_under(joints, stands, fps, self.floor_window_s))
+                floor = floor_under(joints, stands, fps, self.floor_window_s)
+                joints = lowered(joints, floor)
+                if not self.distance_gives_focal:
+                    person = on_the_same_floor(floor - pose[..., 2, 3], hips_range, valid)
+                    valid = valid & person[..., None]
+                    seen = seen & valid[..., None]
         joints = joints.gather(-3, nearest_valid(valid)[..., None, None].expand_as(joints))
         return joints * valid.any(dim=-1)[..., None, None, None], seen
 

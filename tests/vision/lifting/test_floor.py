@@ -16,6 +16,7 @@ from tensorsim.vision.lifting.floor import (
     looks_bent,
     lowered,
     lowest_ankle,
+    on_the_same_floor,
     range_on_floor,
     upright_share,
 )
@@ -251,6 +252,34 @@ def test_near_ranges_are_good_to_a_centimetre_and_no_precision_is_below_a_thousa
     assert float(near) == pytest.approx(1.0), "both are held at 1 cm"
     large = fused_range(0.2 * one, zero, far, far, far, one)[2]
     assert float(large) == pytest.approx(1e-4 / 0.03**2)
+
+
+@pytest.mark.parametrize(
+    ("camera_m", "tall", "person"),
+    [
+        (1.5, 0.58, False),
+        (1.5, 0.62, True),
+        (1.5, 0.9, True),
+        (0.5, 0.4, True),
+        (4.0, 0.9, True),
+        (4.0, 0.58, False),
+    ],
+)
+def test_who_would_be_less_than_a_third_as_tall_on_the_floor_is_nobody(
+    camera_m: float, tall: float, person: bool
+) -> None:
+    """By its size a thing of 0.58 m is 3.1 times as far away as it is, and its feet 3.1 times as far below the camera.
+
+    Of a camera near the floor that is less than two metres.
+    """
+    times = 1.8 / tall
+    level = torch.tensor([-camera_m, -camera_m * times, 5.0], dtype=torch.float64)[:, None].expand(3, 9)
+    away = torch.tensor([4.0, 4.5 * times, 1.0], dtype=torch.float64)[:, None].expand(3, 9)
+    valid = torch.tensor([True, True, False])[:, None].expand(3, 9)
+    assert on_the_same_floor(level, away, valid)[:2].tolist() == [True, person]
+    assert on_the_same_floor(level[1:], away[1:], valid[1:])[0], "alone it may be anybody"
+    assert on_the_same_floor(-level, away, valid)[:2].all(), "feet above the camera tell nothing"
+    assert on_the_same_floor(level[:0], away[:0], valid[:0]).shape == (0,)
 
 
 def test_floor_is_a_low_quantile_of_the_lower_ankle() -> None:

@@ -152,15 +152,19 @@ def project(world: np.ndarray, camera: CameraConfig) -> np.ndarray:
     return np.stack([u0 + focal * right / forward, v0 - focal * up / forward], axis=-1)
 
 
-def film(world: Tensor, camera: CameraConfig = CameraConfig()) -> tuple[Tensor, Lifted]:  # noqa: B008
+def film(
+    world: Tensor,
+    camera: CameraConfig = CameraConfig(),  # noqa: B008
+    tall: float = TALL,
+) -> tuple[Tensor, Lifted]:
     """Key points (T, 14, 2) of world joints and the lifting that an all-knowing lifter would return."""
     image = torch.tensor(project(world.numpy(), camera))
     pose = camera_to_world(camera)
     ahead = (world - pose[:, 3]) @ pose[:, 2]
     root = mid_hips(ahead[..., None])
-    depth = (ahead - root) / TALL
+    depth = (ahead - root) / tall
     focal = FOCAL if camera.focal_px is None else camera.focal_px
-    scale = focal / (root[:, 0] / TALL + depth.mean(dim=-1))
+    scale = focal / (root[:, 0] / tall + depth.mean(dim=-1))
     nothing = torch.zeros(len(world), dtype=torch.float64)
     return image, Lifted(depth, scale, image, nothing.long(), nothing, torch.zeros_like(depth))
 
@@ -337,6 +341,26 @@ def test_hidden_joints_and_absent_people_are_filled_and_marked() -> None:
     expected = valid[..., None].expand(-1, -1, 14).clone()
     expected[0, 30:40, wrist] = False
     assert torch.equal(seen, expected)
+
+
+@pytest.mark.parametrize(("tall", "is_person"), [(0.5, False), (0.9, True)])
+def test_a_post_beside_a_walker_is_nobody_but_a_child_is(tall: float, is_person: bool) -> None:
+    """By its size a post of half a metre, 5 m away, is a person 17.5 m away whose feet are 3.75 m below the floor."""
+    world = walker((0.5, 4.0), (0.0, 0.0))
+    small = world * (tall / TALL) + torch.tensor([-1.0, 5.0 - 4.0 * tall / TALL, 0.0])
+    images, lifts = zip(film(small, tall=tall), film(world), strict=True)
+    lifted = Lifted(*(torch.stack(fields) for fields in zip(*lifts, strict=True)))
+    ones = torch.ones(2, 90, 14, dtype=torch.float64)
+    arguments = (torch.stack(images), ones, lifted, ones[..., 0] > 0, HEIGHT, WIDTH, FPS)
+    joints, seen = MetricPose(person_height_m=(TALL,))(*arguments)
+    assert bool(seen[1].all())
+    assert bool(seen[0].all()) == bool(seen[0].any()) == is_person
+    assert bool(joints[0].any()) == is_person
+    assert float((joints[1] - world).norm(dim=-1).max()) < 0.03
+    assert bool(MetricPose(person_height_m=(tall, TALL))(*arguments)[1].all()), "of known height"
+    assert bool(MetricPose(person_height_m=(TALL,), calibrated=True)(*arguments)[1].all()), (
+        "no floor is estimated"
+    )
 
 
 def place_seen(
