@@ -142,10 +142,11 @@ def floor_under(joints: Tensor, valid: Tensor, fps: float, window_s: float) -> T
 
 
 def on_the_same_floor(floor: Tensor, hips_range: Tensor, valid: Tensor) -> Tensor:
-    """Whether people stand on the floor of the nearest one, as far as a wrong tilt of the camera leaves that open.
+    """Whether people stand on the same floor as the nearest one, with room for a tilt of the camera that is wrong.
 
-    What is taken for a person but is small, such as a post, seems far away by its size, and then its feet are far below
-    the floor. On the floor it would be less than a third as tall as a person; children are half as tall as adults.
+    A small object that is taken for a person, such as a post, seems far away by its size, and then its feet are far
+    below the floor: by more than two metres, and so far that on the floor it would be less than a third as tall as a
+    person. A child, half as tall as an adult, is kept.
 
     Args:
         floor: (..., P, T) height of the floor under each, above the camera (so negative), m.
@@ -161,5 +162,5 @@ def on_the_same_floor(floor: Tensor, hips_range: Tensor, valid: Tensor) -> Tenso
     away = torch.where(valid.any(dim=-1), away, torch.full_like(away, float("inf")))
     level = masked_median(floor, valid)[..., 0]
     nearest = level.gather(-1, away.argmin(dim=-1, keepdim=True))
-    # Of two metres below, 8 degrees of tilt are 14 m of range.
+    # A tilt that is 8 degrees off moves feet that are 14 m away by two metres.
     return (nearest >= 0.0) | (level > 3.0 * nearest) | (level > nearest - 2.0)

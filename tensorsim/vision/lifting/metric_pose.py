@@ -91,8 +91,8 @@ class MetricPose(nn.Module):
     not give a reliable size: they take that of the others, and one of few joints that would make a body of less than
     0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The floor is a low running
     quantile of the height of the lower ankle where they stand, so that it stays through a jump and an outlier does not
-    move it. Where sizes tell ranges, who would stand far below the floor of the nearest person is a small thing and
-    nobody: none of its joints is seen.
+    move it. Where ranges come from sizes, whatever would stand far below the floor of the nearest person is a small
+    object, not a person, and none of its joints counts as seen.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
     joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
