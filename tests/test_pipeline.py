@@ -232,6 +232,25 @@ def test_brief_gaps_of_a_joint_are_predicted_and_longer_ones_are_not() -> None:
     assert torch.equal(stage.smoother.measured[0, 0], expected)
 
 
+@pytest.mark.parametrize(("speed_m_s", "there"), [(0.5, True), (6.0, False)])
+def test_nobody_runs_while_hidden(speed_m_s: float, there: bool) -> None:
+    """Somebody is hidden for half a second and stands elsewhere then."""
+    stage = pipeline().video_to_pose
+    gone = slice(8, 13)
+    start, stop = (
+        stage(film(*walker(20, FPS, range_m, 0.0, 0.0)).unsqueeze(0), FPS)
+        for range_m in (4.0, 4.0 + 0.6 * speed_m_s)
+    )
+    later = (torch.arange(20) >= 10)[:, None]
+    keypoints = torch.where(later[..., None], stop.keypoints, start.keypoints)
+    scores = torch.where(later, stop.keypoint_scores, start.keypoint_scores)
+    boxes = torch.where(later, stop.boxes, start.boxes)
+    scores[:, :, gone] = 0.0
+    pose = stage.lift(ts.Tracks(boxes, start.valid, start.valid), keypoints, scores, 240, 320, FPS)
+    assert bool(pose.valid[:, :, gone].all()) == bool(pose.valid[:, :, gone].any()) == there
+    assert pose.valid[:, :, : gone.start].all() and pose.valid[:, :, gone.stop :].all()
+
+
 def test_a_track_that_shows_no_joint_is_nobody() -> None:
     stage = pipeline().video_to_pose
     whole = stage(film(*walker(20, FPS, 4.0, 0.5, 0.0)).unsqueeze(0), FPS)

@@ -6,7 +6,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body
+from tensorsim.body.skeleton import coco_to_body, mid_hips
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
 from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
@@ -15,7 +15,7 @@ from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
-from tensorsim.vision.smoothing.along_time import brief_gaps
+from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within
 from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise, noise_with_depth
@@ -112,6 +112,8 @@ class VideoToPose(nn.Module):
         self.brief_gap_s = brief_gap_s
         #: Who is hidden for longer is gone until they are seen again.
         self.longest_gap_s = 1.0
+        #: Nor does who is hidden for longer than ``brief_gap_s`` run meanwhile, in m/s.
+        self.hidden_speed_m_s = 3.0
         #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
         self.noise_share = 0.03
         #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
@@ -346,6 +348,7 @@ class VideoToPose(nn.Module):
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
+        placed = mid_hips(joints)
         # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there
         # the joint of the matched pose replaces it, as long as the person is in the scene.
         in_scene = usable.unsqueeze(-1).expand_as(seen)
@@ -353,7 +356,9 @@ class VideoToPose(nn.Module):
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
         # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
-        there = usable | brief_gaps(usable, int(self.longest_gap_s * fps))
+        hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
+        hidden = hidden & crossed_within(placed, usable, self.hidden_speed_m_s / fps)
+        there = usable | brief_gaps(usable, int(self.brief_gap_s * fps)) | hidden
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
 
 

@@ -20,10 +20,8 @@ def nearest_valid(valid: Tensor) -> Tensor:
 
     Without any valid frame each frame gets its own index.
     """
-    frames = valid.shape[-1]
-    time = torch.arange(frames, device=valid.device).expand(valid.shape)
-    before = running_max(torch.where(valid, time, torch.full_like(time, -frames)))
-    after = -running_max(-torch.where(valid, time, torch.full_like(time, 2 * frames)).flip(-1)).flip(-1)
+    time = torch.arange(valid.shape[-1], device=valid.device).expand(valid.shape)
+    before, after = _seen_beside(valid)
     nearest = torch.where(time - before <= after - time, before, after)
     return torch.where(valid.any(dim=-1, keepdim=True), nearest, time)
 
@@ -35,12 +33,35 @@ def fill_gaps(x: Tensor, valid: Tensor) -> Tensor:
 
 def brief_gaps(seen: Tensor, longest: int) -> Tensor:
     """Gaps (..., T) in ``seen`` (..., T) bool of at most ``longest`` frames, with seen frames on both sides."""
+    before, after = _seen_beside(seen)
+    return ~seen & (after - before - 1 <= longest) & (before >= 0) & (after < seen.shape[-1])
+
+
+def crossed_within(position: Tensor, seen: Tensor, step: float) -> Tensor:
+    """Frames (..., T) between seen ones that are at most ``step`` apart for each frame from one to the other.
+
+    Args:
+        position: (..., T, D), read where ``seen``.
+        seen: (..., T) bool.
+        step: in units of the position.
+    """
+    before, after = _seen_beside(seen)
+    inside = (before >= 0) & (after < seen.shape[-1])
+    last = seen.shape[-1] - 1
+    start = position.gather(-2, before.clamp(0, last).unsqueeze(-1).expand(position.shape))
+    stop = position.gather(-2, after.clamp(0, last).unsqueeze(-1).expand(position.shape))
+    distance = torch.linalg.vector_norm(stop - start, dim=-1)
+    return inside & (distance <= step * (after - before))
+
+
+def _seen_beside(seen: Tensor) -> tuple[Tensor, Tensor]:
+    """The last seen frame up to each one and the first from it on (..., T): -T and 2 T where there is none."""
     frames = seen.shape[-1]
     time = torch.arange(frames, device=seen.device).expand(seen.shape)
     never = torch.full_like(time, -frames)
     before = running_max(torch.where(seen, time, never))
     after = -running_max(-torch.where(seen, time, -2 * never).flip(-1)).flip(-1)
-    return ~seen & (after - before - 1 <= longest) & (before >= 0) & (after < frames)
+    return before, after
 
 
 def _kernel(sigma: float, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:

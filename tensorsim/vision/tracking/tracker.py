@@ -299,7 +299,8 @@ class GNNTracker(nn.Module):
         fair = (score >= self.detection_threshold) & (distance <= self.assignment_threshold)
         overlap = iou >= self.weak_iou
         alone = ~(contained(box[taken][:, None], box[None]) > 0.2).any(0)
-        alike = confirmed[:, None] & alone & (overlap | (contained(predicted, box[None]) >= 0.5))
+        recent = s.history[:, : self.confirm_window].any(-1)
+        alike = (confirmed & recent)[:, None] & alone & (overlap | (contained(predicted, box[None]) >= 0.5))
         second = assign(cost, left[:, None] & free & near & ((fair & overlap) | alike), 5.0)
         return torch.where(left, second, column)
 

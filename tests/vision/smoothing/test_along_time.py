@@ -6,6 +6,7 @@ import torch
 
 from tensorsim.vision.smoothing.along_time import (
     brief_gaps,
+    crossed_within,
     fill_gaps,
     local_linear,
     masked_median,
@@ -138,6 +139,17 @@ def test_brief_gaps_lie_between_seen_frames() -> None:
     expected = torch.tensor([[c == "b" for c in row] for row in brief])
     assert torch.equal(brief_gaps(seen, 2), expected)
     assert not brief_gaps(seen, 0).any()
+
+
+def test_a_gap_is_crossed_where_its_ends_are_near_enough() -> None:
+    seen = torch.tensor([c == "x" for c in ".xx...x..xx.x."])
+    # 4 m in four frames, 4 m in three, 1 m in two.
+    places = [9.0, 0.0, 1.0, 9.0, 9.0, 9.0, 5.0, 9.0, 9.0, 9.0, 9.0, 0.0, 8.0, 9.0]
+    position = torch.zeros(14, 2, dtype=torch.float64)
+    position[:, 1] = torch.tensor(places)
+    crossed = crossed_within(position, seen, 1.0)
+    assert "".join("c" if c else "." for c in (crossed & ~seen).tolist()) == "...ccc.....c.."
+    assert not crossed_within(position, torch.zeros_like(seen), 1.0).any()
 
 
 def test_only_ratios_of_weights_count() -> None:

@@ -260,6 +260,19 @@ def test_a_detection_of_just_the_faint_score_continues_a_track() -> None:
     assert not GNNTracker(faint_score=0.26)(detections).matched[..., 10:].any()
 
 
+@pytest.mark.parametrize(("gone", "people"), [(4, 1), (5, 2)])
+def test_a_faint_detection_does_not_continue_a_track_that_was_lost(gone: int, people: int) -> None:
+    """Somebody who left, and a mark on the wall around the place; later somebody else comes from the other side."""
+    person, mark = walker(300, 300, 60), walker(300, 300, 60, height=380)
+    seen = film([hidden(person, slice(20, 60))])
+    faint = film([hidden(hidden(mark, slice(0, 20 + gone)), slice(21 + gone, 60))], score=0.2)
+    other = film([hidden(walker(330, 330, 60), slice(0, 47))])
+    parts = zip(seen, faint, other, strict=True)
+    tracks = GNNTracker()(Detections(*(torch.cat(part, dim=2) for part in parts)))
+    assert bool(tracks.matched[0, :, 20 + gone].any()) == (people == 1)
+    assert tracks.boxes.shape[1] == people
+
+
 def test_one_person_detected_twice_is_one_person() -> None:
     person = walker(200, 500, 40)
     upper = person.clone()
