@@ -248,7 +248,19 @@ def test_nobody_runs_while_hidden(speed_m_s: float, there: bool) -> None:
     scores[:, :, gone] = 0.0
     pose = stage.lift(ts.Tracks(boxes, start.valid, start.valid), keypoints, scores, 240, 320, FPS)
     assert bool(pose.valid[:, :, gone].all()) == bool(pose.valid[:, :, gone].any()) == there
-    assert pose.valid[:, :, : gone.start].all() and pose.valid[:, :, gone.stop :].all()
+    assert pose.valid[:, :, : gone.start].all()
+    assert pose.valid[:, :, gone.stop :].all()
+
+
+@pytest.mark.parametrize(
+    ("good", "is_person"), [(slice(0, 11), True), (slice(0, 10), False), (slice(0, 60, 4), True)]
+)
+def test_a_person_is_seen_for_a_second_or_often(good: slice, is_person: bool) -> None:
+    """Of six seconds: somebody who falls and lies, furniture, somebody in the dark."""
+    scores = torch.full((1, 1, 60, 17), 0.4)
+    scores[:, :, good] = 0.8
+    stage = pipeline().video_to_pose
+    assert bool(stage.is_person(scores, torch.ones(1, 1, 60, dtype=torch.bool), FPS)) == is_person
 
 
 def test_a_track_that_shows_no_joint_is_nobody() -> None:

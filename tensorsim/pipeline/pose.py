@@ -301,12 +301,15 @@ class VideoToPose(nn.Module):
             scores.append(s)
         return torch.cat(keypoints), torch.cat(scores)
 
-    def is_person(self, scores: Tensor, valid: Tensor) -> Tensor:
-        """Whether the pose network sees a person in at least a quarter of the frames of a track.
+    def is_person(self, scores: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """Whether the pose network sees a person in a quarter of the frames of a track, or in a whole second.
+
+        Who falls and lies has low scores from then on, for most of a long film.
 
         Args:
             scores: (B, P, T, 17) of the key points.
             valid: (B, P, T) bool.
+            fps: frames per second.
 
         Returns:
             (B, P) bool.
@@ -314,7 +317,11 @@ class VideoToPose(nn.Module):
         seen = (scores >= self.keypoint_threshold).to(scores.dtype)
         mean = (scores * seen).sum(dim=-1) / seen.sum(dim=-1).clamp(min=1.0)
         good = valid & (mean >= self.least_score)
-        return 4 * good.sum(dim=-1) >= valid.sum(dim=-1).clamp(min=1)
+        often = 4 * good.sum(dim=-1) >= valid.sum(dim=-1).clamp(min=1)
+        second = int(fps) + 1
+        if good.shape[-1] < second:
+            return often
+        return often | good.unfold(-1, second, 1).all(dim=-1).any(dim=-1)
 
     def lift(
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
@@ -328,7 +335,7 @@ class VideoToPose(nn.Module):
         # A foot alone at the edge of the picture does not determine a pose: the smoother predicts such frames.
         usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
         usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
-        usable = usable & self.is_person(scores, tracks.valid).unsqueeze(-1)
+        usable = usable & self.is_person(scores, tracks.valid, fps).unsqueeze(-1)
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
             lifted = self.temporal.in_picture(found, body, body_scores, height, width)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.types import RadarMaps
@@ -13,6 +14,8 @@ from tensorsim.types import RadarMaps
 #: Length of the clips that the shipped networks were trained on.
 WINDOW_S = 4.0
 STEP_S = 1.0
+#: The label of a window in which nobody is.
+EMPTY = ACTIVITIES[0]
 #: The label of a window whose most probable class has less than the probability that is asked for.
 NOT_SURE = "not sure"
 
@@ -115,5 +118,9 @@ def _part(maps: RadarMaps, start: float, end: float) -> RadarMaps:
 
 
 def scene_probabilities(windows: list[Window]) -> Tensor:
-    """Mean probabilities (classes,) over the windows of a scene."""
-    return torch.tensor([window.probabilities for window in windows]).mean(0)
+    """Mean probabilities (classes,) over the windows of a scene that are not empty, or over all if all are empty.
+
+    Somebody who falls in the first second and is not seen any more has fallen.
+    """
+    occupied = [window for window in windows if window.label != EMPTY]
+    return torch.tensor([window.probabilities for window in occupied or windows]).mean(0)

@@ -7,7 +7,13 @@ from torch import Tensor, nn
 
 import tensorsim as ts
 from tensorsim.errors import TensorsimError
-from tensorsim.recognition.timeline import NOT_SURE, label_windows, scene_probabilities, window_starts
+from tensorsim.recognition.timeline import (
+    NOT_SURE,
+    Window,
+    label_windows,
+    scene_probabilities,
+    window_starts,
+)
 from tensorsim.results import label_of
 from tensorsim.types import RadarMaps
 
@@ -65,6 +71,13 @@ def test_each_window_sees_its_own_part() -> None:
     np.testing.assert_allclose(windows[3].probabilities, (0.5, 0.5), atol=0.02)
     means = np.mean([w.probabilities for w in windows], axis=0)
     np.testing.assert_allclose(scene_probabilities(windows).numpy(), means, atol=1e-6)
+
+
+def test_empty_windows_do_not_count_beside_others() -> None:
+    fell = Window(0.0, 4.0, "S12 Walking to Falling", (0.1, 0.2, 0.7))
+    gone = [Window(4.0 + k, 8.0 + k, "S1 Empty", (0.9, 0.1, 0.0)) for k in range(3)]
+    assert scene_probabilities([fell, *gone]).tolist() == pytest.approx(fell.probabilities)
+    assert scene_probabilities(gone).tolist() == pytest.approx(gone[0].probabilities)
 
 
 def test_a_short_scene_is_one_window() -> None:

@@ -58,10 +58,10 @@ class GNNTracker(nn.Module):
        decides where boxes do not overlap, plus the share of ``delete_window`` since the last match, as the covariance
        of a lost track admits much. A pair needs ``d^2 <= assignment_threshold``, centres within ``reach`` sizes and
        areas within a factor of 4; in the second pass also an IoU of ``weak_iou``, so that a lost person is not found
-       in a piece of furniture, and a detection that is no duplicate of a matched one. A confirmed track may there
-       take one of ``faint_score`` whatever d, also if one box covers half of the other, unless a fifth of it is
-       covered by a matched one: somebody who lies down is found badly, in a box of another shape. Any such pair is
-       better than none.
+       in a piece of furniture, and a detection that is no duplicate of a matched one. A confirmed track with a match
+       in the last ``confirm_window`` observed frames may there take one of ``faint_score`` whatever d, also if one
+       box covers half of the other, unless a fifth of it is covered by a matched one: somebody who lies down is found
+       badly, in a box of another shape. Any such pair is better than none.
     3. An unmatched detection of at least ``start_score`` starts a track, unless it overlaps a better or
        matched one by an IoU above ``duplicate_iou``, or with more than ``duplicate_part`` of its own area:
        one person detected twice.
@@ -78,7 +78,7 @@ class GNNTracker(nn.Module):
     Args:
         max_tracks: people at a time.
         confirm_hits: M of the M-of-N confirmation.
-        confirm_window: N of it, observed frames.
+        confirm_window: N of it, observed frames; for as long faint detections continue a track.
         delete_misses: P of the P-of-R deletion.
         delete_window: R of it, observed frames.
         assignment_threshold: largest squared Mahalanobis distance of a pair.
@@ -86,7 +86,8 @@ class GNNTracker(nn.Module):
         min_box_px: smallest width and height of a detection that counts.
         start_score: score from which a detection starts a track, and is matched without overlap.
         weak_iou: IoU with the predicted box that a detection of less needs.
-        faint_score: smallest score of a detection that continues a confirmed track; it counts for nothing else.
+        faint_score: smallest score of a detection that continues a confirmed track that was just matched; it counts
+            for nothing else.
         min_hits: detections of at least ``start_score`` from which a confirmed track is a person.
         process_noise: density of the acceleration noise, size^2 / frame^3.
         measurement_noise: variance of a detected coordinate, size^2.
