@@ -359,9 +359,9 @@ def label_of(
 ) -> dict[str, Any]:
     """What ``summary.json`` says of the activity.
 
-    ``label`` and ``probabilities`` (means over the windows that are not empty) are of the whole scene, ``timeline`` has
-    the label of each window of four seconds. None where there is no recognizer, or one that cannot see the speeds of
-    this radar.
+    ``timeline`` has the label of each window of four seconds; ``label`` and ``probabilities`` are of the whole scene,
+    see :func:`~tensorsim.recognition.timeline.scene_probabilities`. None where there is no recognizer, or one that
+    cannot see the speeds of this radar.
 
     Args:
         recognizer: of the radar of the maps.

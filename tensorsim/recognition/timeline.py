@@ -6,7 +6,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.types import RadarMaps
@@ -14,8 +13,6 @@ from tensorsim.types import RadarMaps
 #: Length of the clips that the shipped networks were trained on.
 WINDOW_S = 4.0
 STEP_S = 1.0
-#: The label of a window in which nobody is.
-EMPTY = ACTIVITIES[0]
 #: The label of a window whose most probable class has less than the probability that is asked for.
 NOT_SURE = "not sure"
 
@@ -27,12 +24,14 @@ class Window(NamedTuple):
         start_s, end_s: from the beginning of the maps.
         label: the most probable class, or :data:`NOT_SURE`.
         probabilities: of the classes of the recognizer, in their order.
+        power: mean power of the columns of the Doppler-time map.
     """
 
     start_s: float
     end_s: float
     label: str
     probabilities: tuple[float, ...]
+    power: float
 
 
 def window_starts(duration_s: float, window_s: float = WINDOW_S, step_s: float = STEP_S) -> list[float]:
@@ -78,7 +77,8 @@ def label_windows(
         best = int(probabilities.argmax())
         sure = float(probabilities[best]) >= least_probability
         label = recognizer.class_names[best] if sure else NOT_SURE
-        windows.append(Window(start_s, end_s, label, tuple(probabilities.tolist())))
+        power = float(part.doppler_time.double().square().sum(dim=-2).mean())
+        windows.append(Window(start_s, end_s, label, tuple(probabilities.tolist()), power))
     return windows
 
 
@@ -118,9 +118,12 @@ def _part(maps: RadarMaps, start: float, end: float) -> RadarMaps:
 
 
 def scene_probabilities(windows: list[Window]) -> Tensor:
-    """Mean probabilities (classes,) over the windows of a scene that are not empty, or over all if all are empty.
+    """Mean probabilities (classes,) over the windows of a scene, each as much as there is motion in it.
 
-    Somebody who falls in the first second and is not seen any more has fallen.
+    The picture of a window shows what is weak as bright as what is strong: somebody who stands still after an act, or
+    who fell and is not seen any more, says little of the scene.
     """
-    occupied = [window for window in windows if window.label != EMPTY]
-    return torch.tensor([window.probabilities for window in occupied or windows]).mean(0)
+    probabilities = torch.tensor([window.probabilities for window in windows])
+    power = torch.tensor([window.power for window in windows], dtype=torch.float64)
+    share = power / power.sum() if bool(power.sum() > 0) else torch.full_like(power, 1 / len(windows))
+    return (share.to(probabilities) @ probabilities).clamp(0.0, 1.0)

@@ -73,11 +73,15 @@ def test_each_window_sees_its_own_part() -> None:
     np.testing.assert_allclose(scene_probabilities(windows).numpy(), means, atol=1e-6)
 
 
-def test_empty_windows_do_not_count_beside_others() -> None:
-    fell = Window(0.0, 4.0, "S12 Walking to Falling", (0.1, 0.2, 0.7))
-    gone = [Window(4.0 + k, 8.0 + k, "S1 Empty", (0.9, 0.1, 0.0)) for k in range(3)]
-    assert scene_probabilities([fell, *gone]).tolist() == pytest.approx(fell.probabilities)
-    assert scene_probabilities(gone).tolist() == pytest.approx(gone[0].probabilities)
+def test_windows_count_by_the_power_of_their_motion() -> None:
+    fell, still = Window(0.0, 4.0, "fall", (0.1, 0.9), 3.0), Window(4.0, 8.0, "turn", (0.7, 0.3), 1.0)
+    assert scene_probabilities([fell, still]).tolist() == pytest.approx([0.25, 0.75])
+    nothing = [window._replace(power=0.0) for window in (fell, still)]
+    assert scene_probabilities(nothing).tolist() == pytest.approx([0.4, 0.6])
+    scene = maps(800, 400)
+    scene.doppler_time[:, 400:] *= 0.1
+    first, *_, last = label_windows(recognizer(), scene, 8.0)
+    assert (first.power, last.power) == pytest.approx((1.0, 0.01))
 
 
 def test_a_short_scene_is_one_window() -> None:
