@@ -2,8 +2,9 @@
 
 import csv
 import json
+import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,6 +37,8 @@ class EvaluateFilms(NetworkOptions):
     """How joints get their depths, as in `tensorsim simulate`."""
     stride: int = 1
     """Keep every n-th frame."""
+    whole: bool = False
+    """Label films from beginning to end, not only the seconds in which the activity happens."""
     variants: bool = False
     """Label each film in five variants as well (mirrored, shortened at either end, key points a little off), and print
     means over all six. It takes six times as long without the networks, which run once."""
@@ -71,6 +74,8 @@ class EvaluateFilms(NetworkOptions):
         films = read_labels(self.data)
         if self.only:
             films = [film for film in films if any(part in film.path.name for part in self.only)]
+        if self.whole:
+            films = [replace(film, start_s=0.0, end_s=math.inf) for film in films]
         if not films:
             raise TensorsimError(f"{self.data}: got no film to label, expected at least one")
         device = usable_device(self.device)

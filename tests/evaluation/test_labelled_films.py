@@ -105,6 +105,11 @@ def test_the_command_labels_films_and_runs_the_networks_once(
     assert CountingDetector.frames == seen, "kept in cache/"
     assert json.loads((out / "films.json").read_text()) == [walk]
 
+    cli.main([*arguments, "--only", "walk", "--whole"])
+    (whole,) = json.loads((out / "films.json").read_text())
+    assert whole["seconds"] == pytest.approx(2.0)
+    seen = CountingDetector.frames
+
     cli.main([*arguments, "--only", "walk", "--body", "surface"])
     assert CountingDetector.frames == seen
     (other,) = json.loads((out / "films.json").read_text())
