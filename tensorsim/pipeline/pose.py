@@ -112,7 +112,7 @@ class VideoToPose(nn.Module):
         self.brief_gap_s = brief_gap_s
         #: Who is hidden for longer is gone until they are seen again.
         self.longest_gap_s = 1.0
-        #: Nor does who is hidden for longer than ``brief_gap_s`` run meanwhile, in m/s.
+        #: Who would have moved faster while hidden, in m/s, is gone after ``brief_gap_s`` already.
         self.hidden_speed_m_s = 3.0
         #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
         self.noise_share = 0.03
@@ -302,9 +302,9 @@ class VideoToPose(nn.Module):
         return torch.cat(keypoints), torch.cat(scores)
 
     def is_person(self, scores: Tensor, valid: Tensor, fps: float) -> Tensor:
-        """Whether the pose network sees a person in a quarter of the frames of a track, or in a whole second.
+        """Whether the pose network sees a person in a quarter of the frames of a track, or for a second on end.
 
-        Who falls and lies has low scores from then on, for most of a long film.
+        Somebody who lies after a fall has low scores, perhaps for most of a long film.
 
         Args:
             scores: (B, P, T, 17) of the key points.
@@ -355,17 +355,16 @@ class VideoToPose(nn.Module):
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
-        placed = mid_hips(joints)
+        # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
+        hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
+        hidden = hidden & crossed_within(mid_hips(joints), usable, self.hidden_speed_m_s / fps)
+        there = usable | brief_gaps(usable, int(self.brief_gap_s * fps)) | hidden
         # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there
         # the joint of the matched pose replaces it, as long as the person is in the scene.
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
-        # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
-        hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
-        hidden = hidden & crossed_within(placed, usable, self.hidden_speed_m_s / fps)
-        there = usable | brief_gaps(usable, int(self.brief_gap_s * fps)) | hidden
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
 
 

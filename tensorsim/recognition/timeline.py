@@ -118,12 +118,12 @@ def _part(maps: RadarMaps, start: float, end: float) -> RadarMaps:
 
 
 def scene_probabilities(windows: list[Window]) -> Tensor:
-    """Mean probabilities (classes,) over the windows of a scene, each as much as there is motion in it.
+    """Mean probabilities (classes,) over the windows of a scene, weighted by their power; the plain mean if it is 0.
 
-    The picture of a window shows what is weak as bright as what is strong: somebody who stands still after an act, or
-    who fell and is not seen any more, says little of the scene.
+    The recognizer scales the picture of each window to its own peak, so that it does not see how weak an echo is. A
+    window in which somebody only stands still, or is gone after a fall, should say little of the scene.
     """
-    probabilities = torch.tensor([window.probabilities for window in windows])
+    probabilities = torch.tensor([window.probabilities for window in windows], dtype=torch.float64)
     power = torch.tensor([window.power for window in windows], dtype=torch.float64)
-    share = power / power.sum() if bool(power.sum() > 0) else torch.full_like(power, 1 / len(windows))
-    return (share.to(probabilities) @ probabilities).clamp(0.0, 1.0)
+    weights = power if bool(power.any()) else torch.ones_like(power)
+    return weights @ probabilities / weights.sum()

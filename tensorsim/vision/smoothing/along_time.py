@@ -38,7 +38,7 @@ def brief_gaps(seen: Tensor, longest: int) -> Tensor:
 
 
 def crossed_within(position: Tensor, seen: Tensor, step: float) -> Tensor:
-    """Frames (..., T) between seen ones that are at most ``step`` apart for each frame from one to the other.
+    """Frames (..., T) between two seen ones that can be reached from one another with at most ``step`` per frame.
 
     Args:
         position: (..., T, D), read where ``seen``.

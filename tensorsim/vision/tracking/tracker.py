@@ -78,7 +78,7 @@ class GNNTracker(nn.Module):
     Args:
         max_tracks: people at a time.
         confirm_hits: M of the M-of-N confirmation.
-        confirm_window: N of it, observed frames; for as long faint detections continue a track.
+        confirm_window: N of it, observed frames; also how recent the last match must be for ``faint_score``.
         delete_misses: P of the P-of-R deletion.
         delete_window: R of it, observed frames.
         assignment_threshold: largest squared Mahalanobis distance of a pair.
@@ -86,8 +86,8 @@ class GNNTracker(nn.Module):
         min_box_px: smallest width and height of a detection that counts.
         start_score: score from which a detection starts a track, and is matched without overlap.
         weak_iou: IoU with the predicted box that a detection of less needs.
-        faint_score: smallest score of a detection that continues a confirmed track that was just matched; it counts
-            for nothing else.
+        faint_score: smallest score of a detection that continues a confirmed, recently matched track; it counts for
+            nothing else.
         min_hits: detections of at least ``start_score`` from which a confirmed track is a person.
         process_noise: density of the acceleration noise, size^2 / frame^3.
         measurement_noise: variance of a detected coordinate, size^2.

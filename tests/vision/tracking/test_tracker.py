@@ -262,7 +262,7 @@ def test_a_detection_of_just_the_faint_score_continues_a_track() -> None:
 
 @pytest.mark.parametrize(("gone", "people"), [(4, 1), (5, 2)])
 def test_a_faint_detection_does_not_continue_a_track_that_was_lost(gone: int, people: int) -> None:
-    """Somebody who left, and a mark on the wall around the place; later somebody else comes from the other side."""
+    """Somebody leaves, a mark on the wall is taken for a person once, and later somebody else stands there."""
     person, mark = walker(300, 300, 60), walker(300, 300, 60, height=380)
     seen = film([hidden(person, slice(20, 60))])
     faint = film([hidden(hidden(mark, slice(0, 20 + gone)), slice(21 + gone, 60))], score=0.2)
