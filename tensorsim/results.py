@@ -102,28 +102,22 @@ class Pictures:
         return {"style": self.style, "subtitle": self.subtitle, "peak": peak, "note": note}
 
 
-def write_maps(
+def draw_maps(
     folder: Path,
     maps: RadarMaps,
     axes: Axes,
     truth: RadarMaps | None = None,
     pictures: Pictures = Pictures(),  # immutable
-    formats: Sequence[str] = ("npz",),
 ) -> None:
-    """Write ``maps.npz`` and a picture per map.
+    """Write a picture per map.
 
     Args:
         folder: where to.
         maps: on the CPU, without batch dimensions.
         axes: of the maps.
-        truth: maps of the true motion, of the same shapes: written to ``maps_truth.npz`` and beside the maps in
-            every picture.
+        truth: maps of the true motion, of the same shapes, drawn beside the others.
         pictures: how they are drawn.
-        formats: of the arrays, see :func:`~tensorsim.array_files.save_arrays`.
     """
-    save_maps(folder / "maps", maps, axes, formats)
-    if truth is not None:
-        save_maps(folder / "maps_truth", truth, axes, formats)
     for name, title in (
         ("range_time", "range-time map"),
         ("range_time_mti", "range-time map after moving target indication"),
@@ -169,7 +163,14 @@ def doppler_figure(
 
 
 def save_maps(path: Path, maps: RadarMaps, axes: Axes, formats: Sequence[str] = ("npz",)) -> None:
-    """Write maps and their axes; ``path`` has no suffix."""
+    """Write maps and their axes.
+
+    Args:
+        path: without a suffix.
+        maps: on the CPU, without batch dimensions.
+        axes: of the maps.
+        formats: see :func:`~tensorsim.array_files.save_arrays`.
+    """
     arrays = {
         "range_time": maps.range_time.numpy(),
         "range_time_mti": maps.range_time_mti.numpy(),
@@ -212,20 +213,22 @@ def write_doppler_sound(
     write_sound(folder / "doppler.wav", doppler_sound(signal.cpu(), stage.simulator.radar.prf_hz))
 
 
-def write_pose(
-    folder: Path, pose: Pose, fps: float, pictures: Pictures = Pictures(), formats: Sequence[str] = ("npz",)
-) -> None:
-    """Write ``pose.npz`` (and other formats) and a picture of the skeletons in the world."""
-    joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
+def save_pose(folder: Path, pose: Pose, fps: float, formats: Sequence[str] = ("npz",)) -> None:
+    """Write ``pose.npz``, or the same in other formats (:func:`~tensorsim.array_files.save_arrays`)."""
     arrays: dict[str, np.ndarray | float] = {
-        "joints_m": joints,
+        "joints_m": pose.joints[0].numpy(),
         "keypoints_px": pose.keypoints[0].numpy(),
         "keypoint_scores": pose.keypoint_scores[0].numpy(),
         "boxes_px": pose.boxes[0].numpy(),
-        "valid": valid,
+        "valid": pose.valid[0].numpy(),
         "fps": fps,
     }
     save_arrays(folder / "pose", arrays, formats)
+
+
+def draw_pose(folder: Path, pose: Pose, fps: float, pictures: Pictures) -> None:
+    """Write a picture of the skeletons in the world."""
+    joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
     figure = plot.skeleton_figure(joints, valid, fps, subtitle=pictures.subtitle)
     plot.save_figure(figure, folder / f"skeleton.{pictures.suffix}")
 

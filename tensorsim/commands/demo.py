@@ -59,7 +59,7 @@ class Demo(NetworkOptions, RadarOptions):
 
         from tensorsim import results
         from tensorsim.config import ACTIVITIES, SmoothingConfig
-        from tensorsim.data.video import VideoReader
+        from tensorsim.data.video import KEPT_MB, VideoReader
         from tensorsim.data.video_writer import write_video
         from tensorsim.device import usable_device
         from tensorsim.files import complete_or_nothing
@@ -82,7 +82,7 @@ class Demo(NetworkOptions, RadarOptions):
             people = VideoToPose.from_config(config, *networks).to(device)
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
-                source = film_source(VideoReader(folder / "film.mp4"), people, device)
+                source = film_source(VideoReader(folder / "film.mp4", kept_mb=KEPT_MB), people, device)
                 simulated = results.simulated(source, maps_stage, folder, config, device, self.quiet)
                 with simulated as (seen, maps, strip):
                     pose = seen.pose

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tensorsim.exceptions import TensorsimError
 
-Engine = Literal["onnxruntime", "bfloat16", "int8", "torch"]
+Engine = Literal["onnxruntime", "openvino", "int8", "torch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +24,8 @@ class NetworkOptions:
     """Show the pose network every person mirrored as well: better, at twice the cost."""
     engine: Engine = "onnxruntime"
     """What runs the networks on the processor. ONNX Runtime takes half the time of torch, with networks that it exports
-    once to the user's cache; "int8" has the pose network in 8-bit integers there, "bfloat16" has it in torch in that
-    precision, for processors with instructions for it. Both are faster and less exact. On a GPU it is always torch."""
+    once to the user's cache. Faster and less exact: "openvino" (pip install openvino) has the pose network in bfloat16
+    on processors with instructions for it, "int8" in 8-bit integers. On a GPU it is always torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:

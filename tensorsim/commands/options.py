@@ -4,6 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -183,12 +184,20 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         pose, maps, stage = run.pose, run.maps, run.stage
         label = results.label_of(run.recognizer, maps, pose.valid.shape[2] / run.fps, self.least_probability)
         warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()))
-        pictures, formats = (
-            self.pictures(stage, label["label"], run.film, run.somebody),
-            array_formats(self.save),
-        )
-        results.write_maps(folder, maps, results.axes_of(stage, maps), truth, pictures, formats)
-        results.write_pose(folder, pose, run.fps, pictures, formats)
+        pictures = self.pictures(stage, label["label"], run.film, run.somebody)
+        axes, formats = results.axes_of(stage, maps), array_formats(self.save)
+
+        def save() -> None:
+            results.save_maps(folder / "maps", maps, axes, formats)
+            if truth is not None:
+                results.save_maps(folder / "maps_truth", truth, axes, formats)
+            results.save_pose(folder, pose, run.fps, formats)
+
+        with ThreadPoolExecutor(1) as pool:
+            saved = pool.submit(save)
+            results.draw_maps(folder, maps, axes, truth, pictures)
+            results.draw_pose(folder, pose, run.fps, pictures)
+            saved.result()
         if self.sound:
             results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
         return label

@@ -196,7 +196,7 @@ class Simulate(NetworkOptions, RadarOptions):
         from torch import nn
 
         from tensorsim import sources
-        from tensorsim.data.video import VideoReader
+        from tensorsim.data.video import KEPT_MB, VideoReader
         from tensorsim.pipeline import VideoToPose
 
         cut = sources.Cut(self.start, self.end, self.stride)
@@ -218,7 +218,12 @@ class Simulate(NetworkOptions, RadarOptions):
         )
         config = config.replace(tracking__detector=str(detector), pose__network=str(pose))
         reader = VideoReader(
-            self.source, fps=self.fps, start_s=self.start, end_s=self.end, stride=self.stride
+            self.source,
+            fps=self.fps,
+            start_s=self.start,
+            end_s=self.end,
+            stride=self.stride,
+            kept_mb=KEPT_MB,
         )
         networks = load_networks(detector, pose, config.pose.flip_test, self.engine)
         stage = VideoToPose.from_config(config, *networks).to(device)

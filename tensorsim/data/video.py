@@ -17,6 +17,8 @@ from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.limits import RANGES, check_range
 from tensorsim.threads import ahead
 
+#: Memory for the frames of a film that is passed over several times: enough for 12 s of 720p at 30 frames per second.
+KEPT_MB = 1000.0
 #: A file that announces so many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
 
@@ -51,6 +53,8 @@ class VideoReader:
         fps: frames per second of the film, instead of those that the file announces.
         start_s, end_s: keep the frames from ``start_s`` on that are before ``end_s``, in seconds of the film.
         stride: keep every stride-th of them.
+        kept_mb: a film whose frames fit into so many megabytes stays in memory after the first pass, and is not decoded
+            again for passes in chunks of the same size or a divisor of it.
 
     Attributes:
         path: of the file.
@@ -81,6 +85,7 @@ class VideoReader:
         start_s: float | None = None,
         end_s: float | None = None,
         stride: int = 1,
+        kept_mb: float = 0.0,
     ) -> None:
         self.path = Path(path)
         start_s = 0.0 if start_s is None else start_s
@@ -121,6 +126,8 @@ class VideoReader:
         self.frame_count = (
             None if announced is None else max(1, -(-(self._stop(announced) - self._first) // stride))
         )
+        self._most_kept = int(kept_mb * 1e6 / frame.nbytes)
+        self._kept: list[Tensor] = []
 
     def chunks(self, size: int) -> Iterator[Tensor]:
         """The frames in order, at most ``size`` at a time: (n, 3, H, W) uint8 RGB on the CPU, n >= 1, channels last.
@@ -136,7 +143,10 @@ class VideoReader:
         """
         if size < 1:
             raise TensorsimError(f"chunks: got a size of {size} frames, expected 1 or more")
-        return ahead(self._chunks(size))
+        if self._kept and self._kept[0].shape[0] % size == 0:
+            return (part for chunk in self._kept for part in chunk.split(size))
+        fits = self.frame_count is not None and self.frame_count <= self._most_kept
+        return ahead(self._keeping(size) if fits else self._chunks(size))
 
     def even_chunks(self, size: int) -> Iterator[Tensor]:
         """As :meth:`chunks`; of a film whose ``uneven_times_s`` are known, the frames nearest to even times.
@@ -153,6 +163,19 @@ class VideoReader:
             for part in here.split(size):
                 yield frames[part]
             done += frames.shape[0]
+
+    def _keeping(self, size: int) -> Generator[Tensor, None, None]:
+        """The chunks, which are kept once the pass has come to its end."""
+        kept: list[Tensor] = []
+        count = 0
+        for chunk in self._chunks(size):
+            count += chunk.shape[0]
+            if count > self._most_kept:  # more than the file announces
+                kept.clear()
+            else:
+                kept.append(chunk)
+            yield chunk
+        self._kept = kept
 
     def _chunks(self, size: int) -> Generator[Tensor, None, None]:
         import cv2

@@ -1,33 +1,28 @@
-"""What runs the networks on a processor: ONNX Runtime, torch in bfloat16, or torch as it is."""
-
-from collections.abc import Callable
-from functools import partial
+"""What runs the networks on a processor: ONNX Runtime, OpenVINO, or torch."""
 
 from torch import nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.vision.bfloat16 import Bfloat16Pose
 from tensorsim.vision.detection.rtmdet import RTMDet
-from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose
+from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose, Runtime
 from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
-#: What runs a heat-map network in the place of torch, by engine.
-_POSE_BY: dict[str, Callable[[nn.Module], nn.Module]] = {
-    "onnxruntime": OnnxPose,
-    "bfloat16": Bfloat16Pose,
-    "int8": partial(OnnxPose, int8=True),
+#: What runs the detector and what the pose network, by engine. Boxes would move in integers.
+_RUNTIMES: dict[str, tuple[Runtime, Runtime]] = {
+    "onnxruntime": ("onnxruntime", "onnxruntime"),
+    "openvino": ("openvino", "openvino-bfloat16"),
+    "int8": ("onnxruntime", "int8"),
 }
-ENGINES = (*_POSE_BY, "torch")
+ENGINES = (*_RUNTIMES, "torch")
 
 
 def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.Module]:
     """The same two stages with their networks run by an engine, as far as they are of this package.
 
     Args:
-        engine: ``"torch"`` changes nothing. The others run the detector in ONNX Runtime in float32, as its boxes would
-            move otherwise, and the pose network in ONNX Runtime in float32 (``"onnxruntime"``) or in 8-bit integers
-            (``"int8"``), or in torch in bfloat16 (``"bfloat16"``).
+        engine: ``"onnxruntime"`` runs both in float32; ``"int8"`` the pose network in 8-bit integers; ``"openvino"``
+            the pose network in bfloat16 on processors with instructions for it; ``"torch"`` changes nothing.
         detector, pose: the stages; networks inside of ``pose`` are replaced.
 
     Raises:
@@ -37,10 +32,11 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
         raise TensorsimError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
     if engine == "torch":
         return detector, pose
+    of_detector, of_pose = _RUNTIMES[engine]
     if isinstance(detector, RTMDet):
-        detector = OnnxDetector(detector).eval()
+        detector = OnnxDetector(detector, of_detector).eval()
     if isinstance(pose, TopDownPose):
         holder = pose.network if isinstance(pose.network, FlipTest) else pose
-        if not isinstance(holder.network, OnnxFile | OnnxPose | Bfloat16Pose):
-            holder.network = _POSE_BY[engine](holder.network).eval()
+        if not isinstance(holder.network, OnnxFile | OnnxPose):
+            holder.network = OnnxPose(holder.network, of_pose).eval()
     return detector, pose

@@ -1,75 +1,92 @@
-"""Networks of this package in ONNX Runtime, which joins convolutions with what follows them: twice as fast on a CPU.
+"""Networks of this package in ONNX Runtime or OpenVINO, which join convolutions with what follows them.
 
 A network is exported once and kept in the user's cache, by its class, its weights and torch's version. The pose network
-also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), in ranges that crops of rendered people have.
+also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), in ranges that crops of rendered people have, or, in
+OpenVINO, in bfloat16.
 """
 
 import hashlib
 import io
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
-from threading import Lock
-from typing import Any
+from threading import Lock, local
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.geometry.boxes import LETTERBOX_GREY, letterbox_size
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
 
-#: Held while a session is opened: parts of a film come in several threads, and the exporter stands only one.
+#: Held while a network is opened: parts of a film come in several threads, and the exporter stands only one.
 _OPENING = Lock()
+
+#: What runs a network: in float32 but for ``"int8"`` (ONNX Runtime, 8-bit integers) and ``"openvino-bfloat16"``.
+Runtime = Literal["onnxruntime", "int8", "openvino", "openvino-bfloat16"]
+Images = npt.NDArray[np.float32]
+#: Images (N, 3, H, W) to outputs (N, ...).
+Run = Callable[[Images], list[Images]]
 
 
 class OnnxEngine(nn.Module):
-    """Runs a network (N, 3, H, W) -> one or several tensors (N, ...) in ONNX Runtime on the CPU, elsewhere as it is.
+    """Runs a network (N, 3, H, W) -> one or several tensors (N, ...) in another runtime on the CPU, elsewhere as it is.
 
-    Float32, without gradients; answers agree to rounding (1e-5 of the largest).
+    Without gradients. In float32 answers agree to rounding (1e-5 of the largest), in bfloat16 and in 8-bit integers,
+    for crops of people in [0, 1], to about 5 % of the largest. Bfloat16 is for processors with instructions for it; on
+    others OpenVINO computes in float32.
 
     Args:
         network: with static shapes but for N; it is put into evaluation mode.
         size: (H, W).
-        int8: in 8-bit integers: pictures are crops of people in [0, 1], and answers are those of the network to about
-            5 % of the largest.
+        runtime: what runs it.
 
     Raises:
-        TensorsimError: no ONNX Runtime.
+        TensorsimError: the runtime is not installed.
     """
 
-    def __init__(self, network: nn.Module, size: tuple[int, int], int8: bool = False) -> None:
+    def __init__(self, network: nn.Module, size: tuple[int, int], runtime: Runtime = "onnxruntime") -> None:
         super().__init__()
+        package = "openvino" if runtime.startswith("openvino") else "onnxruntime"
+        if find_spec(package) is None:
+            raise TensorsimError(
+                f"--engine {package}: it is not installed, expected `pip install {package}` before"
+            )
         # The exporter leaves a network in the mode that it says it is in, parts included.
-        self.network, self.size, self.int8 = network.eval(), size, int8
-        self._session: Any = None
+        self.network, self.size, self.runtime = network.eval(), size, runtime
+        self.threads = torch.get_num_threads()
+        self._run: Run | None = None
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """The outputs of the network, flat."""
         if images.device.type != "cpu" or images.dtype != torch.float32 or images.shape[0] == 0:
             return _flat(self.network(images))
         with _OPENING:
-            if self._session is None:
-                self._session = _session(self.network, self.size, self.int8)
-        found = self._session.run(None, {"images": images.contiguous().numpy()})
-        return [torch.from_numpy(output) for output in found]
+            if self._run is None:
+                self._run = _opened(self.network, self.size, self.runtime, self.threads)
+        return [torch.from_numpy(output) for output in self._run(images.contiguous().numpy())]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_session": None}
+        return {**self.__dict__, "_run": None}
 
 
 class OnnxPose(nn.Module):
     """A heat-map network of this package behind its own interface, run by an :class:`OnnxEngine`."""
 
-    def __init__(self, network: nn.Module, int8: bool = False) -> None:
+    def __init__(self, network: nn.Module, runtime: Runtime = "onnxruntime") -> None:
         super().__init__()
         self.input_size: tuple[int, int] = getattr(network, "input_size", (256, 192))
         self.stride = getattr(network, "stride", 4)
-        self.engine = OnnxEngine(network, self.input_size, int8)
+        self.engine = OnnxEngine(network, self.input_size, runtime)
 
     def forward(self, crops: Tensor) -> Tensor:
         """Crops (N, 3, H, W) to heat maps (N, 17, h, w)."""
@@ -79,10 +96,10 @@ class OnnxPose(nn.Module):
 class OnnxDetector(nn.Module):
     """An :class:`~tensorsim.vision.RTMDet` whose dense part is run by an :class:`OnnxEngine`."""
 
-    def __init__(self, detector: RTMDet) -> None:
+    def __init__(self, detector: RTMDet, runtime: Runtime = "onnxruntime") -> None:
         super().__init__()
         self.detector = detector
-        self.engine = OnnxEngine(_Dense(detector), (detector.input_size, detector.input_size))
+        self.engine = OnnxEngine(_Dense(detector), (detector.input_size, detector.input_size), runtime)
 
     def forward(self, images: Tensor) -> Detections:
         """Images (B, 3, H, W) to detections, see :class:`~tensorsim.vision.RTMDet`."""
@@ -118,24 +135,32 @@ def _flat(outputs: Any) -> list[Tensor]:
     return [outputs] if isinstance(outputs, Tensor) else list(outputs)
 
 
-def _session(network: nn.Module, size: tuple[int, int], int8: bool) -> Any:
-    """The session of a network, from the user's cache or exported now."""
-    path = _cached(network, size, int8)
+def _opened(network: nn.Module, size: tuple[int, int], runtime: Runtime, threads: int) -> Run:
+    """A network in its runtime, from the user's cache or exported now."""
+
+    path = _cached(network, size, runtime == "int8")
+
+    def run(model: bytes) -> Run:
+        if runtime.startswith("openvino"):
+            cache = path.parent if path.is_file() else None
+            return _in_openvino(model, threads, runtime == "openvino-bfloat16", cache)
+        return _in_onnxruntime(model)
+
     if path.is_file():
         try:
-            return _opened(path.read_bytes())
-        except Exception:  # damaged; the runtime's own exceptions share no base class
+            return run(path.read_bytes())
+        except Exception:  # damaged; the runtimes' own exceptions share no base class
             path.unlink(missing_ok=True)
-    data = _exported(network, size)
-    if int8:
+    model = _exported(network, size)
+    if runtime == "int8":
         from tensorsim.render.crops import rendered_crops
         from tensorsim.vision.quantise import quantised
 
-        data = quantised(data, rendered_crops(size))
+        model = quantised(model, rendered_crops(size))
     # A cache that cannot be written costs an export in every run.
     with suppress(OSError), complete_file(path) as scratch:
-        scratch.write_bytes(data)
-    return _opened(data)
+        scratch.write_bytes(model)
+    return run(model)
 
 
 def _cached(network: nn.Module, size: tuple[int, int], int8: bool) -> Path:
@@ -167,15 +192,36 @@ def _exported(network: nn.Module, size: tuple[int, int]) -> bytes:
     return file.getvalue()
 
 
-def _opened(data: bytes) -> Any:
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise TensorsimError(
-            f"--engine onnxruntime: it cannot be imported ({error}), expected it installed: pip install onnxruntime"
-        ) from error
+def _in_onnxruntime(model: bytes) -> Run:
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     # Threads that spin while others work slow those down.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    return lambda images: session.run(None, {"images": images})
+
+
+def _in_openvino(model: bytes, threads: int, bfloat16: bool, cache: Path | None) -> Run:
+    import openvino
+
+    bfloat16 = bfloat16 and multiplies_bfloat16(torch.device("cpu"))
+    core = openvino.Core()
+    settings: dict[str, Any] = {
+        "INFERENCE_PRECISION_HINT": "bf16" if bfloat16 else "f32",
+        # One thread for each of those that call.
+        "NUM_STREAMS": threads,
+        "INFERENCE_NUM_THREADS": threads,
+    }
+    if cache is not None:  # compiled networks, which take a third of the time to open
+        settings["CACHE_DIR"] = str(cache)
+    compiled = core.compile_model(core.read_model(model), "CPU", settings)
+    of_thread = local()
+
+    def run(images: Images) -> list[Images]:
+        if not hasattr(of_thread, "request"):
+            of_thread.request = compiled.create_infer_request()
+        return list(of_thread.request.infer({0: images}, share_inputs=True).values())
+
+    return run

@@ -46,8 +46,8 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (results, "maps_of_pose", "radar"),
     (results, "label_of", "label"),
     (results, "write_overlay", "overlay"),
-    (results, "write_maps", "maps: pictures"),
-    (results, "write_pose", "poses: picture"),
+    (results, "draw_maps", "maps: pictures"),
+    (results, "draw_pose", "poses: picture"),
     (results, "save_arrays", "writing arrays"),
     (RadarOptions, "write_report", "report"),
 )

@@ -29,7 +29,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("films", type=Path, nargs="*")
-    parser.add_argument("--engines", nargs="+", default=["onnxruntime", "bfloat16", "int8"])
+    parser.add_argument("--engines", nargs="+", default=["onnxruntime", "openvino", "int8"])
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:

@@ -500,3 +500,30 @@ def test_a_full_disk_is_noticed(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kept_mb", [0.0, 1.0])
+def test_films_that_fit_into_memory_are_decoded_once(
+    clip: Path, kept_mb: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = VideoReader(clip, kept_mb=kept_mb)  # 20 frames, 0.18 MB
+    expected = read(clip)
+    next(reader.chunks(8))  # a pass that ends early keeps nothing
+    assert torch.equal(torch.cat(list(reader.chunks(8))), expected)
+    decoded = []
+    chunks = VideoReader._chunks
+    monkeypatch.setattr(VideoReader, "_chunks", lambda *given: decoded.append(given) or chunks(*given))
+    assert [len(chunk) for chunk in reader.chunks(4)] == [4] * 5
+    assert torch.equal(torch.cat(list(reader.even_chunks(8))), expected)
+    assert len(decoded) == (0 if kept_mb else 2)
+    # In chunks that do not fit into those that are kept, it is decoded again.
+    assert [len(chunk) for chunk in reader.chunks(6)] == [6, 6, 6, 2]
+    assert torch.equal(torch.cat(list(reader.chunks(3))), expected)
+
+
+def test_films_with_more_frames_than_announced_are_not_kept(clip: Path) -> None:
+    reader = VideoReader(clip, kept_mb=10 * HEIGHT * WIDTH * 3 / 1e6)
+    assert len(torch.cat(list(reader.chunks(4)))) == 20
+    reader.frame_count = 10
+    for _ in range(2):
+        assert len(torch.cat(list(reader.chunks(5)))) == 20

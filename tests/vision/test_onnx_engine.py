@@ -1,16 +1,19 @@
-"""Networks in ONNX Runtime answer as in torch, for any number of images, and are exported once."""
+"""Networks in ONNX Runtime and OpenVINO answer as in torch, for any number of images, and are exported once."""
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 import tensorsim as ts
+from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.render.crops import rendered_crops
 from tensorsim.vision import onnx_engine
-from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose
+from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose, Runtime
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 
 
@@ -23,28 +26,30 @@ def exported(tmp_path: Path) -> list[Path]:
     return sorted((tmp_path / "hub" / "tensorsim" / "engines").glob("*.onnx"))
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 @torch.no_grad()
-def test_pose_network_answers_as_in_torch_and_is_exported_once(tmp_path: Path) -> None:
+def test_pose_network_answers_as_in_torch_and_is_exported_once(tmp_path: Path, runtime: Runtime) -> None:
     network = ts.vision.HRNet.from_pretrained()
     crops = torch.rand(3, 3, *network.input_size)
     for _ in range(2):
-        found = OnnxPose(network)(crops)
+        found = OnnxPose(network, runtime)(crops)
         assert torch.allclose(found, network(crops), atol=1e-4)
         assert len(exported(tmp_path)) == 1
-    assert OnnxPose(network)(crops[:0]).shape[0] == 0
-    again = pickle.loads(pickle.dumps(OnnxPose(network)))
+    assert OnnxPose(network, runtime)(crops[:0]).shape[0] == 0
+    again = pickle.loads(pickle.dumps(OnnxPose(network, runtime)))
     assert torch.allclose(again(crops[:1]), found[:1], atol=1e-5)
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 @torch.no_grad()
-def test_detector_answers_as_in_torch() -> None:
+def test_detector_answers_as_in_torch(runtime: Runtime) -> None:
     detector = ts.vision.RTMDet.from_pretrained()
     images = torch.randint(0, 256, (2, 3, 90, 160), dtype=torch.uint8)
-    ours, expected = OnnxDetector(detector)(images), detector(images)
+    ours, expected = OnnxDetector(detector, runtime)(images), detector(images)
     assert torch.equal(ours.valid, expected.valid)
     dense = detector.preprocess(images)
     logits, distances = detector.dense(dense)
-    for found, wanted in zip(OnnxDetector(detector).engine(dense), logits + distances, strict=True):
+    for found, wanted in zip(OnnxDetector(detector, runtime).engine(dense), logits + distances, strict=True):
         assert float((found - wanted).abs().max()) < 1e-4 * float(wanted.abs().max())
 
 
@@ -63,7 +68,7 @@ def test_pictures_are_prepared_to_the_bit_as_in_torch(shape: tuple[int, int]) ->
 
 def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -> None:
     with torch.no_grad():
-        network = torch.nn.Conv2d(3, 4, 3).eval()
+        network = nn.Conv2d(3, 4, 3).eval()
         images = torch.rand(2, 3, 8, 9)
         OnnxEngine(network, (8, 9))(images)
         network.bias.add_(1.0)
@@ -76,10 +81,42 @@ def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -
         assert OnnxEngine(network, (8, 9))(images.double().float())[0].dtype == torch.float32
 
 
-def test_without_the_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
-    with pytest.raises(TensorsimError, match="--engine onnxruntime: it cannot be imported"):
-        onnx_engine._opened(b"")
+@pytest.mark.parametrize(
+    ("runtime", "package"),
+    [("onnxruntime", "onnxruntime"), ("openvino-bfloat16", "openvino")],
+)
+def test_without_the_library_it_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, runtime: Runtime, package: str
+) -> None:
+    monkeypatch.setattr(onnx_engine, "find_spec", lambda _: None)
+    with pytest.raises(TensorsimError, match=f"--engine {package}: it is not installed"):
+        OnnxPose(nn.Identity(), runtime)
+
+
+@torch.no_grad()
+def test_openvino_answers_several_threads_at_a_time() -> None:
+    network = ts.vision.HRNet.from_pretrained()
+    crops = torch.rand(6, 3, *network.input_size)
+    engine = OnnxPose(network, "openvino")
+    with ThreadPoolExecutor(3) as pool:
+        found = torch.cat(list(pool.map(engine, crops.split(1))))
+    assert torch.allclose(found, network(crops), atol=1e-4)
+
+
+@torch.no_grad()
+def test_in_bfloat16_key_points_stay_where_they_are() -> None:
+    network = ts.vision.HRNet.from_pretrained()
+    crops = rendered_crops(network.input_size, people=3, seed=100)
+    plain, found = network(crops), OnnxPose(network, "openvino-bfloat16")(crops)
+    off = float((found - plain).abs().max()) / float(plain.abs().max())
+    assert off < 0.05
+    # On processors without instructions for bfloat16 it is in float32.
+    assert (off > 1e-4) == multiplies_bfloat16(torch.device("cpu"))
+    decode = HeatmapDecoder()
+    (expected, scores), (points, _) = decode(plain), decode(found)
+    away = (points - expected).norm(dim=-1)[scores > 0.3]
+    assert away.median() < 0.1
+    assert away.quantile(0.98) < 0.5
 
 
 @torch.no_grad()
@@ -87,7 +124,7 @@ def test_in_8_bits_key_points_stay_where_they_are(tmp_path: Path) -> None:
     network = ts.vision.HRNet.from_pretrained()
     # Other people than those whose ranges were taken.
     crops = rendered_crops(network.input_size, people=2, seed=100)
-    plain, small = network(crops), OnnxPose(network, int8=True)(crops)
+    plain, small = network(crops), OnnxPose(network, "int8")(crops)
     decode = HeatmapDecoder()
     (expected, scores), (found, _) = decode(plain), decode(small)
     away = (found - expected).norm(dim=-1)[scores > 0.3]
