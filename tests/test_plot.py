@@ -78,7 +78,13 @@ def test_skeleton_figure_shows_only_people_who_are_there() -> None:
     figure = plot.skeleton_figure(joints, valid, 10.0, poses=3)
     labels = [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
     assert labels == ["person 1, 0.2 to 0.7 s", "radar"]
-    assert len(figure.axes[0].lines) == 3 * len(plot.BODY_BONES) + 1
+    *poses, way = figure.axes[0].lines
+    assert len(way.get_data_3d()[0]) == 6
+    assert len(poses) == 3
+    for pose, frame in zip(poses, (2, 4, 7), strict=True):
+        bones = np.stack(pose.get_data_3d(), axis=-1).reshape(-1, 3, 3)
+        assert np.isnan(bones[:, 2]).all(), "bones are apart from each other"
+        assert np.array_equal(bones[:, :2], joints[0, frame][np.array(plot.BODY_BONES)])
 
 
 def test_ridges_are_hidden_where_dots_would_cover_the_map() -> None:

@@ -64,7 +64,7 @@ def skeleton_figure(
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low)
     for scale, label, spacing in (
-        (axes.xaxis, "x", 0.5),
+        (axes.xaxis, "x", 0.5 if high[0] - low[0] < 4.0 else 1.0),
         (axes.yaxis, "y (range)", 1.0),
         (axes.zaxis, "z", 0.5),
     ):
@@ -95,13 +95,9 @@ def _draw_person(
     labelled = np.full((1, 3), np.inf)
     for k, frame in enumerate(chosen):
         shade = 0.35 + 0.65 * (k + 1) / chosen.size
-        for a, b in BODY_BONES:
-            axes.plot(
-                *zip(joints[frame, a], joints[frame, b], strict=True),
-                color=colour,
-                alpha=shade,
-                linewidth=1.8,
-            )
+        # One line that NaN interrupts after each bone: many lines take long to draw.
+        bones = np.pad(joints[frame][np.array(BODY_BONES)], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        axes.plot(*bones.reshape(-1, 3).T, color=colour, alpha=shade, linewidth=1.8)
         top = joints[frame, 0] + (0, 0, 0.15)
         # Somebody who stays in place has the times of all poses in the legend only.
         if (np.linalg.norm(labelled - top, axis=1) > 0.4).all():
