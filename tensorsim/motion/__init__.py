@@ -1,5 +1,6 @@
 """Joints at video rate -> scatterers at pulse rate."""
 
+from tensorsim.body.gait import boulic_gait
 from tensorsim.body.skeleton import body_to_coco
 from tensorsim.motion.activities import ActivityGenerator, GeneratedMotion, activity_index
 from tensorsim.motion.body13 import Body13Scatterers
@@ -12,7 +13,6 @@ from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.motion.shadowing import Shadowing
 from tensorsim.motion.sway import PosturalSway
 from tensorsim.motion.vital_signs import VitalSigns
-from tensorsim.motion.walking import boulic_gait
 
 __all__ = [
     "ActivityGenerator",

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tensorsim.body.gait import Gait, boulic_gait, cycle_s
 from tensorsim.body.kinematics import BodyPose
 from tensorsim.motion.feet import tread
 from tensorsim.motion.people import People
-from tensorsim.motion.walking import Gait, boulic_gait, cycle_s
 
 _DEGREE = math.pi / 180
 Pair = tuple[Tensor | float, Tensor | float]

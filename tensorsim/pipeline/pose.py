@@ -12,6 +12,7 @@ from tensorsim.errors import TensorsimError, check_positive, check_rank, check_r
 from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
+from tensorsim.vision.lifting.hidden_legs import HiddenLegs
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -106,6 +107,7 @@ class VideoToPose(nn.Module):
         self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
+        self.hidden_legs = HiddenLegs()
         self.keypoint_threshold = keypoint_threshold
         self.detection_interval = detection_interval
         self.fewest_joints = fewest_joints
@@ -364,7 +366,10 @@ class VideoToPose(nn.Module):
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
-        joints = limit_speed(self.smoother(joints, measured, fps, noise), fps, self.top_speed_m_s)
+        joints = self.smoother(joints, measured, fps, noise)
+        if self.temporal is not None:  # a matched pose has legs of its own
+            joints = self.hidden_legs(joints, reliable, there, fps)
+        joints = limit_speed(joints, fps, self.top_speed_m_s)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
 
 

@@ -1,5 +1,6 @@
 """The temporal lifter inside the pipeline: scripted, for another camera, by its configuration."""
 
+import math
 from typing import cast
 
 import pytest
@@ -7,7 +8,11 @@ import torch
 from torch import Tensor, nn
 
 import tensorsim as ts
+from tensorsim.body.kinematics import rotation
+from tensorsim.body.skeleton import body_to_coco, mid_hips
 from tensorsim.config import CameraConfig
+from tensorsim.geometry.camera import camera_to_world, project
+from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.pipeline import VideoToPose
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -29,8 +34,8 @@ class Lifting(nn.Module):
         return joints
 
 
-def stage_with(lifter: nn.Module | None) -> VideoToPose:
-    camera = CameraConfig(focal_px=500.0)
+def stage_with(lifter: nn.Module | None, focal_px: float = 500.0) -> VideoToPose:
+    camera = CameraConfig(focal_px=focal_px)
     # What stands before the lifting is not used here, but is scripted along.
     return VideoToPose(
         ts.vision.RTMDet("nano-person"),
@@ -91,6 +96,30 @@ def test_the_shipped_lifter_raises_arms_where_they_are() -> None:
     assert float((raised - 1.75 * (0.288 + 0.332 * 0.416)).abs().max()) < 0.2
     forward = found.joints[0, 15, [4, 7], 1].abs()  # about straight ahead or behind
     assert float(forward.min()) > 0.2
+
+
+def test_legs_below_the_picture_step() -> None:
+    """Somebody walks across in front of the camera, which sees no knee: the ankles swing as those of the truth do."""
+    walk = ActivityGenerator().generate("walking", seed=1, duration_s=1.6, rate_hz=30.0).joints[0]
+    walk = walk @ rotation(2, torch.tensor(-math.pi / 2, dtype=torch.float64)).mT
+    walk = walk - mid_hips(walk)[24] + walk.new_tensor([0.0, 2.0, 0.9])
+    camera = CameraConfig(focal_px=420.0)
+    keypoints, _ = project(body_to_coco(walk).float(), 420.0, (319.5, 179.5), camera_to_world(camera).float())
+    inside = ((keypoints >= 0) & (keypoints < torch.tensor([640.0, 360.0]))).all(dim=-1)
+    assert inside[:, :13].all()
+    assert not inside[:, 13:].any()
+    low, high = keypoints.amin(dim=1), keypoints.amax(dim=1)
+    boxes = torch.cat([low - 10, (high + 10).minimum(torch.tensor([639.0, 359.0]))], dim=-1)
+    arguments = keypoints[None, None], 0.9 * inside[None, None], boxes[None, None], torch.ones(1, 1, 48) > 0
+    stage = stage_with(TemporalLifter.from_pretrained(None, camera, (1.75,)).double(), 420.0)
+    with torch.no_grad():
+        found = Lifting(stage)(*arguments)[0, 0]
+
+    def top_speed(joints: Tensor) -> float:
+        ankles = joints[15:-15, [10, 13]]
+        return float((ankles[1:] - ankles[:-1]).norm(dim=-1).amax() * 30.0)
+
+    assert top_speed(found) == pytest.approx(top_speed(walk), rel=0.2)
 
 
 def test_nobody_is_lifted() -> None:

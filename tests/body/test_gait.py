@@ -8,8 +8,8 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
+from tensorsim.body.gait import boulic_gait, cycle_s, pelvis_roll, periodic_pchip, stance_share
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.walking import boulic_gait, cycle_s, pelvis_roll, periodic_pchip, stance_share
 
 FIELDS = ("hip", "knee", "ankle", "shoulder", "elbow", "trunk", "pelvis", "translation")
 

@@ -1,0 +1,154 @@
+"""Legs beyond the edge of the picture: whoever moves along walks, though no camera sees the steps."""
+
+import math
+from typing import Final
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from tensorsim.body.gait import boulic_gait
+from tensorsim.body.skeleton import mid_hips
+from tensorsim.errors import TensorsimError, check_points, check_positive
+from tensorsim.vision.smoothing.along_time import local_linear
+
+#: Harmonics of the angles of a gait cycle.
+_HARMONICS = 8
+#: Relative speeds of the table of gaits: 0.1, 0.2, ... leg lengths per second.
+_SPEEDS, _PER_SPEED = 25, 10.0
+
+
+class HiddenLegs(nn.Module):
+    """Gives legs that nobody sees the steps of a gait at the speed of the hips.
+
+    A lifter knows nothing of the phase of legs beyond the picture, and gives them the mean of all phases: they hang
+    without a swing, and the radar would see somebody glide. Where neither knees nor ankles are seen and the hips of an
+    upright body move forwards or backwards, thighs and shanks turn as in the gait of Boulic, Magnenat-Thalmann and
+    Thalmann (1990, :func:`tensorsim.body.gait.boulic_gait`), whose cadence follows from the speed; the phase is
+    arbitrary. Bones keep their lengths but for half a second at both ends, where old and new legs are blended.
+
+    Args:
+        slow_m_s, walking_m_s: speeds of the hips below which nothing is changed and from which all is a gait.
+        blend_s: seconds for which legs are hidden before they begin to step, and over which they come to do so.
+
+    Shape:
+        joints (..., T, 14, 3) in metres, z up, seen (..., T, 14) bool, valid (..., T) bool, frames per second ->
+        joints (..., T, 14, 3). Differentiable.
+
+    Raises:
+        TensorsimError: speeds that are not positive or not ascending, wrong shapes, NaN, no frames.
+    """
+
+    cosines: Tensor
+    sines: Tensor
+    harmonics: Final[int]
+    speeds: Final[int]
+    per_speed: Final[float]
+
+    def __init__(self, slow_m_s: float = 0.3, walking_m_s: float = 0.6, blend_s: float = 0.25) -> None:
+        super().__init__()
+        check_positive(slow_m_s, "HiddenLegs.slow_m_s")
+        check_positive(blend_s, "HiddenLegs.blend_s")
+        if walking_m_s <= slow_m_s:
+            raise TensorsimError(f"HiddenLegs.walking_m_s: got {walking_m_s}, expected more than {slow_m_s}")
+        self.slow_m_s, self.walking_m_s, self.blend_s = slow_m_s, walking_m_s, blend_s
+        self.harmonics, self.speeds, self.per_speed = _HARMONICS, _SPEEDS, _PER_SPEED
+        relative_speed = torch.arange(1, _SPEEDS + 1, dtype=torch.float64) / _PER_SPEED
+        phase = torch.arange(64, dtype=torch.float64).expand(_SPEEDS, -1) / 64
+        gait = boulic_gait(relative_speed, phase)
+        # Flexion of the right hip and knee (speeds, angles, harmonics).
+        series = torch.fft.rfft(torch.stack([gait.hip[..., 0], gait.knee[..., 0]], dim=1)) / 64
+        series = series[..., : _HARMONICS + 1] * torch.tensor([1.0] + [2.0] * _HARMONICS)
+        self.register_buffer("cosines", series.real.contiguous(), persistent=False)
+        self.register_buffer("sines", -series.imag.contiguous(), persistent=False)
+
+    def forward(self, joints: Tensor, seen: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """Joints, which of them are seen, frames with a person, frame rate -> joints."""
+        check_points(joints, 3, 14, 3, "joints", "(..., T, 14, 3) metres")
+        for name, mask, shape in (("seen", seen, joints.shape[:-1]), ("valid", valid, joints.shape[:-2])):
+            if mask.dtype != torch.bool or list(mask.shape) != list(shape):
+                raise TensorsimError(
+                    f"{name}: got {mask.dtype} of shape {list(mask.shape)}, expected bool of shape {list(shape)}"
+                )
+        check_positive(fps, "fps")
+        if joints.numel() == 0:
+            return joints
+        hips = mid_hips(joints)
+        velocity = self._velocity(hips[..., :2], valid, fps)
+        speed = velocity.square().sum(dim=-1).clamp(min=1e-12).sqrt()
+        # Which way the body faces: a quarter turn from its right side, of hips and shoulders.
+        right = joints[..., 8, :2] - joints[..., 11, :2] + joints[..., 2, :2] - joints[..., 5, :2]
+        facing = F.normalize(torch.stack([-right[..., 1], right[..., 0]], dim=-1), dim=-1, eps=1e-6)
+        forwards = (velocity * facing).sum(dim=-1) / speed
+        trunk = joints[..., 1, :] - hips
+        upright = trunk[..., 2] / trunk.square().sum(dim=-1).clamp(min=1e-6).sqrt()
+        hidden = valid & ~(seen[..., 9:11].any(dim=-1) | seen[..., 12:14].any(dim=-1))
+        share = hidden.to(joints.dtype)
+        share = share * ((speed - self.slow_m_s) / (self.walking_m_s - self.slow_m_s)).clamp(0.0, 1.0)
+        # Nobody steps sideways as they walk, nor who bends down or lies.
+        share = (
+            share * ((forwards.abs() - 0.4) / 0.3).clamp(0.0, 1.0) * ((upright - 0.7) / 0.15).clamp(0.0, 1.0)
+        )
+        share = self._blended(share, fps)[..., None]
+
+        way = torch.where(forwards < 0, -1.0, 1.0).to(joints.dtype)
+        ahead = F.pad(velocity / speed[..., None] * way[..., None], [0, 1])
+        down = torch.tensor([0.0, 0.0, -1.0], dtype=joints.dtype, device=joints.device)
+        parts: list[Tensor] = []
+        for hip in (8, 11):
+            thigh = torch.linalg.vector_norm(joints[..., hip + 1, :] - joints[..., hip, :], dim=-1)
+            shank = torch.linalg.vector_norm(joints[..., hip + 2, :] - joints[..., hip + 1, :], dim=-1)
+            relative_speed = speed / (thigh + shank).clamp(min=0.1)
+            cycles = way * relative_speed.clamp(min=0.1).sqrt() / (1.346 * fps)  # per frame
+            phase = torch.cumsum(cycles, dim=-1) + (0.0 if hip == 8 else 0.5)
+            bend, knee = self._angles(relative_speed, phase)
+            upper = thigh[..., None] * (
+                torch.sin(bend)[..., None] * ahead + torch.cos(bend)[..., None] * down
+            )
+            turned = bend - knee
+            lower = torch.sin(turned)[..., None] * ahead + torch.cos(turned)[..., None] * down
+            at_knee = joints[..., hip, :] + upper
+            at_ankle = at_knee + shank[..., None] * lower
+            parts.append(joints[..., hip + 1, :] + share * (at_knee - joints[..., hip + 1, :]))
+            parts.append(joints[..., hip + 2, :] + share * (at_ankle - joints[..., hip + 2, :]))
+        legs = torch.stack(parts, dim=-2)
+        return torch.cat(
+            [joints[..., :9, :], legs[..., :2, :], joints[..., 11:12, :], legs[..., 2:, :]], dim=-2
+        )
+
+    def _velocity(self, position: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """Velocity (..., T, 2) of positions (..., T, 2), over half a second."""
+        frames = position.shape[-2]
+        weights = valid.to(position.dtype) + 1e-6
+        smooth = torch.stack(
+            [local_linear(position[..., axis], weights, 0.2 * fps) for axis in range(2)], dim=-1
+        )
+        time = torch.arange(frames, device=position.device)
+        half = max(int(0.25 * fps), 1)
+        before, after = (time - half).clamp(min=0), (time + half).clamp(max=frames - 1)
+        seconds = ((after - before).to(position.dtype) / fps).clamp(min=1e-3)
+        return (smooth.index_select(-2, after) - smooth.index_select(-2, before)) / seconds[:, None]
+
+    def _blended(self, share: Tensor, fps: float) -> Tensor:
+        """The smallest share (..., T) nearby, and the mean of that: zero wherever it was, and steady."""
+        half = max(int(self.blend_s * fps), 1)
+        rows = share.reshape(-1, 1, share.shape[-1])
+        least = -F.max_pool1d(-rows, 2 * half + 1, 1, half)
+        return F.avg_pool1d(least, 2 * half + 1, 1, half, count_include_pad=False).reshape(share.shape)
+
+    def _angles(self, relative_speed: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Flexion (...) of a hip and a knee in radians at relative speeds and phases (...)."""
+        place = (relative_speed * self.per_speed - 1.0).clamp(0.0, self.speeds - 1.001)
+        row = place.detach().floor()
+        rest = (place - row)[..., None]
+        number = torch.arange(self.harmonics + 1, device=phase.device, dtype=phase.dtype)
+        turn = 2 * math.pi * phase[..., None] * number
+        cos, sin = torch.cos(turn), torch.sin(turn)
+        low = row.long()
+        found: list[Tensor] = []
+        for angle in range(2):
+            a, b = self.cosines[:, angle].to(phase.dtype), self.sines[:, angle].to(phase.dtype)
+            even = a[low] + rest * (a[low + 1] - a[low])
+            odd = b[low] + rest * (b[low + 1] - b[low])
+            found.append((even * cos + odd * sin).sum(dim=-1))
+        return found[0], found[1]

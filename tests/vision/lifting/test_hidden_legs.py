@@ -1,0 +1,140 @@
+"""Hidden legs: they step as those of the gait model do, and all that is seen, or does not walk, stays as it is."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tensorsim.body.gait import boulic_gait
+from tensorsim.body.kinematics import rotation
+from tensorsim.errors import TensorsimError
+from tensorsim.motion.activities import ActivityGenerator
+from tensorsim.vision.lifting.hidden_legs import HiddenLegs
+from tests.stage import StageTester
+
+FPS = 30.0
+LEGS = [9, 10, 12, 13]
+
+
+def generated(activity: str, heading_deg: float = 0.0, seed: int = 3) -> Tensor:
+    """Joints (T, 14, 3) of a generated person."""
+    joints = ActivityGenerator().generate(activity, seed=seed, duration_s=4.0, rate_hz=FPS).joints[0].double()
+    return joints @ rotation(2, torch.tensor(math.radians(heading_deg), dtype=torch.float64)).mT
+
+
+def hanging(joints: Tensor) -> Tensor:
+    """The same people with straight legs below their hips, as a lifter gives those that it knows nothing of."""
+    legs = joints.clone()
+    for hip in (8, 11):
+        for number, below in ((1, 0.42), (2, 0.82)):
+            legs[..., hip + number, :] = joints[..., hip, :] - below * joints.new_tensor([0.0, 0.0, 1.0])
+    return legs
+
+
+def masks(joints: Tensor, hidden: bool = True) -> tuple[Tensor, Tensor]:
+    """Which joints are seen, all but knees and ankles, and that people are there throughout."""
+    seen = torch.ones(joints.shape[:-1], dtype=torch.bool)
+    seen[..., LEGS] = not hidden
+    return seen, torch.ones(joints.shape[:-2], dtype=torch.bool)
+
+
+def speeds(joints: Tensor) -> Tensor:
+    """Speeds (T - 1, 2) of the ankles in m/s."""
+    return (joints[1:, [10, 13]] - joints[:-1, [10, 13]]).norm(dim=-1) * FPS
+
+
+class TestHiddenLegs(StageTester):
+    batched_arguments = (0, 1, 2)
+    gradient_arguments = (0,)
+
+    def make(self) -> nn.Module:
+        return HiddenLegs()
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        generator = torch.Generator().manual_seed(0)
+        walk = hanging(generated("walking"))[:40].to(dtype)
+        noise = torch.randn(*batch, *walk.shape, generator=generator, dtype=dtype)
+        joints = walk + 0.01 * noise
+        return joints, *masks(joints), FPS
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        joints, seen, valid, fps = self.inputs((), torch.float32)
+        return [
+            ((joints[..., :13, :], seen, valid, fps), "14"),
+            ((joints, seen[..., :13], valid, fps), "seen"),
+            ((joints, seen, valid.float(), fps), "valid"),
+            ((joints, seen, valid, 0.0), "fps"),
+        ]
+
+
+@pytest.mark.parametrize("heading", [0.0, 70.0, 200.0])
+def test_hidden_legs_step_as_true_ones(heading: float) -> None:
+    """Feet swing as fast, and one of them stands meanwhile, as the cadence belongs to the speed."""
+    walk = generated("walking", heading)
+    hung = hanging(walk)
+    legs = HiddenLegs()(hung, *masks(walk), FPS)
+    inner = slice(20, -20)  # blended at the ends
+    assert torch.equal(legs[:, [0, 1, 2, 3, 4, 5, 6, 7, 8, 11]], walk[:, [0, 1, 2, 3, 4, 5, 6, 7, 8, 11]])
+    true, found, glide = (speeds(joints[inner]) for joints in (walk, legs, hung))
+    assert found.amax() == pytest.approx(float(true.amax()), rel=0.1)
+    assert float(glide.amax()) < 0.5 * float(true.amax())
+    assert float(found.amin(dim=-1).median()) < 0.3 < 0.7 < float(glide.amin(dim=-1).median())
+    for first, second in ((8, 9), (9, 10), (11, 12), (12, 13)):
+        bone = (legs[inner, first] - legs[inner, second]).norm(dim=-1)
+        torch.testing.assert_close(bone, (hung[inner, first] - hung[inner, second]).norm(dim=-1))
+
+
+def test_backwards_knees_bend_forwards_still() -> None:
+    walk = hanging(generated("walking")).flip(0)
+    legs = HiddenLegs()(walk, *masks(walk), FPS)[20:-20]
+    right = (legs[:, 8] - legs[:, 11])[:, :2]
+    facing = torch.nn.functional.normalize(torch.stack([-right[:, 1], right[:, 0]], dim=-1), dim=-1)
+    for hip in (8, 11):
+        middle = (legs[:, hip, :2] + legs[:, hip + 2, :2]) / 2
+        assert float(((legs[:, hip + 1, :2] - middle) * facing).sum(dim=-1).amin()) > -0.02
+
+
+@pytest.mark.parametrize("activity", ["punching", "sitting down", "grabbing", "rotating"])
+def test_who_stays_does_not_step(activity: str) -> None:
+    still = hanging(generated(activity))
+    torch.testing.assert_close(HiddenLegs()(still, *masks(still), FPS), still)
+
+
+def test_only_hidden_legs_of_those_who_walk_ahead_change() -> None:
+    walk = generated("walking")
+    legs, (seen, valid) = HiddenLegs(), masks(walk)
+    assert torch.equal(legs(walk, *masks(walk, hidden=False), FPS), walk)
+    assert torch.equal(legs(walk, seen, torch.zeros_like(valid), FPS), walk)
+    lying = walk @ rotation(0, torch.tensor(math.pi / 2, dtype=torch.float64)).mT
+    assert torch.equal(legs(lying, seen, valid, FPS), lying)
+    middle = walk[:, [8, 11]].mean(dim=1, keepdim=True)
+    sideways = (walk - middle) @ rotation(2, torch.tensor(math.pi / 2, dtype=torch.float64)).mT + middle
+    assert torch.equal(legs(sideways, seen, valid, FPS), sideways)
+    # Legs that are hidden for a moment are left to the lifter; seen ones are, up to the frame beside hidden ones.
+    briefly = torch.ones_like(seen)
+    briefly[40:54, LEGS] = False
+    assert torch.equal(legs(walk, briefly, valid, FPS), walk)
+    half = torch.ones_like(seen)
+    half[60:, LEGS] = False
+    found = legs(walk, half, valid, FPS)
+    assert torch.equal(found[:60], walk[:60])
+    assert not torch.equal(found[80:], walk[80:])
+    assert float(speeds(found).amax()) < 1.3 * float(speeds(walk).amax())
+
+
+def test_angles_are_those_of_the_gait_model() -> None:
+    phase = torch.linspace(0, 2, 101, dtype=torch.float64)
+    for relative_speed in (0.4, 1.25, 2.0):
+        gait = boulic_gait(torch.tensor(relative_speed, dtype=torch.float64), phase)
+        hip, knee = HiddenLegs()._angles(torch.full_like(phase, relative_speed), phase)
+        assert float((hip - gait.hip[..., 0]).abs().amax()) < math.radians(1.0)
+        assert float((knee - gait.knee[..., 0]).abs().amax()) < math.radians(2.5)
+
+
+def test_refuses_speeds_out_of_order() -> None:
+    with pytest.raises(TensorsimError, match="walking_m_s"):
+        HiddenLegs(slow_m_s=0.6, walking_m_s=0.5)
+    with pytest.raises(TensorsimError, match="slow_m_s"):
+        HiddenLegs(slow_m_s=0.0)
