@@ -1,8 +1,8 @@
 """Networks of this package in ONNX Runtime or OpenVINO, which join convolutions with what follows them.
 
-A network is exported once and kept in the user's cache, by its class, its weights and torch's version. The pose network
-also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), in ranges that crops of rendered people have, or, in
-OpenVINO, in bfloat16.
+A network is exported once and kept in the user's cache, by its class, its weights, and the versions of torch and of
+this package. The pose network also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), in ranges that crops of
+rendered people have, or, in OpenVINO, in bfloat16.
 """
 
 import hashlib
@@ -10,6 +10,7 @@ import io
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock, local
@@ -166,7 +167,8 @@ def _opened(network: nn.Module, size: tuple[int, int], runtime: Runtime, threads
 def _cached(network: nn.Module, size: tuple[int, int], int8: bool) -> Path:
     from tensorsim.registry import cache_dir
 
-    digest = hashlib.sha256(f"{network!r} {size} {int8} {torch.__version__}".encode())
+    versions = f"{torch.__version__} {version('tensorsim')}"
+    digest = hashlib.sha256(f"{network!r} {size} {int8} {versions}".encode())
     for name, value in network.state_dict().items():
         digest.update(name.encode())
         digest.update(value.cpu().contiguous().numpy().tobytes())

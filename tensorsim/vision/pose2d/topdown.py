@@ -78,7 +78,8 @@ class TopDownPose(nn.Module):
             none.
         crops_per_batch: how many crops the network gets at once.
         stand_up: whoever leans by more than 45 degrees is looked at again, turned by quarter turns to stand upright,
-            and the keypoints with the higher mean score are kept: networks have seen few people who lie.
+            and the keypoints with the higher mean score are kept: networks have seen few people who lie. Shoulders and
+            hips must be seen: half a person, whose hips are beyond the picture, seems to lean at random.
 
     Raises:
         TensorsimError: arguments out of range; ranks or batch sizes that do not fit; integer boxes; valid boxes that
@@ -110,6 +111,7 @@ class TopDownPose(nn.Module):
         self.decoder = decode
         self.crops_per_batch = crops_per_batch
         self.stand_up = stand_up
+        self.least_trunk_score = 0.3  # of a shoulder and a hip, for a lean to be believed
         self.keypoints = len(COCO_KEYPOINTS)
 
     def forward(self, images: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,8 +177,9 @@ class TopDownPose(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Keypoints and scores of boxes, after a second look at those who lean."""
         turns = quarter_turns(points)
+        trunk = torch.minimum(scores[:, 5:7].amax(-1), scores[:, 11:13].amax(-1)) >= self.least_trunk_score
         for turn in range(1, 4):
-            lean = (turns == turn).nonzero()[:, 0]
+            lean = (trunk & (turns == turn)).nonzero()[:, 0]
             if lean.shape[0] > 0:
                 turned, heights = self.look(images, boxes[lean], index[lean], turn)
                 better = heights[:, 5:].mean(-1) > scores[lean, 5:].mean(-1)
