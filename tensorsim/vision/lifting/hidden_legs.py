@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.body.gait import boulic_gait
+from tensorsim.body.gait import boulic_gait, cycle_s
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.errors import TensorsimError, check_points, check_positive
 from tensorsim.vision.smoothing.along_time import local_linear
@@ -36,23 +36,22 @@ class HiddenLegs(nn.Module):
         joints (..., T, 14, 3). Differentiable.
 
     Raises:
-        TensorsimError: speeds that are not positive or not ascending, wrong shapes, NaN, no frames.
+        TensorsimError: speeds that are not positive or not ascending, wrong shapes, NaN.
     """
 
     cosines: Tensor
     sines: Tensor
-    harmonics: Final[int]
-    speeds: Final[int]
     per_speed: Final[float]
 
     def __init__(self, slow_m_s: float = 0.3, walking_m_s: float = 0.6, blend_s: float = 0.25) -> None:
         super().__init__()
         check_positive(slow_m_s, "HiddenLegs.slow_m_s")
+        check_positive(walking_m_s, "HiddenLegs.walking_m_s")
         check_positive(blend_s, "HiddenLegs.blend_s")
         if walking_m_s <= slow_m_s:
             raise TensorsimError(f"HiddenLegs.walking_m_s: got {walking_m_s}, expected more than {slow_m_s}")
         self.slow_m_s, self.walking_m_s, self.blend_s = slow_m_s, walking_m_s, blend_s
-        self.harmonics, self.speeds, self.per_speed = _HARMONICS, _SPEEDS, _PER_SPEED
+        self.per_speed = _PER_SPEED
         relative_speed = torch.arange(1, _SPEEDS + 1, dtype=torch.float64) / _PER_SPEED
         phase = torch.arange(64, dtype=torch.float64).expand(_SPEEDS, -1) / 64
         gait = boulic_gait(relative_speed, phase)
@@ -85,7 +84,7 @@ class HiddenLegs(nn.Module):
         hidden = valid & ~(seen[..., 9:11].any(dim=-1) | seen[..., 12:14].any(dim=-1))
         share = hidden.to(joints.dtype)
         share = share * ((speed - self.slow_m_s) / (self.walking_m_s - self.slow_m_s)).clamp(0.0, 1.0)
-        # Nobody steps sideways as they walk, nor who bends down or lies.
+        # Whoever moves sideways, bends down or lies does not walk.
         share = (
             share * ((forwards.abs() - 0.4) / 0.3).clamp(0.0, 1.0) * ((upright - 0.7) / 0.15).clamp(0.0, 1.0)
         )
@@ -94,21 +93,19 @@ class HiddenLegs(nn.Module):
         way = torch.where(forwards < 0, -1.0, 1.0).to(joints.dtype)
         ahead = F.pad(velocity / speed[..., None] * way[..., None], [0, 1])
         down = torch.tensor([0.0, 0.0, -1.0], dtype=joints.dtype, device=joints.device)
+        upper = joints[..., 8:13:3, :] - joints[..., 9:14:3, :]  # hips to knees, right and left
+        lower = joints[..., 9:14:3, :] - joints[..., 10:14:3, :]
+        thighs, shanks = torch.linalg.vector_norm(upper, dim=-1), torch.linalg.vector_norm(lower, dim=-1)
+        # Both legs have one cadence, however long each of them seems.
+        relative_speed = speed / (thighs + shanks).mean(dim=-1).clamp(min=0.1)
+        cycles = torch.cumsum(way / (cycle_s(relative_speed.clamp(min=0.1)) * fps), dim=-1)
         parts: list[Tensor] = []
-        for hip in (8, 11):
-            thigh = torch.linalg.vector_norm(joints[..., hip + 1, :] - joints[..., hip, :], dim=-1)
-            shank = torch.linalg.vector_norm(joints[..., hip + 2, :] - joints[..., hip + 1, :], dim=-1)
-            relative_speed = speed / (thigh + shank).clamp(min=0.1)
-            cycles = way * relative_speed.clamp(min=0.1).sqrt() / (1.346 * fps)  # per frame
-            phase = torch.cumsum(cycles, dim=-1) + (0.0 if hip == 8 else 0.5)
-            bend, knee = self._angles(relative_speed, phase)
-            upper = thigh[..., None] * (
-                torch.sin(bend)[..., None] * ahead + torch.cos(bend)[..., None] * down
-            )
-            turned = bend - knee
-            lower = torch.sin(turned)[..., None] * ahead + torch.cos(turned)[..., None] * down
-            at_knee = joints[..., hip, :] + upper
-            at_ankle = at_knee + shank[..., None] * lower
+        for side in range(2):
+            hip, thigh, shank = 8 + 3 * side, thighs[..., side, None], shanks[..., side, None]
+            flexion = self._angles(relative_speed, cycles + 0.5 * side)
+            bend, turned = flexion[..., :1], flexion[..., :1] - flexion[..., 1:]
+            at_knee = joints[..., hip, :] + thigh * (torch.sin(bend) * ahead + torch.cos(bend) * down)
+            at_ankle = at_knee + shank * (torch.sin(turned) * ahead + torch.cos(turned) * down)
             parts.append(joints[..., hip + 1, :] + share * (at_knee - joints[..., hip + 1, :]))
             parts.append(joints[..., hip + 2, :] + share * (at_ankle - joints[..., hip + 2, :]))
         legs = torch.stack(parts, dim=-2)
@@ -119,10 +116,9 @@ class HiddenLegs(nn.Module):
     def _velocity(self, position: Tensor, valid: Tensor, fps: float) -> Tensor:
         """Velocity (..., T, 2) of positions (..., T, 2), over half a second."""
         frames = position.shape[-2]
-        weights = valid.to(position.dtype) + 1e-6
-        smooth = torch.stack(
-            [local_linear(position[..., axis], weights, 0.2 * fps) for axis in range(2)], dim=-1
-        )
+        rows = position.transpose(-1, -2)
+        weights = (valid.to(position.dtype) + 1e-6).unsqueeze(-2).expand_as(rows)
+        smooth = local_linear(rows, weights, 0.2 * fps).transpose(-1, -2)
         time = torch.arange(frames, device=position.device)
         half = max(int(0.25 * fps), 1)
         before, after = (time - half).clamp(min=0), (time + half).clamp(max=frames - 1)
@@ -136,19 +132,15 @@ class HiddenLegs(nn.Module):
         least = -F.max_pool1d(-rows, 2 * half + 1, 1, half)
         return F.avg_pool1d(least, 2 * half + 1, 1, half, count_include_pad=False).reshape(share.shape)
 
-    def _angles(self, relative_speed: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """Flexion (...) of a hip and a knee in radians at relative speeds and phases (...)."""
-        place = (relative_speed * self.per_speed - 1.0).clamp(0.0, self.speeds - 1.001)
-        row = place.detach().floor()
-        rest = (place - row)[..., None]
-        number = torch.arange(self.harmonics + 1, device=phase.device, dtype=phase.dtype)
-        turn = 2 * math.pi * phase[..., None] * number
-        cos, sin = torch.cos(turn), torch.sin(turn)
-        low = row.long()
-        found: list[Tensor] = []
-        for angle in range(2):
-            a, b = self.cosines[:, angle].to(phase.dtype), self.sines[:, angle].to(phase.dtype)
-            even = a[low] + rest * (a[low + 1] - a[low])
-            odd = b[low] + rest * (b[low + 1] - b[low])
-            found.append((even * cos + odd * sin).sum(dim=-1))
-        return found[0], found[1]
+    def _angles(self, relative_speed: Tensor, phase: Tensor) -> Tensor:
+        """Flexion of a hip and a knee (..., 2) in radians at relative speeds and phases (...)."""
+        last = self.cosines.shape[0] - 1
+        place = (relative_speed * self.per_speed - 1.0).clamp(0.0, float(last))
+        row = place.detach().long().clamp(max=last - 1)
+        rest = (place - row)[..., None, None]
+        number = torch.arange(self.cosines.shape[-1], device=phase.device, dtype=phase.dtype)
+        turn = 2 * math.pi * phase[..., None, None] * number
+        a, b = self.cosines.to(phase.dtype), self.sines.to(phase.dtype)
+        even = a[row] + rest * (a[row + 1] - a[row])
+        odd = b[row] + rest * (b[row + 1] - b[row])
+        return (even * torch.cos(turn) + odd * torch.sin(turn)).sum(dim=-1)
