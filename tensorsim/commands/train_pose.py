@@ -31,6 +31,7 @@ class TrainPose(PeopleOptions):
             nearer to those of films.
         second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
             agree with the labels, they put them right and add the face.
+        presence: train nothing but the head of the HRNet in --init that tells which keypoints are in the picture.
     """
 
     data: Path
@@ -44,6 +45,7 @@ class TrainPose(PeopleOptions):
     learning_rate: float = 2e-3
     augmentation: Literal["full", "mild"] = "full"
     second_labels: Path | None = None
+    presence: bool = False
 
     def run(self) -> None:
         """Do it."""
@@ -58,10 +60,13 @@ class TrainPose(PeopleOptions):
             read_people,
         )
         from tensorsim.training.pose_data import MILD_AUGMENTATION, Augmentation, RenderedPeople
+        from tensorsim.training.presence import PresenceRecipe, with_presence_head
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 
         check_positive(self.learning_rate, "--learning-rate")
+        if self.presence and (self.init is None or self.network != "hrnet"):
+            raise TensorsimError("--presence: got no --init of an HRNet, whose keypoints it is about")
         if self.first_steps > 0 and (min(self.first_size) < 32 or any(side % 32 for side in self.first_size)):
             raise TensorsimError(f"--first-size: got {self.first_size}, expected (H, W), multiples of 32")
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=500)
@@ -69,21 +74,32 @@ class TrainPose(PeopleOptions):
         net: HRNet | TrainedCPM
         if self.network == "cpm":
             net = TrainedCPM(3, self.size, 32 if self.width is None else self.width)
+            self.begin(net)
+        elif self.init is not None:
+            net = HRNet.from_pretrained(self.init, input_size=self.size)
+            if self.width is not None and self.width != net.config.width:
+                raise TensorsimError(
+                    f"{self.init}: got width {net.config.width}, expected --width {self.width}"
+                )
         else:
             width = 24 if self.width is None else self.width
-            small = HRNetConfig(width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32)
-            net = HRNet(small, self.size)
-        self.begin(net)
+            net = HRNet(HRNetConfig(width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)
         persons = read_people(self.data, self.second_labels)
         cutouts = self.rendered_people()
         rendered = None
         if cutouts is not None:
             rendered = RenderedPeople(cutouts, Shards(find_shards(self.data, "backgrounds")))
         held_out = held_out_people(self.data)
+        validation = {"coco": some(held_out["COCO, large"]), "lspet": some(held_out["LSPE, upright"])}
+        if self.presence and isinstance(net, HRNet):
+            net = with_presence_head(net)
+            head = PresenceRecipe(net, persons, validation, self.seed, self.learning_rate)
+            self.train(head, loop)
+            return
         recipe = PoseRecipe(
             net,
             persons,
-            {"coco": some(held_out["COCO, large"]), "lspet": some(held_out["LSPE, upright"])},
+            validation,
             rendered,
             seed=self.seed,
             learning_rate=self.learning_rate,

@@ -316,9 +316,12 @@ class PoseRecipe(Recipe):
         """OKS and PCK of every held-out group."""
         figures = {name: evaluate_pose(net, persons) for name, persons in self.validation.items()}
         score = sum(figure["oks"] for figure in figures.values()) / max(len(figures), 1)
-        return {f"{name}_{k}": v for name, figure in figures.items() for k, v in figure.items()} | {
-            "score": score
-        }
+        return by_group(figures) | {"score": score}
+
+
+def by_group(figures: dict[str, dict[str, float]]) -> dict[str, float]:
+    """The figures of groups of people, in one table."""
+    return {f"{name}_{k}": v for name, figure in figures.items() for k, v in figure.items()}
 
 
 def _weights(persons: Sequence[Person]) -> npt.NDArray[np.float64]:

@@ -6,7 +6,7 @@ that :class:`~tensorsim.vision.pose2d.crops.BoxCrop` gives for the person's box.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,6 +79,7 @@ class Augmentation:
         lay: probability that a person is laid on a side after it.
         half: probability that only the upper or the lower body is cropped.
         cut: probability that the picture ends within the person, mostly below.
+        repeat: probability that the edges of the picture are repeated beyond it, instead of black.
     """
 
     scale: float = 0.15
@@ -89,10 +90,13 @@ class Augmentation:
     lay: float = 0.12
     half: float = 0.25
     cut: float = 0.25
+    repeat: float = 0.5
 
 
 #: Crops nearer to those that the network will see, for the end of a training.
 MILD_AUGMENTATION = Augmentation(scale=0.1, turn_deg=8.0, shift=0.03, edge=0.03, lay=0.08, half=0.1, cut=0.2)
+#: Crops of pictures that mostly end within the people, padded as the pipeline pads them.
+CUT_AUGMENTATION = replace(MILD_AUGMENTATION, cut=0.75, repeat=0.0)
 
 
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
@@ -227,7 +231,7 @@ def crop_person(
         if generator is None:
             raise TensorsimError("crop_person: got an augmentation, expected a generator with it")
         mirrored = bool(generator.random() < 0.5)
-        if generator.random() < 0.5:
+        if generator.random() < augmentation.repeat:
             border = cv2.BORDER_REPLICATE
         if generator.random() < augmentation.cut:
             image, box, rest = cut_picture(image, box, keypoints, generator)

@@ -1,6 +1,7 @@
 """The commands that train and judge the pose network, on made-up shards."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
 from tensorsim.training.pose import held_out_people, read_people
+from tensorsim.vision.pose2d.hrnet import HRNet
 from tests.training.tars import write_tar
 from tests.training.test_pose_data import BOX, standing, write_cutouts
 from tests.training.test_shards import jpg, label
@@ -65,6 +67,17 @@ def test_train_then_evaluate(network: str, data: Path, capsys: pytest.CaptureFix
     )  # type: ignore[arg-type]
     more.run()
     assert (data / "more" / "best.safetensors").is_file()
+    if network == "hrnet":
+        head = TrainPose(
+            data, out=data / "head", steps=1, batch=2, workers=0, quiet=True, init=weights, presence=True
+        )
+        head.run()
+        gated = HRNet.from_pretrained(data / "head" / "best.safetensors")
+        assert gated.config.presence == 128
+        # Such a network can be trained further as well.
+        again = replace(more, init=data / "head" / "best.safetensors", out=data / "again", width=None)
+        again.run()
+        assert HRNet.from_pretrained(data / "again" / "best.safetensors").config == gated.config
 
 
 def test_nobody_held_out_is_trained_on(data: Path) -> None:
@@ -106,6 +119,7 @@ def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> No
         ({"rendered_seed": -1}, "--rendered-seed: got -1"),
         ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
         ({"width": 0}, "HRNetConfig"),
+        ({"presence": True}, "--presence: got no --init"),
         ({"second_labels": Path("none.json")}, "none.json: not a COCO file of keypoint results"),
         ({"first_steps": 1, "first_size": (192, 144)}, r"--first-size: got \(192, 144\), expected"),
     ],

@@ -6,6 +6,7 @@ the resolution and twice the channels; after every group of residual blocks each
 all of them. Module names are those of the authors' code, so published checkpoints load key by key.
 """
 
+import math
 import os
 import re
 from dataclasses import astuple, dataclass
@@ -42,9 +43,10 @@ class HRNetConfig:
         modules: exchange modules of stages 2, 3 and 4 (of 2, 3 and 4 branches).
         bottlenecks: bottleneck blocks of stage 1.
         planes: inner channels of those; their outputs have 4 times as many.
+        presence: hidden units of the :class:`PresenceHead`; 0 for none, as in published nets.
 
     Raises:
-        TensorsimError: a number below one, or not three counts of modules.
+        TensorsimError: a number below one, a negative ``presence``, or not three counts of modules.
     """
 
     width: int
@@ -52,12 +54,13 @@ class HRNetConfig:
     modules: tuple[int, int, int] = (1, 4, 3)
     bottlenecks: int = 4
     planes: int = 64
+    presence: int = 0
 
     def __post_init__(self) -> None:
-        counts = (self.width, self.blocks, self.bottlenecks, self.planes, *self.modules)
+        counts = (self.width, self.blocks, self.bottlenecks, self.planes, *self.modules, self.presence + 1)
         if len(self.modules) != 3 or not all(isinstance(n, int) and n >= 1 for n in counts):
             raise TensorsimError(
-                f"HRNetConfig: got {astuple(self)}, expected integers >= 1 and three module counts"
+                f"HRNetConfig: got {astuple(self)}, expected integers >= 1, three module counts and presence >= 0"
             )
 
 
@@ -194,6 +197,45 @@ class _Transition(nn.ModuleList):
         return out
 
 
+class PresenceHead(nn.Module):
+    """How much of each heat map to believe, from the whole crop: little where its key point is not in the picture.
+
+    Where the picture ends within a person, a heat map still has a highest peak, at another part of the body or of
+    somebody else. Two layers see the mean of the features in 4 x 4 parts of the crop, black edges included, and the
+    heights of all peaks, and give each map a factor from 0 to 1 (as the squeeze and excitation of J. Hu et al., CVPR
+    2018, with keypoints for channels). Places of peaks stay as they are.
+
+    Args:
+        channels: of the features.
+        hidden: units of the first layer.
+    """
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        # Factors above 1 are cut, so that key points that are surely there keep their scores.
+        self.most = 1.3
+        self.hidden = nn.Linear(16 * channels + len(COCO_KEYPOINTS), hidden)
+        self.factor = nn.Linear(hidden, len(COCO_KEYPOINTS))
+        # Training starts from factors just below 1: above there is no gradient.
+        nn.init.zeros_(self.factor.weight)
+        nn.init.constant_(self.factor.bias, -math.log(self.most - 1.0) - 1e-5)
+
+    def forward(self, features: Tensor, maps: Tensor) -> Tensor:
+        """Features (N, C, h, w), h and w multiples of 8, and heat maps (N, 17, h, w) -> heat maps."""
+        # Exports to ONNX at any size, unlike pooling.
+        parts = features.unflatten(-1, [4, -1]).mean(-1).unflatten(2, [4, -1]).mean(3)
+        seen = torch.cat([parts.flatten(1), maps.amax((-2, -1))], dim=1)
+        factor = (self.most * torch.sigmoid(self.factor(F.relu(self.hidden(seen))))).clamp(max=1.0)
+        return maps * factor[..., None, None]
+
+
+class _NoHead(nn.Module):
+    """Heat maps as they are."""
+
+    def forward(self, features: Tensor, maps: Tensor) -> Tensor:
+        return maps
+
+
 class HRNet(nn.Module):
     """High-resolution net: (N, 3, H, W) RGB crops in [0, 1] -> (N, 17, H/4, W/4) heat maps, peaks near 1.
 
@@ -244,6 +286,7 @@ class HRNet(nn.Module):
         # Heat maps are almost zero everywhere: training starts from there.
         for parameter in self.final_layer.parameters():
             nn.init.normal_(parameter, std=0.001)
+        self.presence = PresenceHead(c, config.presence) if config.presence else _NoHead()
 
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
@@ -265,7 +308,7 @@ class HRNet(nn.Module):
         branches = self.stage2(self.transition1([x]))
         branches = self.stage3(self.transition2(branches))
         branches = self.stage4(self.transition3(branches))
-        return self.final_layer(branches[0])
+        return self.presence(branches[0], self.final_layer(branches[0]))
 
     @classmethod
     def from_pretrained(
@@ -323,6 +366,7 @@ def _read_config(state: dict[str, Tensor], source: str) -> HRNetConfig:
             modules=(count("stage2"), count("stage3"), count("stage4")),
             bottlenecks=count("layer1"),
             planes=state["layer1.0.conv1.weight"].shape[0],
+            presence=len(state.get("presence.hidden.bias", ())),
         )
     except (KeyError, IndexError, TensorsimError) as error:
         some = ", ".join(list(state)[:3])

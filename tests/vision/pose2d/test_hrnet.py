@@ -1,5 +1,6 @@
 import copy
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from tests.networks import settled
 from tests.stage import StageTester
 
 TINY = HRNetConfig(width=4, blocks=1, modules=(1, 2, 2), bottlenecks=2, planes=4)
+WITH_HEAD = replace(TINY, presence=5)
 
 
 def make_network(config: HRNetConfig | int = TINY) -> HRNet:
@@ -43,6 +45,13 @@ class TestHRNet(StageTester):
             ((torch.zeros(1, 3, 0, 32),), "multiples of 32"),
             ((torch.zeros(1, 3, 64, 32, dtype=torch.uint8),), "floating"),
         ]
+
+
+class TestHRNetWithPresence(TestHRNet):
+    def make(self) -> nn.Module:
+        network = make_network(WITH_HEAD)
+        nn.init.normal_(network.presence.factor.weight, std=0.3)
+        return network
 
 
 def reference(state: dict[str, Tensor], images: Tensor) -> Tensor:
@@ -181,7 +190,7 @@ def _mmpose(state: dict[str, Tensor], head: str) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("name", [*NAMINGS, "own.safetensors"])
-@pytest.mark.parametrize("config", [TINY, 18])
+@pytest.mark.parametrize("config", [TINY, WITH_HEAD, 18])
 def test_loads_every_published_naming(tmp_path: Path, name: str, config: HRNetConfig | int) -> None:
     network, images = make_network(config), torch.rand(1, 3, 64, 64)
     state = network.state_dict()
@@ -227,10 +236,37 @@ def test_refuses_bad_configurations() -> None:
         (lambda: HRNet(33), r"got width 33, expected one of \[18, 32, 48\]"),
         (lambda: HRNet(TINY, input_size=(256, 190)), "multiples of 32"),
         (lambda: HRNetConfig(width=0), "integers >= 1"),
+        (lambda: HRNetConfig(width=8, presence=-1), "presence >= 0"),
         (lambda: HRNetConfig(width=8, modules=(1, 1)), "three module counts"),  # type: ignore[arg-type]
     ):
         with pytest.raises(TensorsimError, match=message):
             make()
+
+
+def test_presence_scales_whole_maps() -> None:
+    """A factor for each map, by hand in float64, which is 1 before training."""
+    plain, network = make_network(), make_network(WITH_HEAD)
+    network.load_state_dict(network.state_dict() | plain.state_dict())
+    images = torch.rand(2, 3, 64, 96)
+    seen: list[Tensor] = []
+    network.presence.register_forward_hook(lambda module, inputs, output: seen.extend(inputs))
+    with torch.no_grad():
+        maps = plain(images)
+        torch.testing.assert_close(network(images), maps)
+        nn.init.normal_(network.presence.factor.weight, std=0.3)
+        found = network(images).double()
+    features = seen[0].double()
+    parts = [
+        features[:, :, 4 * i : 4 * i + 4, 6 * j : 6 * j + 6].mean((-2, -1))
+        for i in range(4)
+        for j in range(4)
+    ]
+    x = torch.cat([torch.stack(parts, dim=-1).flatten(1), maps.double().amax((-2, -1))], dim=1)
+    head = {name: value.double() for name, value in network.presence.state_dict().items()}
+    x = (x @ head["hidden.weight"].T + head["hidden.bias"]).clamp_min(0)
+    factor = (1.3 / (1 + (-(x @ head["factor.weight"].T + head["factor.bias"])).exp())).clamp(max=1.0)
+    assert 0.2 < float((factor < 1.0).double().mean()) < 0.8
+    torch.testing.assert_close(found, maps.double() * factor[..., None, None], rtol=1e-5, atol=1e-5)
 
 
 def test_exports_with_a_free_batch() -> None:

@@ -1,0 +1,102 @@
+"""The recipe of HRNet's head that tells which key points are in the picture, with the rest of the network as it is."""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from tensorsim.errors import TensorsimError
+from tensorsim.training.loop import Batch
+from tensorsim.training.pose import PosePeople, PoseRecipe, by_group
+from tensorsim.training.pose_data import CUT_AUGMENTATION, Person
+from tensorsim.training.pose_metrics import evaluate_cut
+from tensorsim.vision.pose2d.hrnet import HRNet, PresenceHead
+
+#: Shares of people in pictures, in films, with confused sides and rendered: those whose hidden points are known best.
+SHARES_PRESENCE = (0.8, 0.2, 0.0, 0.0)
+#: Score of a key point that is in the picture or not with even odds. The mean with the mirror image lowers it to 0.3.
+EVEN_ODDS = 0.34
+
+
+def presence_loss(scores: Tensor, known: Tensor, gone: Tensor, sharpness: float = 4.0) -> Tensor:
+    """Cross-entropy of telling key points in the picture from those beyond its edge by scores.
+
+    The probability of being in the picture is a logistic function of the logarithm of the score, one half at
+    :data:`EVEN_ODDS`; key points of which nothing is known do not count.
+
+    Args:
+        scores: (N, 17) heights of the peaks.
+        known: (N, 17) bool, in the picture.
+        gone: (N, 17) bool, beyond.
+        sharpness: slope of the logistic function.
+    """
+    told = (known | gone).to(scores.dtype)
+    logits = sharpness * (scores.clamp_min(1e-3) / EVEN_ODDS).log()
+    loss = F.binary_cross_entropy_with_logits(logits, known.to(scores.dtype), told, reduction="sum")
+    return loss / told.sum().clamp_min(1)
+
+
+def with_presence_head(net: HRNet, hidden: int = 128) -> HRNet:
+    """The same network with an untrained presence head, which changes nothing yet, unless it has one already."""
+    if isinstance(net.presence, PresenceHead):
+        return net
+    other = HRNet(replace(net.config, presence=hidden), net.input_size)
+    other.load_state_dict(other.state_dict() | net.state_dict())
+    return other
+
+
+class PresenceRecipe(PoseRecipe):
+    """Train the :class:`~tensorsim.vision.pose2d.hrnet.PresenceHead` of an HRNet, and nothing else of it.
+
+    Args:
+        net: with such a head, and with trained weights.
+        persons, seed, learning_rate: as of :class:`~tensorsim.training.pose.PoseRecipe`.
+        validation: held-out people; the share of their key points in the picture that are seen, less that of those
+            beyond its edge, is the score.
+
+    Raises:
+        TensorsimError: a network without such a head, a source without people.
+    """
+
+    def __init__(
+        self,
+        net: HRNet,
+        persons: PosePeople,
+        validation: dict[str, list[Person]],
+        seed: int = 0,
+        learning_rate: float = 2e-3,
+    ) -> None:
+        super().__init__(
+            net,
+            persons,
+            validation,
+            None,
+            seed,
+            learning_rate,
+            shares=SHARES_PRESENCE,
+            augmentation=CUT_AUGMENTATION,
+        )
+        if not isinstance(net.presence, PresenceHead):
+            raise TensorsimError("PresenceRecipe: got an HRNet without a presence head, expected one with it")
+        self.head: nn.Module = net.presence
+        for parameter in net.parameters():
+            parameter.requires_grad_(False)
+        for parameter in self.head.parameters():
+            parameter.requires_grad_(True)
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """:func:`presence_loss` of the batch."""
+        net.eval()  # the rest of the network, its statistics included, stays as it is
+        maps = net(batch["crops"].float() / 255).float()
+        return {"loss": presence_loss(maps.amax((-2, -1)), batch["known"], batch["gone"])}
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        """AdamW of the head."""
+        return torch.optim.AdamW(self.head.parameters(), lr=self.learning_rate, weight_decay=0.02)
+
+    def validate(self, net: nn.Module) -> dict[str, float]:
+        """Shares of key points seen in the picture and beyond its edge, of every held-out group."""
+        figures = {name: evaluate_cut(net, persons, EVEN_ODDS) for name, persons in self.validation.items()}
+        score = sum(figure["seen"] - figure["ghosts"] for figure in figures.values()) / max(len(figures), 1)
+        return by_group(figures) | {"score": score}
