@@ -1,4 +1,4 @@
-"""Movements of everyday people that count as one of the twelve activities: falls any way, balls kicked.
+"""Movements of everyday people that count as one of the twelve activities: falls any way, walks that end, balls kicked.
 
 Scripts as in :mod:`.scripts`. Each happens from time 0 on; before it the person stands, or walks up.
 """
@@ -131,6 +131,24 @@ def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
     act = with_gait(time, who, base, pace, path)
     upright = 1 - segment(time, 0.4 / tempo, 0.9 / tempo)
     return act._replace(hold=act.hold * upright[..., None], lift=act.lift * upright[..., None], level=upright)
+
+
+def walk_and_stop(time: Tensor, who: People) -> Act:
+    """Walks up, comes to a halt from time 0 on, within 0.7 to 1.5 s, and stands."""
+    start = torch.zeros_like(who.tempo[:, None])
+    halt = 0.7 + 0.8 * share_of(who, 17.0)
+    pace = 1 - segment(time, start, halt)
+    path = who.speed_m_s[:, None] * (time - travel(time, start, halt))
+    return with_gait(time, who, make_pose(time, who), pace, path)
+
+
+def walk_with_still_arms(time: Tensor, who: People) -> Act:
+    """Walks without a swing of the arms: they hang, are folded, or hold something."""
+    up, bent = 25.0 * share_of(who, 19.0), 110.0 * share_of(who, 23.0)
+    base = make_pose(time, who, flexion=(up, up), abduction=(12.0, 12.0), elbow=(bent, 0.9 * bent))
+    path = who.speed_m_s[:, None] * time
+    act = with_gait(time, who, base, torch.ones_like(time), path)
+    return act._replace(pose=act.pose._replace(shoulder=base.shoulder, elbow=base.elbow))
 
 
 def kick_ball(time: Tensor, who: People) -> Act:

@@ -80,7 +80,11 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (Variant(scripts.sit_down, 0.8, 1.9, 1.0, (0.8, 1.7)),),
     (Variant(scripts.stand_up, 0.7, 2.0, 1.0, (0.8, 1.7)),),
     (Variant(scripts.rotate, 0.0, None, 1.0, (0.7, 1.3)),),
-    (Variant(scripts.walk, 0.0, None, 1.0),),
+    (
+        Variant(scripts.walk, 0.0, None, 0.65),
+        Variant(everyday.walk_and_stop, -1.6, 2.6, 0.25, (0.8, 1.2)),
+        Variant(everyday.walk_with_still_arms, 0.0, None, 0.1, (0.8, 1.2)),
+    ),
     (Variant(scripts.sit_to_walk, 0.4, 2.4, 1.0, (0.75, 1.15)),),
     (Variant(scripts.walk_to_sit, 0.8, 2.8, 1.0, (0.8, 1.15)),),
     (Variant(scripts.fall_to_walk, 0.25, 2.6, 1.0, (0.7, 1.2)),),

@@ -11,6 +11,7 @@ from tensorsim.motion.people import PeopleConfig, draw_people
 RATE = 120.0
 FALLS = ("fall_any_way", "fall_on_knees", "fall_onto_seat", "walk_and_fall_any_way")
 BLOWS = ("swing_fist", "punch_once", "kick_round")
+WALKS = ("walk_and_stop", "walk_with_still_arms")
 BONES = [("right_hip", "right_knee"), ("left_knee", "left_ankle"), ("neck", "right_shoulder"),
          ("left_elbow", "left_wrist")]  # fmt: skip
 
@@ -31,7 +32,7 @@ def moved(request):
     return request.param, people, perform(script(request.param), time.expand(16, -1), people)
 
 
-@pytest.mark.parametrize("moved", [*FALLS, *BLOWS, "kick_ball"], indirect=True)
+@pytest.mark.parametrize("moved", [*FALLS, *BLOWS, *WALKS, "kick_ball"], indirect=True)
 def test_bones_keep_their_length_and_nobody_is_too_fast(moved):
     _, _, joints = moved
     for a, b in BONES:
@@ -54,6 +55,31 @@ def test_who_falls_ends_on_the_floor_and_stays(moved):
     assert bool((hips[:, -1] < 0.45 * people.height_m).all())
     late = joints[:, -round(0.3 * RATE) :]
     assert float((late.diff(dim=1).norm(dim=-1) * RATE).max()) < 0.1
+
+
+@pytest.mark.parametrize("moved", ["walk_and_stop"], indirect=True)
+def test_who_stops_walks_up_and_then_stands_with_both_feet_below_the_body(moved):
+    _, people, joints = moved
+    hips = (joint(joints, "right_hip") + joint(joints, "left_hip")) / 2
+    begins, stands = round(1.5 * RATE), round(3.7 * RATE)
+    before = (hips[:, begins - round(1.0 * RATE), 1] - hips[:, 0, 1]) / 0.5
+    torch.testing.assert_close(before, people.speed_m_s, rtol=0.25, atol=0)
+    assert float((joints[:, stands:].diff(dim=1).norm(dim=-1) * RATE).max()) < 0.05
+    for side in ("right", "left"):
+        astray = (joint(joints, f"{side}_ankle") - joint(joints, f"{side}_hip"))[:, stands:, :2]
+        assert float(astray.norm(dim=-1).max()) < 0.15
+
+
+@pytest.mark.parametrize("moved", ["walk_with_still_arms"], indirect=True)
+def test_still_arms_do_not_swing_and_differ_between_people(moved):
+    _, _, joints = moved
+    # In the frame of the trunk; the chest only breathes and turns with the gait.
+    upper = joint(joints, "left_elbow") - joint(joints, "left_shoulder")
+    assert float(upper.std(dim=1).max()) < 0.05
+    legs = joint(joints, "left_ankle") - joint(joints, "left_hip")
+    assert float(legs.std(dim=1).amax(-1).min()) > 0.1
+    height = (joint(joints, "left_wrist") - joint(joints, "left_shoulder"))[..., 2].mean(1)
+    assert float(height.std()) > 0.08
 
 
 def test_people_fall_to_all_sides():
