@@ -25,7 +25,7 @@ from tensorsim.progress import picture, progress_bar
 from tensorsim.recognition import ActivityRecognizer, label_windows
 from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.report.film import FilmStrip
-from tensorsim.streaming import Found, maps_of_pose
+from tensorsim.streaming import Found, maps_of_pose, within_reach
 from tensorsim.threads import beside
 from tensorsim.types import Pose, RadarMaps
 from tensorsim.vision.calibration.calibrator import camera_config, camera_row
@@ -292,7 +292,9 @@ def simulated(
     torch computes on one thread.
     """
     found = source.find(quiet)
-    pose = select_people(found.pose, config.pose.people, source.fps)
+    found = found._replace(pose=select_people(found.pose, config.pose.people, source.fps))
+    found = within_reach(found, config.scene.radar)
+    pose = found.pose
     warn_of_empty_clips(pose.valid)
     picture(
         "world",
@@ -301,7 +303,7 @@ def simulated(
         ),
     )
     torch.manual_seed(config.seed)
-    camera = None if found.camera is None else camera_config(found.camera)
+    camera = None if found.camera is None else camera_config(found.camera, found.radar_ahead_m)
 
     def overlay(chunks: Iterable[Tensor]) -> FilmStrip:
         return write_overlay(folder, chunks, source.fps, pose, source.threshold, quiet, camera)
@@ -309,7 +311,7 @@ def simulated(
     # The radar is as fast on one thread as on two, and the film needs the other.
     with beside(overlay, source.frames()) as film, one_thread():
         maps = maps_of_pose(stage, pose, source.fps, device, quiet)
-        yield found._replace(pose=pose), maps, film
+        yield found, maps, film
 
 
 def _figure_pixels(figure: Any) -> np.ndarray:
@@ -347,6 +349,7 @@ def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: R
         "source": {"kind": source.kind, **source.about},
         "people": people_of(found.pose, source.fps),
         "camera": camera_row(found.camera),
+        "radar_ahead_of_camera_m": round(found.radar_ahead_m, 3),
         "background_px_s": None if found.background_px_s is None else round(found.background_px_s, 1),
         "frames": found.pose.valid.shape[2],
         "fps": source.fps,

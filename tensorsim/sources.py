@@ -19,6 +19,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.pipeline import VideoToPose
+from tensorsim.pipeline.reach import NEAREST_M
 from tensorsim.streaming import Found, people_of_film
 from tensorsim.types import Pose, Tracks
 from tensorsim.vision.smoothing.along_time import nearest_valid
@@ -26,8 +27,6 @@ from tensorsim.vision.smoothing.along_time import nearest_valid
 #: Size of the picture on which people without a film are drawn, and its grey.
 CANVAS = (360, 640)
 _GREY = 40
-#: Motion that comes nearer to the radar than this, or passes behind it, is moved away unless its place is given.
-NEAREST_M = 1.5
 
 #: What the simulation of a path starts from.
 KINDS = {"video": "a video", "keypoints": "keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
@@ -182,7 +181,8 @@ def motion_source(
         path, clip, fps: see :func:`~tensorsim.data.motion_files.load_motion`.
         heading_rad: turn about the vertical, counter-clockwise seen from above.
         start_range_m: y of the first person's hips in the first frame; None keeps the places of the file if these
-            are in front of the radar, else moves the people as near as :data:`NEAREST_M`.
+            are in front of the radar, else moves the people as near as
+            :data:`~tensorsim.pipeline.reach.NEAREST_M`.
         cut: the frames to keep.
 
     Raises:
@@ -225,7 +225,7 @@ def motion_source(
 
 
 def _in_front(motion: Motion, nearest: float) -> Motion:
-    """People moved so that none comes nearer than :data:`NEAREST_M` and their paths are centred on x = 0."""
+    """People moved so that none comes too near and their paths are centred on x = 0."""
     x = mid_hips(motion.joints[motion.valid])[:, 0]
     shift = motion.joints.new_tensor([-float(x.min() + x.max()) / 2, NEAREST_M - nearest, 0.0])
     return motion._replace(joints=(motion.joints + shift) * motion.valid[..., None, None])

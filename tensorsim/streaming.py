@@ -1,5 +1,6 @@
 """Long films, frame by frame, and long motion, pulse by pulse: memory does not grow with their length."""
 
+import warnings
 from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
@@ -9,9 +10,11 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
+from tensorsim.config import RadarConfig
 from tensorsim.data.video import VideoReader
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.pipeline.reach import radar_ahead_m
 from tensorsim.progress import picture, progress_bar
 from tensorsim.threads import spread
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
@@ -33,11 +36,36 @@ class Found(NamedTuple):
         camera: as estimated from the people; None where it was not.
         background_px_s: how far the background shifts within a second at most, in pixels of the film; None where
             that is not known.
+        radar_ahead_m: how far in front of the camera the radar stands, see :func:`within_reach`.
     """
 
     pose: Pose
     camera: CameraEstimate | None = None
     background_px_s: float | None = None
+    radar_ahead_m: float = 0.0
+
+
+def within_reach(found: Found, radar: RadarConfig) -> Found:
+    """The same people before a radar that stands as far in front of the camera as it takes to see them.
+
+    Only where the camera was estimated: who tells where it is knows where the radar is. People whom the radar does not
+    see from beside the camera (:func:`~tensorsim.pipeline.reach.radar_ahead_m`) are nearer by as much, which a
+    TensorsimWarning says.
+    """
+    if found.camera is None:
+        return found
+    ahead_m = radar_ahead_m(found.pose.joints[0], found.pose.valid[0], radar)
+    if ahead_m == 0:
+        return found
+    warnings.warn(
+        f"people are beyond the {radar.reach_m:.2f} m of this radar's range axis: the radar is put {ahead_m:.1f} m in "
+        "front of the camera (--camera-fov or --initial-distance leaves it there)",
+        TensorsimWarning,
+        stacklevel=2,
+    )
+    there = found.pose.valid[..., None, None]
+    nearer = found.pose.joints - there * found.pose.joints.new_tensor([0.0, ahead_m, 0.0])
+    return found._replace(pose=found.pose._replace(joints=nearer), radar_ahead_m=ahead_m)
 
 
 def people_of_film(
@@ -96,7 +124,7 @@ def calibrated(
     """
     heights = stage.metric_pose.heights
     assert isinstance(heights, Tensor)
-    calibrator = CameraCalibrator(tuple(heights.tolist()), keypoint_threshold=stage.keypoint_threshold)
+    calibrator = CameraCalibrator(tuple(heights.tolist()))
     found = with_reserve(calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps))
     return stage.seen_by(camera_config(found), known=False), found
 

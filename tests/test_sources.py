@@ -16,7 +16,8 @@ from tensorsim.data.video import VideoReader
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.framing import camera_on, seen_keypoints
-from tensorsim.sources import CANVAS, NEAREST_M, Cut, keypoint_source, kind_of, motion_source
+from tensorsim.pipeline.reach import NEAREST_M
+from tensorsim.sources import CANVAS, Cut, keypoint_source, kind_of, motion_source
 from tests.bvh import write_bvh
 
 FPS = 30.0

@@ -119,7 +119,7 @@ class EvaluateFilms(NetworkOptions):
         pose = found.pose
         shown = []
         for name, how in scenes.items():
-            verdict, maps = judged(film, pose, video.fps, name, how, self.seed, device, self.quiet)
+            verdict, maps = judged(film, found, video.fps, name, how, self.seed, device, self.quiet)
             axes = None if maps is None else results.axes_of(how.stage, maps)
             shown.append((verdict, maps, axes))
         figure = contact_sheet(film, video, pose, found.camera, reader.stage.keypoint_threshold, shown)
@@ -130,7 +130,7 @@ class EvaluateFilms(NetworkOptions):
             return row
         of_variants = {}
         for variant, of_variant in variants(seen, video.fps).items():
-            changed = reader.lifted(of_variant, video.fps).pose
+            changed = reader.lifted(of_variant, video.fps)
             of_variants[variant] = {
                 name: asdict(judged(film, changed, video.fps, name, how, self.seed, device, self.quiet)[0])
                 for name, how in scenes.items()

@@ -24,7 +24,14 @@ from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.results import label_of, people_of
-from tensorsim.streaming import Found, calibrated, detections_of_film, keypoints_of_film, maps_of_pose
+from tensorsim.streaming import (
+    Found,
+    calibrated,
+    detections_of_film,
+    keypoints_of_film,
+    maps_of_pose,
+    within_reach,
+)
 from tensorsim.types import Detections, Pose, RadarMaps
 from tensorsim.vision.calibration.calibrator import camera_row
 from tensorsim.vision.calibration.camera_motion import BackgroundMotion
@@ -210,7 +217,7 @@ def _digest(*parts: bytes) -> str:
 
 def judged(
     film: LabelledFilm,
-    pose: Pose,
+    found: Found,
     fps: float,
     scene: str,
     how: Scene,
@@ -219,13 +226,14 @@ def judged(
     quiet: bool = False,
 ) -> tuple[Verdict, RadarMaps | None]:
     """The verdict on a film in one scene, and its maps; None where the simulation refuses its motion."""
+    pose = within_reach(found, how.stage.simulator.radar).pose
     torch.manual_seed(seed)
     try:
         maps = maps_of_pose(how.stage, pose, fps, device, quiet)
     except TensorsimError as error:
         return Verdict(scene, None, None, False, error=str(error)), None
-    found = label_of(how.recognizer, maps, pose.valid.shape[2] / fps)
-    label, probabilities = found["label"], found["probabilities"]
+    said = label_of(how.recognizer, maps, pose.valid.shape[2] / fps)
+    label, probabilities = said["label"], said["probabilities"]
     of_accepted = round(sum(probabilities.get(name, 0.0) for name in film.accept), 4)
     return Verdict(scene, label, probabilities[label], label in film.accept, of_accepted), maps
 

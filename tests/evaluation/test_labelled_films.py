@@ -26,6 +26,7 @@ from tensorsim.evaluation.labelled_films import (
 )
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.streaming import Found
 from tensorsim.types import Detections, Pose, RadarMaps
 from tests.film import RectangleDetector, StandingPose, film, walker
 
@@ -220,12 +221,12 @@ def test_a_verdict_is_right_where_the_label_is_accepted() -> None:
     cpu = torch.device("cpu")
     for index, right in ((7, True), (1, False)):
         how = Scene(stage, Always(index))  # type: ignore[arg-type]
-        verdict, maps = judged(known, somebody(1.0), FPS, "through-wall", how, 0, cpu, quiet=True)
+        verdict, maps = judged(known, Found(somebody(1.0)), FPS, "through-wall", how, 0, cpu, quiet=True)
         assert maps is not None
         assert (verdict.label, verdict.right) == (ACTIVITIES[index], right)
         assert verdict.probability == pytest.approx(np.exp(4) / (np.exp(4) + 11), abs=1e-3)
         assert verdict.right_probability == pytest.approx(np.exp(4 * right) / (np.exp(4) + 11), abs=1e-3)
-    verdict, maps = judged(known, somebody(10.0), FPS, "through-wall", how, 0, cpu, quiet=True)
+    verdict, maps = judged(known, Found(somebody(10.0)), FPS, "through-wall", how, 0, cpu, quiet=True)
     assert maps is None
     assert not verdict.right
     assert "radial speed" in (verdict.error or "")

@@ -68,15 +68,16 @@ def with_reserve(found: CameraEstimate, good_rad: float = math.radians(5.0)) -> 
     )
 
 
-def camera_config(found: CameraEstimate) -> CameraConfig:
-    """The camera of one clip above the origin, looking along +y.
+def camera_config(found: CameraEstimate, radar_ahead_m: float = 0.0) -> CameraConfig:
+    """The camera of one clip, looking along +y, above the radar at the origin or behind it.
 
     Args:
         found: of one clip, fields of one element.
+        radar_ahead_m: how far in front of the camera the radar stands.
     """
     return CameraConfig(
         horizontal_fov_rad=float(found.horizontal_fov_rad),
-        position_m=(0.0, 0.0, float(found.height_m)),
+        position_m=(0.0, -radar_ahead_m, float(found.height_m)),
         pitch_rad=float(found.pitch_rad),
         roll_rad=float(found.roll_rad),
     )
@@ -110,7 +111,9 @@ class CameraCalibrator(nn.Module):
     Args:
         person_height_m: standing heights by order of person; the last one serves all further people.
         height_sd_m: standard deviation of these heights: 0.08 m for people of unknown height, less for known ones.
-        keypoint_threshold: score from which a key point counts as seen.
+        keypoint_threshold: score from which a key point counts. The usual 0.3 is too low for this: key points of low
+            scores err to one side (feet below the picture are found at its edge), and one camera is told from all
+            frames.
         most_frames: of each person that are used, evenly spread.
 
     Shape:
@@ -132,7 +135,7 @@ class CameraCalibrator(nn.Module):
         self,
         person_height_m: tuple[float, ...] = (1.70,),
         height_sd_m: float = 0.08,
-        keypoint_threshold: float = 0.3,
+        keypoint_threshold: float = 0.6,
         most_frames: int = 120,
     ) -> None:
         super().__init__()
@@ -153,7 +156,7 @@ class CameraCalibrator(nn.Module):
         self.walk_ratio, self.walk_ratio_spread = WALK_RATIO, WALK_RATIO_SPREAD
         self.least_rhythm = 0.4  # share of a sinusoid in the steps from which a cadence is believed
         self.correlation_s = 0.4  # after which the errors of a body are no longer those of before
-        self.smoothing_s = 0.15
+        self.smoothing_s = 0.25
         self.path = 0.25  # body heights in the image after which somebody is seen anew
         mean = [0.0, 0.0, math.log(1.5), 60 * degree]
         deviation = [20 * degree, 3 * degree, 0.45, 15 * degree]

@@ -108,6 +108,41 @@ def test_nobody_tells_nothing() -> None:
     assert float(found.pitch_sd_rad) == pytest.approx(math.radians(20.0))
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_key_points_of_low_scores_do_not_tell_the_camera(seed: int) -> None:
+    """Feet that are found too high where they are near, with half the usual score, make people small there."""
+    camera = known_camera(24.0, 3.0, 60.0)
+    walk = walk_before(camera, seed=seed)
+    keypoints, scores = walk.keypoints.clone(), walk.scores.clone()
+    size = (keypoints[:, 15:17].mean(dim=1) - keypoints[:, 5:7].mean(dim=1)).norm(dim=-1)
+    near = (size > size.quantile(0.7))[:, None]
+    keypoints[:, 15:17, 1] -= 0.1 * size[:, None] * near
+    scores[:, 15:17] = torch.where(near, 0.45, scores[:, 15:17])
+    tilts = []
+    for threshold in (0.6, 0.3):
+        module = CameraCalibrator((walk.height_m,), 0.02, keypoint_threshold=threshold)
+        found = module(keypoints[None], scores[None], walk.scores.any(dim=-1)[None], HEIGHT, WIDTH, FPS)
+        errors = errors_of(found, camera, walk)
+        tilts.append(abs(errors.pitch_deg))
+        # Frames that do not count make it less sure, not wrong: whoever walks up to a gap has not stopped.
+        assert abs(errors.range) < 0.12
+    assert tilts[0] < 0.5
+    assert tilts[1] > 0.55
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_whoever_walks_straight_away_walks_all_the_time(seed: int) -> None:
+    """Ankles that hardly move against each other, gaps and the ends of a film do not make a walker stand."""
+    walk = walk_before(known_camera(0.0, 1.5, 60.0), seed=seed)
+    upright = is_upright(walk.keypoints, walk.scores, 0.5)
+    share = walking_share(walk.keypoints[None], upright[None], FPS)[0]
+    assert float(share[upright].min()) == 1.0
+    gap = torch.arange(len(upright)).remainder(70) < 10
+    share = walking_share(walk.keypoints[None], (upright & ~gap)[None], FPS)[0]
+    assert float(share[upright & ~gap].min()) > 0.5
+    assert float(share[gap].max()) == 0.0
+
+
 def test_who_fights_in_place_does_not_walk() -> None:
     """Feet that move in place say nothing of the focal length."""
     time = torch.arange(60, dtype=torch.float64) / FPS
