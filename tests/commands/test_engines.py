@@ -51,6 +51,7 @@ def test_key_points_and_maps_of_the_engines_agree(
     away, _, decibels = compared("openvino")
     assert np.median(away) < 0.1
     assert np.quantile(away, 0.98) < 0.5
-    assert decibels < 0.1
+    # In bfloat16, by films of 20 frames, 0.01 to 0.13 dB.
+    assert decibels < 0.2
     away, _, _ = compared("int8")
     assert 0 < np.median(away) < 0.5
