@@ -1,4 +1,4 @@
-"""Where a radar stands that shall see the people of a film, whose camera may be farther away than it reaches."""
+"""Where to put a radar so that it sees the people of a film, whose camera may be farther away than it reaches."""
 
 import torch
 from torch import Tensor
