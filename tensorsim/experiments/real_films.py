@@ -22,7 +22,7 @@ from tensorsim.recognition import ActivityRecognizer
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.recognition.timeline import windows_of
 from tensorsim.registry import locate
-from tensorsim.streaming import maps_of_pose
+from tensorsim.streaming import maps_of_pose, within_reach
 from tensorsim.training.classifier import RANGE_DB
 from tensorsim.training.everyday_classifier import EverydayRecipe
 from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
@@ -126,12 +126,13 @@ def _made(films: list[LabelledFilm], size: int, work: Work) -> dict[str, Tensor]
     for k, film in enumerate(tqdm(films, desc="films", unit="film", disable=work.quiet)):
         with collected_warnings():  # `tensorsim evaluate films` prints them
             video = reader.open(film)
-            pose = reader.people(film, video, cpu, quiet=True).pose
+            found = reader.people(film, video, cpu, quiet=True)
             for name, scene in scenes.items():
                 torch.manual_seed(0)  # of the receiver's noise
                 shown = [torch.zeros(0, 1, size, size)]
                 # Motion too fast for the radar has no map, and no right label.
                 with suppress(TensorsimError):
+                    pose = within_reach(found, scene.stage.simulator.radar).pose
                     maps = maps_of_pose(scene.stage, pose, video.fps, cpu, quiet=True)
                     parts = windows_of(maps, pose.valid.shape[2] / video.fps)
                     shown += [scene.recognizer.picture(part)[None] for _, _, part in parts]
