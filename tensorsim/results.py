@@ -241,16 +241,19 @@ def write_overlay(
     threshold: float,
     quiet: bool = False,
     camera: CameraConfig | None = None,
+    from_film: Tensor | None = None,
 ) -> FilmStrip:
     """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons.
 
-    With a ``camera`` the floor that it sees is drawn as well.
+    With a ``camera`` the floor that it sees is drawn as well, with ``from_film`` (:class:`~tensorsim.streaming.Found`)
+    where the film's own camera has it.
 
     Returns:
         The same film as a report has it.
     """
     boxes, keypoints = pose.boxes[0].numpy(), pose.keypoints[0].numpy()
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
+    to_film = None if from_film is None else from_film.inverse().numpy()
 
     def drawn() -> Iterator[np.ndarray]:
         index, floor = 0, np.zeros((0, 2, 2))
@@ -259,8 +262,9 @@ def write_overlay(
                 if index == 0 and camera is not None:
                     floor = plot.floor_lines(camera, frames.shape[2], frames.shape[3])
                 for frame in frames.permute(0, 2, 3, 1).numpy():
+                    lines = floor if to_film is None else plot.through(floor, to_film[index])
                     yield plot.draw_people(
-                        plot.draw_lines(frame, floor),
+                        plot.draw_lines(frame, lines),
                         boxes[:, index],
                         keypoints[:, index],
                         scores[:, index],
@@ -306,7 +310,9 @@ def simulated(
     camera = None if found.camera is None else camera_config(found.camera, found.radar_ahead_m)
 
     def overlay(chunks: Iterable[Tensor]) -> FilmStrip:
-        return write_overlay(folder, chunks, source.fps, pose, source.threshold, quiet, camera)
+        return write_overlay(
+            folder, chunks, source.fps, pose, source.threshold, quiet, camera, found.from_film
+        )
 
     # The radar is as fast on one thread as on two, and the film needs the other.
     with beside(overlay, source.frames()) as film, one_thread():

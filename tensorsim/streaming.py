@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -10,9 +11,10 @@ import torch
 from torch import Tensor
 
 from tensorsim import plot
-from tensorsim.config import RadarConfig
+from tensorsim.config import CameraConfig, RadarConfig
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.geometry.camera import focal_length
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.pipeline.reach import radar_ahead_m
 from tensorsim.progress import picture, progress_bar
@@ -25,6 +27,7 @@ from tensorsim.vision.calibration.calibrator import (
     with_reserve,
 )
 from tensorsim.vision.calibration.camera_motion import BackgroundMotion
+from tensorsim.vision.calibration.stabilisation import StillPicture, at_even_times, mapped, still_picture
 from tensorsim.vision.smoothing.even_time import to_even_time
 
 
@@ -37,12 +40,15 @@ class Found(NamedTuple):
         background_px_s: how far the background shifts within a second at most, in pixels of the film; None where
             that is not known.
         radar_ahead_m: how far in front of the camera the radar stands, see :func:`within_reach`.
+        from_film: (T, 3, 3) homographies from pixels of each frame to those of ``camera``, which does not move, see
+            :mod:`tensorsim.vision.calibration.stabilisation`; None where the film's camera does not either.
     """
 
     pose: Pose
     camera: CameraEstimate | None = None
     background_px_s: float | None = None
     radar_ahead_m: float = 0.0
+    from_film: Tensor | None = None
 
 
 def within_reach(found: Found, radar: RadarConfig) -> Found:
@@ -77,7 +83,7 @@ def people_of_film(
 ) -> Found:
     """Detect and track in a first pass over the film, estimate and lift poses in a second one.
 
-    A camera that moves is said in a TensorsimWarning.
+    A camera that moves is said in a TensorsimWarning; if the camera is estimated, its turns and zooms are taken out.
 
     Args:
         stage: with the networks.
@@ -97,16 +103,101 @@ def people_of_film(
     tracks = stage.follow(detections, observed)
     background = BackgroundMotion(reader.fps)
     keypoints, scores = keypoints_of_film(stage, reader, tracks, device, quiet, background)
-    background.warn()
-    size = reader.height, reader.width
+    steps = steps_of_camera(reader, tracks, quiet) if calibrate and background.moves() else None
     if reader.uneven_times_s is not None:
-        times_s = reader.uneven_times_s[None]
-        tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, reader.fps)
-    camera = None
-    if calibrate:
-        stage, camera = calibrated(stage, keypoints, scores, tracks.valid, size, reader.fps)
-    pose = stage.lift(tracks, keypoints, scores, *size, reader.fps)
-    return Found(Pose(*(field.cpu() for field in pose)), camera, background.shift_px_s)
+        times_s = reader.uneven_times_s
+        tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s[None], reader.fps)
+        steps = None if steps is None else at_even_times(steps, times_s, reader.fps)
+    size = reader.height, reader.width
+    found = lifted_film(stage, tracks, keypoints, scores, size, reader.fps, calibrate, steps)
+    background.warn(found.from_film is not None)
+    return found._replace(background_px_s=background.shift_px_s)
+
+
+def steps_of_camera(reader: VideoReader, tracks: Tracks, quiet: bool = False) -> Tensor | None:
+    """How the background of a film moves from frame to frame, (T, 4); None if that is not clear.
+
+    See :func:`~tensorsim.vision.calibration.stabilisation.camera_path`.
+    """
+    background = BackgroundMotion(reader.fps, 0.0)
+    boxes, valid = tracks.boxes[0].transpose(0, 1), tracks.valid[0].transpose(0, 1)
+    done = 0
+    with progress_bar("camera", boxes.shape[0], quiet) as bar:
+        for frames in reader.chunks(16):
+            stop = done + frames.shape[0]
+            background.add(frames, boxes[done:stop], valid[done:stop])
+            bar.update(frames.shape[0])
+            done = stop
+    return background.steps()
+
+
+def lifted_film(
+    stage: VideoToPose,
+    tracks: Tracks,
+    keypoints: Tensor,
+    scores: Tensor,
+    size: tuple[int, int],
+    fps: float,
+    calibrate: bool,
+    steps: Tensor | None = None,
+) -> Found:
+    """People of one film in metres.
+
+    Args:
+        stage: lifts them.
+        tracks: of one clip (B = 1).
+        keypoints: (1, P, T, 17, 2) pixels.
+        scores: (1, P, T, 17).
+        size: (height, width) of the pictures.
+        fps: frames per second.
+        calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
+        steps: (T, 4) of an estimated camera that turns and zooms, which is taken out if it does not turn too far.
+    """
+    if not calibrate:
+        return Found(_on_cpu(stage.lift(tracks, keypoints, scores, *size, fps)))
+    if steps is not None:
+        still = _lifted_in_still_picture(stage, tracks, keypoints, scores, size, fps, steps)
+        if still is not None:
+            return still
+    stage, camera = calibrated(stage, keypoints, scores, tracks.valid, size, fps)
+    return Found(_on_cpu(stage.lift(tracks, keypoints, scores, *size, fps)), camera)
+
+
+def _lifted_in_still_picture(
+    stage: VideoToPose,
+    tracks: Tracks,
+    keypoints: Tensor,
+    scores: Tensor,
+    size: tuple[int, int],
+    fps: float,
+    steps: Tensor,
+) -> Found | None:
+    """:func:`lifted_film` of a camera that moves; None where it turns too far."""
+
+    def told(camera: CameraConfig) -> tuple[StillPicture, CameraEstimate] | None:
+        """The still picture if the film's camera has the field of view of this one, and the camera that it tells."""
+        still = still_picture(tracks, keypoints, scores, size, steps, focal_length(camera, size[1]))
+        if still is None:
+            return None
+        of_size = still.keypoints - still.margin.to(still.keypoints)
+        return still, calibrated(stage, of_size, still.scores, tracks.valid, size, fps)[1]
+
+    # Angles of turns need the field of view, which is estimated when the turns are taken out.
+    first = told(CameraConfig())
+    second = None if first is None else told(camera_config(first[1]))
+    if second is None:
+        return None
+    still, camera = second
+    of_film = camera_config(camera)
+    seen_by = stage.seen_by(replace(of_film, focal_px=focal_length(of_film, size[1])), known=False)
+    pose = seen_by.lift(still.tracks, still.keypoints, still.scores, *still.size, fps)
+    back = mapped(pose.keypoints - still.margin.to(pose.keypoints), still.from_film.inverse())
+    pose = pose._replace(boxes=tracks.boxes, keypoints=back.to(keypoints.dtype))
+    return Found(_on_cpu(pose), camera, from_film=still.from_film)
+
+
+def _on_cpu(pose: Pose) -> Pose:
+    return Pose(*(field.cpu() for field in pose))
 
 
 def calibrated(

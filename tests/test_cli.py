@@ -203,7 +203,7 @@ def test_the_camera_is_in_summary_and_overlay(walk: Path, tmp_path: Path, stand_
     assert drawn[grid].mean() > 100 + bare[grid].mean()
 
 
-def test_a_camera_that_moves_is_said(
+def test_a_camera_that_moves_is_said_and_its_turns_are_taken_out_where_it_is_estimated(
     tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A walker before a blue pattern that passes at 60 pixels per second."""
@@ -216,8 +216,24 @@ def test_a_camera_that_moves_is_said(
     cli.main(["simulate", str(tmp_path / "pan.avi"), "--out", str(tmp_path / "out"), *stand_ins])
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["background_px_s"] == pytest.approx(60, rel=0.1)
-    assert sum("the camera moves: the background shifts" in message for message in summary["warnings"]) == 1
+    (said,) = [m for m in summary["warnings"] if "the camera moves: the background shifts" in m]
+    assert "its turns and zooms are taken out" in said
     assert "the camera moves" in capsys.readouterr().err
+    x_m = np.load(tmp_path / "out" / "pose.npz")["joints_m"][0, :, 1, 0]
+    known = ["--camera-fov", "60", "--out", str(tmp_path / "known")]
+    cli.main(["simulate", str(tmp_path / "pan.avi"), *known, *stand_ins])
+    summary = json.loads((tmp_path / "known" / "summary.json").read_text())
+    assert (
+        sum("the motion of people and the estimated camera contain that" in m for m in summary["warnings"])
+        == 1
+    )
+    # The background goes to the left by 144 of 320 pixels: the camera turns to the right, and so does the walker.
+    moved = (
+        x_m[-1]
+        - x_m[0]
+        - float(np.diff(np.load(tmp_path / "known" / "pose.npz")["joints_m"][0, [0, -1], 1, 0])[0])
+    )
+    assert moved > 1.5
 
 
 def test_radar_from_a_file(walk: Path, tmp_path: Path, stand_ins: list[str]) -> None:

@@ -122,7 +122,7 @@ class EvaluateFilms(NetworkOptions):
             verdict, maps = judged(film, found, video.fps, name, how, self.seed, device, self.quiet)
             axes = None if maps is None else results.axes_of(how.stage, maps)
             shown.append((verdict, maps, axes))
-        figure = contact_sheet(film, video, pose, found.camera, reader.stage.keypoint_threshold, shown)
+        figure = contact_sheet(film, video, found, reader.stage.keypoint_threshold, shown)
         plot.save_figure(figure, self.out / f"{film.path.stem}.png")
         verdicts = [verdict for verdict, _, _ in shown]
         row = film_row(film, found, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)

@@ -12,6 +12,7 @@ from tensorsim.body.skeleton import mid_hips
 from tensorsim.data.video import VideoReader
 from tensorsim.evaluation.labelled_films import LabelledFilm, Verdict
 from tensorsim.results import Axes
+from tensorsim.streaming import Found
 from tensorsim.types import Pose, RadarMaps
 from tensorsim.vision.calibration.calibrator import CameraEstimate, camera_config
 
@@ -27,8 +28,7 @@ _NAMED = 5
 def contact_sheet(
     film: LabelledFilm,
     reader: VideoReader,
-    pose: Pose,
-    camera: CameraEstimate | None,
+    found: Found,
     threshold: float,
     scenes: list[tuple[Verdict, RadarMaps | None, Axes | None]],
 ) -> "Figure":
@@ -36,9 +36,8 @@ def contact_sheet(
 
     Args:
         film: what is known of the film.
-        reader: of the frames that ``pose`` is of.
-        pose: the people found, one clip.
-        camera: as estimated from them, whose floor is drawn; None draws none.
+        reader: of the frames that ``found.pose`` is of.
+        found: the people of one clip, and the camera whose floor is drawn; None draws none.
         threshold: score from which a key point is drawn.
         scenes: per scene the verdict, and its maps with their axes where there are any.
     """
@@ -48,11 +47,10 @@ def contact_sheet(
     figure = Figure(figsize=(16, 11), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(_ROWS + 1, 12, height_ratios=[1.0] * _ROWS + [1.3])
+    pose, camera = found.pose, found.camera
     count = pose.valid.shape[2]
     chosen = np.unique(np.linspace(0, count - 1, _ROWS * _COLUMNS).round().astype(int))
-    for place, (index, picture) in enumerate(
-        _pictures(reader, pose, camera, threshold, set(chosen.tolist()))
-    ):
+    for place, (index, picture) in enumerate(_pictures(reader, found, threshold, set(chosen.tolist()))):
         row, column = divmod(place, _COLUMNS)
         axes = figure.add_subplot(grid[row, 3 * column : 3 * column + 3])
         axes.imshow(picture)
@@ -82,9 +80,11 @@ def _said_of(camera: CameraEstimate | None) -> str:
 
 
 def _pictures(
-    reader: VideoReader, pose: Pose, camera: CameraEstimate | None, threshold: float, chosen: set[int]
+    reader: VideoReader, found: Found, threshold: float, chosen: set[int]
 ) -> list[tuple[int, np.ndarray]]:
     """The chosen frames by number, people drawn on them."""
+    pose, camera = found.pose, found.camera
+    to_film = None if found.from_film is None else found.from_film.inverse().numpy()
     boxes, keypoints, scores, valid = (
         part[0].numpy() for part in (pose.boxes, pose.keypoints, pose.keypoint_scores, pose.valid)
     )
@@ -96,7 +96,9 @@ def _pictures(
                 picture = _small(frame)
                 scale = picture.shape[1] / frame.shape[-1]
                 if camera is not None:
-                    picture = plot.draw_floor(picture, camera_config(camera))
+                    resized = np.diag([scale, scale, 1.0])
+                    moved = None if to_film is None else resized @ to_film[index] @ np.linalg.inv(resized)
+                    picture = plot.draw_floor(picture, camera_config(camera), moved)
                 drawn.append(
                     (
                         index,

@@ -32,6 +32,8 @@ class Observed(NamedTuple):
         scores: (1, P, T, 17).
         size: (height, width) of the pictures.
         background_px_s: as in :class:`~tensorsim.streaming.Found`.
+        camera_steps: (T, 4) of a camera that moves, see :func:`~tensorsim.streaming.steps_of_camera`; None of a still
+            one.
     """
 
     tracks: Tracks
@@ -39,6 +41,7 @@ class Observed(NamedTuple):
     scores: Tensor
     size: tuple[int, int]
     background_px_s: float | None = None
+    camera_steps: Tensor | None = None
 
 
 def variants(seen: Observed, fps: float) -> dict[str, Observed]:
@@ -66,10 +69,14 @@ def mirrored(seen: Observed) -> Observed:
     boxes = torch.where(seen.tracks.valid.unsqueeze(-1), boxes, seen.tracks.boxes)
     order = list(MIRRORED)
     u, v = seen.keypoints[..., order, :].unbind(-1)
+    steps = seen.camera_steps
+    if steps is not None:
+        steps = steps * steps.new_tensor([-1.0, 1.0, -1.0, 1.0])
     return seen._replace(
         tracks=seen.tracks._replace(boxes=boxes),
         keypoints=torch.stack([edge - u, v], -1),
         scores=seen.scores[..., order],
+        camera_steps=steps,
     )
 
 
@@ -78,6 +85,7 @@ def _part(seen: Observed, frames: slice) -> Observed:
         tracks=Tracks(*(part[:, :, frames] for part in seen.tracks)),
         keypoints=seen.keypoints[:, :, frames],
         scores=seen.scores[:, :, frames],
+        camera_steps=None if seen.camera_steps is None else seen.camera_steps[frames],
     )
 
 

@@ -26,15 +26,17 @@ from tensorsim.recognition import ActivityRecognizer
 from tensorsim.results import label_of, people_of
 from tensorsim.streaming import (
     Found,
-    calibrated,
     detections_of_film,
     keypoints_of_film,
+    lifted_film,
     maps_of_pose,
+    steps_of_camera,
     within_reach,
 )
 from tensorsim.types import Detections, Pose, RadarMaps
 from tensorsim.vision.calibration.calibrator import camera_row
-from tensorsim.vision.calibration.camera_motion import BackgroundMotion
+from tensorsim.vision.calibration.camera_motion import MOVING_SHARE, BackgroundMotion
+from tensorsim.vision.calibration.stabilisation import at_even_times
 from tensorsim.vision.smoothing.even_time import to_even_time
 
 
@@ -185,19 +187,35 @@ class FilmReader:
 
         keypoints, scores, shift_px_s = self._kept(f"keypoints-{key}", estimate)
         keypoints, scores, size = keypoints.to(device), scores.to(device), (reader.height, reader.width)
+        shift = None if bool(shift_px_s.isnan()) else float(shift_px_s)
+        steps = None
+        if self.calibrate and shift is not None and shift > MOVING_SHARE * reader.width:
+
+            def follow() -> tuple[Tensor, ...]:
+                steps = steps_of_camera(reader, tracks, quiet)
+                return (torch.zeros(0, 4) if steps is None else steps,)
+
+            (steps,) = self._kept(f"camera-{key}", follow)
+            steps = steps if steps.numel() else None
         if reader.uneven_times_s is not None:
             tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s[None], reader.fps)
-        shift = None if bool(shift_px_s.isnan()) else float(shift_px_s)
-        return Observed(tracks, keypoints, scores, size, shift)
+            steps = None if steps is None else at_even_times(steps, times_s, reader.fps)
+        return Observed(tracks, keypoints, scores, size, shift, steps)
 
     def lifted(self, seen: Observed, fps: float) -> Found:
         """The people in metres, and the camera if that is estimated, of :meth:`observed`."""
-        stage, camera = self.stage, None
-        if self.calibrate:
-            stage, camera = calibrated(stage, seen.keypoints, seen.scores, seen.tracks.valid, seen.size, fps)
-        pose = stage.lift(seen.tracks, seen.keypoints, seen.scores, *seen.size, fps)
-        warn_of_empty_clips(pose.valid)
-        return Found(Pose(*(field.cpu() for field in pose)), camera, seen.background_px_s)
+        found = lifted_film(
+            self.stage,
+            seen.tracks,
+            seen.keypoints,
+            seen.scores,
+            seen.size,
+            fps,
+            self.calibrate,
+            seen.camera_steps,
+        )
+        warn_of_empty_clips(found.pose.valid)
+        return found._replace(background_px_s=seen.background_px_s)
 
     def _kept(self, name: str, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Tensors of a file of the cache, made and written first if it is not there."""

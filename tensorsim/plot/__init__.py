@@ -1,7 +1,7 @@
 """Pictures of maps, skeletons and people. Needs matplotlib and OpenCV, imported on use."""
 
 from tensorsim.plot.figure import FIGURE_FORMATS, save_figure
-from tensorsim.plot.floor import draw_floor, draw_lines, floor_lines
+from tensorsim.plot.floor import draw_floor, draw_lines, floor_lines, through
 from tensorsim.plot.maps import (
     DYNAMIC_RANGE_DB,
     RIDGE_COLOURS,
@@ -37,4 +37,5 @@ __all__ = [
     "person_peaks",
     "save_figure",
     "skeleton_figure",
+    "through",
 ]

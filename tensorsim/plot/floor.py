@@ -45,6 +45,13 @@ def floor_lines(camera: CameraConfig, height: int, width: int) -> np.ndarray:
     return project(ends, focal, center, pose)[0].numpy()
 
 
+def through(lines: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Lines of :func:`floor_lines` through a homography (3, 3); those that it takes behind the camera are left out."""
+    whole = np.concatenate([lines, np.ones_like(lines[..., :1])], axis=-1) @ homography.T
+    whole = whole[(whole[..., 2] > 1e-3).all(axis=-1)]
+    return np.asarray(whole[..., :2] / whole[..., 2:])
+
+
 def draw_lines(image: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """Draw lines of :func:`floor_lines` on a copy of an image (H, W, 3) uint8 RGB."""
     import cv2
@@ -55,14 +62,16 @@ def draw_lines(image: np.ndarray, lines: np.ndarray) -> np.ndarray:
     return image
 
 
-def draw_floor(image: np.ndarray, camera: CameraConfig) -> np.ndarray:
+def draw_floor(image: np.ndarray, camera: CameraConfig, to_image: np.ndarray | None = None) -> np.ndarray:
     """Draw the floor that a camera sees on an image, see :func:`floor_lines`.
 
     Args:
         image: (H, W, 3) uint8 RGB; not changed.
         camera: a focal length in pixels is one of this image.
+        to_image: (3, 3) homography from pixels of the camera to those of the image; None if they are the same.
 
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    return draw_lines(image, floor_lines(camera, *image.shape[:2]))
+    lines = floor_lines(camera, *image.shape[:2])
+    return draw_lines(image, lines if to_image is None else through(lines, to_image))

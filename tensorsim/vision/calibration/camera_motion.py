@@ -1,9 +1,11 @@
-"""Whether the camera of a film moves: how the background shifts from picture to picture."""
+"""Whether and how the camera of a film moves: how the background shifts from picture to picture."""
 
+import math
 import warnings
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from tensorsim.errors import TensorsimWarning, check_positive
@@ -12,6 +14,8 @@ from tensorsim.errors import TensorsimWarning, check_positive
 _WIDTH, _STEP_S = 320, 0.1
 #: Fewer corners than this, or fewer than half of them in one motion, tell nothing.
 _LEAST_POINTS, _LEAST_SHARE = 12, 0.5
+#: Where the motion is not clear in more than this share of the pictures, nobody knows where the camera looks.
+_MOST_UNCLEAR = 0.1
 #: A camera moves if the background shifts by more than this share of the picture's width within a second.
 MOVING_SHARE = 0.02
 
@@ -26,25 +30,28 @@ class BackgroundMotion:
 
     Args:
         fps: frames per second of the film.
+        step_s: seconds between the pictures that are compared; 0 compares all.
 
     Attributes:
-        width: of the pictures, in pixels.
+        width, height: of the pictures, in pixels.
         shift_px_s: the largest shift within a second, in pixels of the film; None while no second is known.
 
     Raises:
         TensorsimError: a rate that is not positive.
     """
 
-    def __init__(self, fps: float) -> None:
+    def __init__(self, fps: float, step_s: float = _STEP_S) -> None:
         check_positive(fps, "fps")
-        self._every = max(1, round(_STEP_S * fps))
+        self._every = max(1, round(step_s * fps))
         self._second = max(1, round(fps / self._every))  # steps
         self._per_s = fps / (self._every * self._second)
         self._index = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # picture and where background is
-        self._steps: list[np.ndarray] = []  # (3, 3) of the steps of the last second, without gaps
+        self._steps: list[
+            np.ndarray | None
+        ] = []  # (3, 3) from picture to picture, in pixels of the compared ones
         self._scale = 1.0
-        self.width = 0
+        self.width = self.height = 0
         self.shift_px_s: float | None = None
 
     def add(self, frames: Tensor, boxes: Tensor, valid: Tensor) -> None:
@@ -64,7 +71,7 @@ class BackgroundMotion:
         """Follow the background from the last picture to this one."""
         import cv2
 
-        self.width = frame.shape[2]
+        self.height, self.width = frame.shape[1:]
         self._scale = min(1.0, _WIDTH / self.width)
         size = (round(frame.shape[2] * self._scale), round(frame.shape[1] * self._scale))
         # The green channel is most of the brightness.
@@ -79,22 +86,49 @@ class BackgroundMotion:
         last, self._last = self._last, (picture, background)
         if last is None:
             return
-        step = similarity_of(*last, picture, background)
-        self._steps = [] if step is None else [*self._steps, step][-self._second :]
-        if len(self._steps) == self._second:
-            shift = _mean_shift(self._steps, picture.shape) / self._scale * self._per_s
+        self._steps.append(similarity_of(*last, picture, background))
+        second = [step for step in self._steps[-self._second :] if step is not None]
+        if len(second) == self._second:
+            shift = _mean_shift(second, picture.shape) / self._scale * self._per_s
             self.shift_px_s = max(shift, self.shift_px_s or 0.0)
+
+    def steps(self) -> Tensor | None:
+        """How the background moves to each picture that was compared from the one before; None if that is not clear.
+
+        Returns:
+            (n, 4) float64 as :func:`~tensorsim.vision.calibration.stabilisation.camera_path` takes it, no motion where
+            too few corners agree. None if that is so in more than a tenth.
+        """
+        unclear = sum(step is None for step in self._steps)
+        if len(self._steps) == 0 or unclear > _MOST_UNCLEAR * len(self._steps):
+            return None
+        middle = np.array([(self.width - 1) / 2, (self.height - 1) / 2])
+        rows = [np.zeros(4)]
+        for step in self._steps:
+            step = np.eye(3) if step is None else step
+            # Compared pictures are resized: their pixel k is the film's (k + 0.5) / scale - 0.5.
+            at = (middle + 0.5) * self._scale - 0.5
+            shift = (step[:2, :2] @ at + step[:2, 2] - at) / self._scale
+            rows.append(
+                np.array([*shift, math.atan2(step[1, 0], step[0, 0]), math.log(math.hypot(*step[:2, 0]))])
+            )
+        return torch.from_numpy(np.stack(rows))
 
     def moves(self) -> bool:
         """Whether the camera moves: the background shifts by more than :data:`MOVING_SHARE` in a second."""
         return self.shift_px_s is not None and self.shift_px_s > MOVING_SHARE * self.width
 
-    def warn(self) -> None:
-        """Say it in a TensorsimWarning if the camera moves."""
+    def warn(self, made_still: bool = False) -> None:
+        """Say it in a TensorsimWarning if the camera moves, and whether its turns and zooms are taken out."""
         if self.moves():
+            effect = (
+                "its turns and zooms are taken out of the motion of people, but not where it is carried along"
+                if made_still
+                else "the motion of people and the estimated camera contain that"
+            )
             warnings.warn(
                 f"the camera moves: the background shifts by up to {self.shift_px_s:.0f} pixels per second, in "
-                f"pictures {self.width} pixels wide; the motion of people and the estimated camera contain that",
+                f"pictures {self.width} pixels wide; {effect}",
                 TensorsimWarning,
                 stacklevel=2,
             )
