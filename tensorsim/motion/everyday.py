@@ -133,6 +133,45 @@ def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
     return act._replace(hold=act.hold * upright[..., None], lift=act.lift * upright[..., None], level=upright)
 
 
+def walk_and_slip(time: Tensor, who: People) -> Act:
+    """Walks up, slips at time 0: the feet slide ahead and up, the person lands on the seat and then on the back.
+
+    The arms are flung up; whoever falls keeps a part of the speed of the walk for a moment.
+    """
+    v = Vary(who)
+    tempo = who.tempo[:, None]
+    drop, over = v(0.55) / tempo, v(0.5) / tempo
+    seated = ((time / drop).clamp(0.0, 1.0)) ** 2
+    lying = minimum_jerk(((time - 0.8 * drop) / over).clamp(0.0, 1.0))
+    flung = bell(time, 0.0 * v(1.0), v(1.6) / tempo)
+    one, other = v(65.0) * flung, v(40.0) * flung
+    rest = 1 - seated
+    bent = v(30.0) * lying * share_of(who, 13.0)
+    base = make_pose(
+        time,
+        who,
+        lean=-(45 * seated + 43 * lying),
+        pitch=v(25.0) * flung,
+        nod=v(20.0) * seated,
+        hip=(REST_HIP * rest + one + 0.6 * bent, REST_HIP * rest + other + 0.5 * bent),
+        knee=(REST_KNEE * rest + 0.4 * one + bent, REST_KNEE * rest + 0.5 * other + 0.9 * bent),
+        flexion=(2 + v(100.0) * flung, 2 + v(90.0) * flung),
+        abduction=(8 + v(40.0) * flung + v(30.0) * lying, 8 + v(40.0) * flung + v(25.0) * lying),
+        elbow=(12 + v(30.0) * flung, 12 + v(30.0) * flung),
+    )
+    base = base._replace(roll=base.roll + math.radians(50.0) * (2 * share_of(who, 7.0) - 1) ** 3 * lying)
+    start = -0.25 + 0.0 * tempo
+    pace = 1 - segment(time, start, 0.3 + 0.0 * tempo)
+    path = who.speed_m_s[:, None] * (time - travel(time, start, 0.7 + 0.0 * tempo))
+    act = with_gait(time, who, base, pace, path)
+    # The hips come down about where they were: the feet, about which the body leans, slide ahead.
+    slide = (0.35 + 0.25 * share_of(who, 29.0)) * who.height_m[:, None] * seated
+    offset = act.offset + torch.nn.functional.pad(slide[..., None], (1, 1))
+    upright = 1 - segment(time, 0.0 * tempo, 0.25 + 0.0 * tempo)
+    hold, lift = act.hold * upright[..., None], act.lift * upright[..., None]
+    return act._replace(offset=offset, hold=hold, lift=lift, level=upright)
+
+
 def walk_and_stop(time: Tensor, who: People) -> Act:
     """Walks up, comes to a halt from time 0 on, within 0.7 to 1.5 s, and stands."""
     start = torch.zeros_like(who.tempo[:, None])

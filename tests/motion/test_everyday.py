@@ -9,7 +9,7 @@ from tensorsim.motion.activities import perform
 from tensorsim.motion.people import PeopleConfig, draw_people
 
 RATE = 120.0
-FALLS = ("fall_any_way", "fall_on_knees", "fall_onto_seat", "walk_and_fall_any_way")
+FALLS = ("fall_any_way", "fall_on_knees", "fall_onto_seat", "walk_and_fall_any_way", "walk_and_slip")
 BLOWS = ("swing_fist", "punch_once", "kick_round")
 WALKS = ("walk_and_stop", "walk_with_still_arms")
 BONES = [("right_hip", "right_knee"), ("left_knee", "left_ankle"), ("neck", "right_shoulder"),
@@ -128,6 +128,22 @@ def test_who_lands_on_the_seat_is_low_before_the_head_is():
     hips, head = joint(joints, "right_hip")[..., 2], joint(joints, "head")[..., 2]
     landed = (hips < 0.25 * people.height_m[:, None]).double().argmax(1)
     assert bool((head.gather(1, landed[:, None])[:, 0] > 0.3 * people.height_m).all())
+    assert bool((head[:, -1] < 0.25 * people.height_m).all())
+
+
+def test_who_slips_lands_on_the_seat_with_the_feet_ahead_and_up():
+    people = draw_people(12, PeopleConfig(), torch.Generator().manual_seed(3))
+    time = torch.arange(round(4 * RATE), dtype=torch.float64) / RATE - 1.0
+    joints = perform(everyday.walk_and_slip, time.expand(12, -1), people)
+    hips, head = (joint(joints, name)[..., 2] for name in ("right_hip", "head"))
+    landed = (hips < 0.15 * people.height_m[:, None]).double().argmax(1)
+    assert bool((landed > round(1.3 * RATE)).all())
+    rows = torch.arange(12)
+    assert bool((head[rows, landed] > 0.25 * people.height_m).all())
+    ahead = torch.maximum(joint(joints, "right_ankle")[..., 1], joint(joints, "left_ankle")[..., 1])
+    assert bool(((ahead - joint(joints, "right_hip")[..., 1])[rows, landed] > 0.2 * people.height_m).all())
+    raised = torch.maximum(joint(joints, "right_ankle")[..., 2], joint(joints, "left_ankle")[..., 2])
+    assert bool((raised.amax(1) > 0.15 * people.height_m).all())
     assert bool((head[:, -1] < 0.25 * people.height_m).all())
 
 

@@ -60,6 +60,7 @@ MOVEMENTS: dict[str, Callable[[], Tensor]] = {
             everyday.fall_on_knees,
             everyday.fall_onto_seat,
             everyday.walk_and_fall_any_way,
+            everyday.walk_and_slip,
             everyday.kick_ball,
             martial_arts.swing_fist,
             martial_arts.punch_once,
