@@ -16,7 +16,7 @@ from tensorsim.vision.lifting.hidden_legs import HiddenLegs
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
-from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within
+from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within, gaps_with
 from tensorsim.vision.smoothing.even_time import to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise, noise_with_depth
@@ -360,6 +360,8 @@ class VideoToPose(nn.Module):
         # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
         hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
         hidden = hidden & crossed_within(mid_hips(joints), usable, self.hidden_speed_m_s / fps)
+        # Who is followed up to the left or right edge of the picture, and comes back from there, was beside it.
+        hidden = hidden & ~gaps_with(cut_off_beside(tracks.boxes, width) & tracks.valid, usable)
         there = usable | brief_gaps(usable, int(self.brief_gap_s * fps)) | hidden
         # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there
         # the joint of the matched pose replaces it, as long as the person is in the scene.

@@ -12,14 +12,22 @@ from tests.film import STANDING
 FPS, FRAMES = 30.0, 24
 
 
-def lifted(scores: torch.Tensor, sideways_px: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Joints (T, 14, 3) and validity (T,) of a standing body, its wrists moved by (T,) pixels."""
+def lifted(
+    scores: torch.Tensor, sideways_px: torch.Tensor, left_px: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Joints (T, 14, 3) and validity (T,) of a standing body, its wrists moved by (T,) pixels.
+
+    Its box begins ``left_px`` (T,) from the left edge of the picture.
+    """
     body = torch.tensor(STANDING) * 200.0 + torch.tensor([320.0, 150.0])
     frames = len(sideways_px)
     keypoints = body.expand(1, 1, frames, 17, 2).clone()
     keypoints[0, 0, :, 9:11, 0] += sideways_px[:, None]
     there = torch.ones(1, 1, frames, dtype=torch.bool)
-    tracks = Tracks(torch.zeros(1, 1, frames, 4), there, there)
+    boxes = torch.tensor([260.0, 140.0, 380.0, 360.0]).repeat(1, 1, frames, 1)
+    if left_px is not None:
+        boxes[0, 0, :, 0] = left_px
+    tracks = Tracks(boxes, there, there)
     stage = VideoToPose(nn.Identity(), nn.Identity(), lifter=NearestPoseLifter(load_pose_library()[::40]))
     pose = stage.lift(tracks, keypoints, scores.expand(1, 1, frames, 17), 480, 640, FPS)
     return pose.joints[0, 0], pose.valid[0, 0]
@@ -56,3 +64,17 @@ def test_who_is_hidden_for_long_is_gone_and_for_a_moment_is_not() -> None:
     scores[110:] = 0.0  # never seen again
     _, valid = lifted(scores, torch.zeros(120))
     assert (~valid).nonzero()[:, 0].tolist() == [*range(50, 90), *range(110, 120)]
+
+
+def test_who_leaves_the_picture_and_comes_back_is_not_there_meanwhile() -> None:
+    scores = torch.ones(60, 17)
+    scores[20:36] = 0.0
+    left = torch.full((60,), 100.0)
+    _, valid = lifted(scores, torch.zeros(60), left)
+    assert bool(valid.all()), "behind something"
+    left[24:30] = -5.0
+    _, valid = lifted(scores, torch.zeros(60), left)
+    assert (~valid).nonzero()[:, 0].tolist() == list(range(20, 36))
+    scores[23:] = 1.0  # for a moment
+    _, valid = lifted(scores, torch.zeros(60), left)
+    assert bool(valid.all())

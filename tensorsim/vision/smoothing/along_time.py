@@ -54,6 +54,15 @@ def crossed_within(position: Tensor, seen: Tensor, step: float) -> Tensor:
     return inside & (distance <= step * (after - before))
 
 
+def gaps_with(event: Tensor, seen: Tensor) -> Tensor:
+    """Frames (..., T) between two seen ones between which there is an ``event`` (..., T) bool in a frame not seen."""
+    before, after = _seen_beside(seen)
+    last = seen.shape[-1] - 1
+    inside = (before >= 0) & (after <= last) & ~seen
+    count = (event & ~seen).to(torch.int64).cumsum(dim=-1)
+    return inside & (count.gather(-1, after.clamp(0, last)) > count.gather(-1, before.clamp(0, last)))
+
+
 def _seen_beside(seen: Tensor) -> tuple[Tensor, Tensor]:
     """The last seen frame up to each one and the first from it on (..., T): -T and 2 T where there is none."""
     frames = seen.shape[-1]

@@ -7,6 +7,7 @@ import torch
 from tensorsim.vision.smoothing.along_time import (
     brief_gaps,
     crossed_within,
+    gaps_with,
     fill_gaps,
     local_linear,
     masked_median,
@@ -158,3 +159,18 @@ def test_only_ratios_of_weights_count() -> None:
     expected = local_linear(x, weights, 2.0)
     torch.testing.assert_close(local_linear(x, 1e-7 * weights, 2.0), expected)
     assert torch.equal(local_linear(x, 0 * weights, 2.0), x), "where nothing counts the value stays"
+
+
+def test_gaps_with_an_event() -> None:
+    seen = torch.tensor([0, 1, 0, 0, 0, 1, 1, 0, 1, 0], dtype=torch.bool)
+    event = torch.zeros_like(seen)
+    assert not gaps_with(event, seen).any()
+    event[[0, 3, 5, 9]] = (
+        True  # before the first and after the last seen frame, and in a seen one, nothing counts
+    )
+    assert gaps_with(event, seen).nonzero()[:, 0].tolist() == [2, 3, 4]
+    event[7] = True
+    both = gaps_with(torch.stack([event, ~event]), seen.expand(2, -1))
+    assert both[0].nonzero()[:, 0].tolist() == [2, 3, 4, 7]
+    assert both[1].nonzero()[:, 0].tolist() == [2, 3, 4]
+    assert not gaps_with(event, torch.zeros_like(seen)).any()
