@@ -7,8 +7,8 @@ import torch
 from tensorsim.vision.smoothing.along_time import (
     brief_gaps,
     crossed_within,
-    gaps_with,
     fill_gaps,
+    gaps_with,
     local_linear,
     masked_median,
     ridge_in_gaps,
