@@ -6,6 +6,8 @@ radar; the detector finds the rectangles, the pose network puts a standing body 
 
 import math
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -46,6 +48,16 @@ def walker(frames: int, fps: float, start_m: float, speed_m_s: float, x_m: float
     """Range and x (1, T) of somebody who walks away at ``speed_m_s``."""
     t = torch.arange(frames) / fps
     return (start_m + speed_m_s * t).unsqueeze(0), torch.full((1, frames), x_m)
+
+
+def panned(frames: Tensor, px_per_frame: int) -> Tensor:
+    """The film (T, 3, H, W) before a blue pattern that goes to the left, as before a camera that turns to the right."""
+    count, _, height, width = frames.shape
+    size = (width + count * px_per_frame, height)
+    coarse = np.random.default_rng(0).integers(0, 110, (12, size[0] // 20), np.uint8)
+    pattern = torch.from_numpy(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC))
+    behind = [pattern[:, px_per_frame * k : px_per_frame * k + width] for k in range(count)]
+    return torch.maximum(frames, torch.stack(behind)[:, None])
 
 
 class RectangleDetector(nn.Module):

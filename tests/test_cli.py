@@ -26,7 +26,7 @@ from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.plot import draw_floor
 from tensorsim.radar.presets import PRESETS
 from tensorsim.weights import save_weights
-from tests.film import RectangleDetector, StandingPose, film, walker
+from tests.film import RectangleDetector, StandingPose, film, panned, walker
 from tests.stage import assert_same
 
 FPS = 10.0
@@ -207,11 +207,7 @@ def test_a_camera_that_moves_is_said_and_its_turns_are_taken_out_where_it_is_est
     tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A walker before a blue pattern that passes at 60 pixels per second."""
-    frames = film(*walker(25, FPS, 4.0, 1.2, 0.3))
-    pattern = np.random.default_rng(0).integers(0, 110, (12, 40), np.uint8)
-    pattern = cv2.resize(pattern, (800, 240), interpolation=cv2.INTER_CUBIC)
-    for k, frame in enumerate(frames):
-        frame[:] = torch.maximum(frame, torch.from_numpy(pattern[:, 6 * k : 6 * k + 320].copy()))
+    frames = panned(film(*walker(25, FPS, 4.0, 1.2, 0.3)), 6)
     write_video(tmp_path / "pan.avi", frames.permute(0, 2, 3, 1).numpy(), FPS)
     cli.main(["simulate", str(tmp_path / "pan.avi"), "--out", str(tmp_path / "out"), *stand_ins])
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from tensorsim import cli
 from tensorsim.commands import evaluate_films
 from tensorsim.config import ACTIVITIES, RadarConfig
+from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.labelled_films import (
     FilmReader,
@@ -28,7 +29,7 @@ from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.streaming import Found
 from tensorsim.types import Detections, Pose, RadarMaps
-from tests.film import RectangleDetector, StandingPose, film, walker
+from tests.film import RectangleDetector, StandingPose, film, panned, walker
 
 FPS = 10.0
 
@@ -165,6 +166,34 @@ def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -
     assert CountingDetector.frames == 0, "kept in the cache"
     for first, second in zip(found[0].pose, found[1].pose, strict=True):
         assert torch.equal(first, second)
+
+
+def test_how_the_camera_moves_is_kept_with_what_the_networks_found(tmp_path: Path) -> None:
+    frames = panned(film(*walker(25, FPS, 4.0, 1.2, 0.3)), 6)
+    write_video(tmp_path / "pan.avi", frames.permute(0, 2, 3, 1).numpy(), FPS)
+    known = LabelledFilm(tmp_path / "pan.avi", 0.0, 2.4, (ACTIVITIES[7],))
+    (tmp_path / "w.onnx").write_text("")
+    stage = VideoToPose(CountingDetector(), StandingPose()).eval()
+    networks = (tmp_path / "w.onnx", tmp_path / "w.onnx")
+    found = {}
+    with torch.inference_mode():
+        for calibrate in (True, False):
+            reader = FilmReader(stage, networks, tmp_path / "cache", calibrate=calibrate)
+            found[calibrate] = reader.people(known, reader.open(known), torch.device("cpu"), quiet=True)
+        kept = sorted(path.name.split("-")[0] for path in (tmp_path / "cache").iterdir())
+        assert kept == ["camera", "detections", "keypoints"]
+        (tmp_path / "pan.avi").rename(tmp_path / "moved.avi")
+        again = FilmReader(stage, networks, tmp_path / "cache")
+        film_there = LabelledFilm(tmp_path / "moved.avi", 0.0, 2.4, known.accept)
+        seen = again.observed(film_there, again.open(film_there), torch.device("cpu"), quiet=True)
+    assert found[False].from_film is None
+    assert found[True].from_film is not None
+    assert found[True].from_film.shape == (24, 3, 3)
+    assert found[True].background_px_s == pytest.approx(60, rel=0.1)
+    assert seen.camera_steps is not None
+    assert seen.camera_steps[1:, 0].numpy() == pytest.approx(-6.0, abs=0.3)
+    # The walker's place in the picture is that of the film.
+    torch.testing.assert_close(found[True].pose.keypoints, found[False].pose.keypoints, rtol=0.0, atol=0.01)
 
 
 @pytest.mark.parametrize(
