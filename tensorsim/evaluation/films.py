@@ -71,7 +71,7 @@ def true_keypoints(clip: Clip) -> Observed:
             torch.zeros(0, frames, 17, 2), torch.zeros(0, frames, 17),
         )  # fmt: skip
     pixels, inside, _ = project(joints)
-    boxes = keypoint_boxes(pixels, inside, margin=0.06)
+    boxes = keypoint_boxes(pixels, inside)
     return Observed(boxes.float()[None], inside.any(dim=-1)[None], pixels.float()[None], inside.float()[None])
 
 

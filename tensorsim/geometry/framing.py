@@ -12,6 +12,9 @@ from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, pri
 
 #: Extent of a body beyond its joints: above the nose and below the ankles.
 _ABOVE_M, _BELOW_M = 0.25, 0.10
+#: Shares of the longer side of an upright person's keypoints from the outermost ones to the left, top, right and bottom
+#: of the box that the detector finds, measured on rendered films.
+BOX_MARGINS = (0.045, 0.07, 0.045, 0.09)
 #: Smallest field of view, also for small motion.
 _NARROWEST_RAD = math.radians(40.0)
 
@@ -78,14 +81,15 @@ def seen_keypoints(
     return torch.where(there[..., None], pixels, 0.0), (there & inside).to(joints.dtype)
 
 
-def keypoint_boxes(keypoints: Tensor, scores: Tensor, margin: float = 0.12) -> Tensor:
+def keypoint_boxes(keypoints: Tensor, scores: Tensor) -> Tensor:
     """Boxes (..., 4) ``xyxy`` about keypoints (..., 17, 2) with a score; zeros without any.
 
-    Keypoints lie inside of bodies: boxes are wider by ``margin`` of their longer side all around.
+    Keypoints lie inside of bodies: boxes are wider by :data:`BOX_MARGINS` of their longer side, as those of the
+    detector are.
     """
     visible = (scores > 0)[..., None]
     low = torch.where(visible, keypoints, math.inf).amin(dim=-2)
     high = torch.where(visible, keypoints, -math.inf).amax(dim=-2)
-    extra = margin * (high - low).amax(dim=-1, keepdim=True)
-    boxes = torch.cat([low - extra, high + extra], dim=-1)
+    extra = keypoints.new_tensor(BOX_MARGINS) * (high - low).amax(dim=-1, keepdim=True)
+    boxes = torch.cat([low - extra[..., :2], high + extra[..., 2:]], dim=-1)
     return torch.where(visible.any(dim=-2), boxes, 0.0)

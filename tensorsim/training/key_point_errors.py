@@ -16,6 +16,7 @@ from tensorsim.evaluation.measured.motions import Draw, smooth_noise
 from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
+from tensorsim.training.lifter_views import USUAL_SCORES
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
@@ -128,7 +129,8 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
         found = torch.where((spell[:, None] & mixed)[..., None], found[:, list(MIRRORED)], found)
 
     inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
-    scores = (0.85 - 3.0 * error.norm(dim=-1) + 0.06 * each.normal(frames).T).clamp(0.35, 0.95)
+    usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
+    scores = (usual - 3.0 * error.norm(dim=-1) + 0.06 * each.normal(frames).T).clamp(0.35, 0.98)
     scores = torch.where(merged[..., 0], scores - 0.2, scores)
     hidden = _spell(frames, 0.12, 0.1, 1.0, each).T
     scores = torch.where(hidden, 0.2, scores) * (inside & (depth > NEAR_M))
@@ -181,7 +183,7 @@ class FilmedMotion:
     def lifted(self, seen: list[Seen], filming: Filming, fps: float) -> tuple[Tensor, Tensor]:
         """What the pipeline makes of key points before a camera: joints (P, T, 14, 3) and presence (P, T)."""
         keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
-        boxes = keypoint_boxes(keypoints, scores, margin=0.08)
+        boxes = keypoint_boxes(keypoints, scores)
         if not bool(valid.any()):
             return torch.ones((*valid.shape, 14, 3)), valid
         stage = self.stage.seen_by(filming.believed, known=False)

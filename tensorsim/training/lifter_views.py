@@ -23,7 +23,7 @@ _LABELLED, _KNOWN = 0.1, 0.4
 #: Relative size of the errors of each COCO key point: face, shoulders, elbows, wrists, hips, knees, ankles.
 _ERROR = (0.7,) * 5 + (0.9,) * 2 + (1.2,) * 2 + (1.5,) * 2 + (1.2,) * 2 + (1.0,) * 2 + (1.2,) * 2
 #: Scores of key points that are found well, measured on films: of the head, of shoulders to ankles.
-_SCORE = (0.92,) * 5 + (0.80,) * 12
+USUAL_SCORES = (0.92,) * 5 + (0.80,) * 12
 #: Body heights from the outermost key points to the left, top, right and bottom of the boxes that the detector finds,
 #: measured on rendered films: of who is upright, and of who lies.
 _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
@@ -240,7 +240,7 @@ def _missed(
         found = torch.where((spell[..., None] & swapped)[..., None], found[:, :, list(MIRRORED)], found)
 
     miss = (found - points).norm(dim=-1) / unit[..., None]
-    usual = torch.tensor(_SCORE) * (1 + 0.05 * draw.normal(1, 17))
+    usual = torch.tensor(USUAL_SCORES) * (1 + 0.05 * draw.normal(1, 17))
     level = torch.where(draw.chance(0.8)[:, None, None], usual, torch.ones(17)) * draw.number(
         0.85, 1.08, 1, 1
     )

@@ -11,7 +11,7 @@ from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.skeleton import body_to_coco
 from tensorsim.config import JOINTS, CameraConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
+from tensorsim.geometry.framing import BOX_MARGINS, camera_on, keypoint_boxes, seen_keypoints
 
 HEIGHT, WIDTH = 360, 640
 
@@ -101,11 +101,12 @@ def test_boxes_surround_the_keypoints_that_have_a_score() -> None:
     scores = torch.ones(2, 17)
     keypoints[0, 3], scores[0, 3] = torch.tensor([900.0, 900.0]), 0.0
     scores[1] = 0.0
-    boxes = keypoint_boxes(keypoints, scores, margin=0.1)
+    boxes = keypoint_boxes(keypoints, scores)
     told = keypoints[0, scores[0] > 0].numpy()
     low, high = told.min(axis=0), told.max(axis=0)
-    extra = 0.1 * (high - low).max()
-    np.testing.assert_allclose(boxes[0].numpy(), [*(low - extra), *(high + extra)], rtol=1e-5)
+    left, top, right, bottom = (high - low).max() * np.array(BOX_MARGINS)
+    expected = [low[0] - left, low[1] - top, high[0] + right, high[1] + bottom]
+    np.testing.assert_allclose(boxes[0].numpy(), expected, rtol=1e-5)
     assert (boxes[1] == 0).all()
 
 

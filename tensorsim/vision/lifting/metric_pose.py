@@ -21,6 +21,7 @@ from tensorsim.vision.lifting.floor import (
     range_on_floor,
     upright_share,
 )
+from tensorsim.vision.lifting.standing_feet import range_over_feet
 from tensorsim.vision.smoothing.along_time import (
     fill_gaps,
     masked_median,
@@ -84,10 +85,11 @@ class MetricPose(nn.Module):
 
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
-    joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm.
+    joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm, and
+    changes as standing feet tell (:mod:`tensorsim.vision.lifting.standing_feet`).
     The less upright a body is, the more its range depends on where the person stood last, and on the range at which its
     lowest joint rests on the floor (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on its line of sight at its
-    own depth. Frames with fewer than ten visible joints, or whose pose the lifter does not know (people who lie), do
+    own depth. Frames with fewer than eight visible joints, or whose pose the lifter does not know (people who lie), do
     not give a reliable size: they take that of the others, and one of few joints that would make a body of less than
     0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The floor is a low running
     quantile of the height of the lower ankle where they stand, so that it stays through a jump and an outlier does not
@@ -152,7 +154,7 @@ class MetricPose(nn.Module):
         self.range_smoothing_s = range_smoothing_s
         self.floor_window_s = floor_window_s
         self.calibrated = calibrated
-        self.whole_body_joints = 10  # visible joints from which the size of a body is reliable
+        self.whole_body_joints = 8  # visible joints from which the size of a body is reliable
         self.poor_fit = (
             0.25  # squared error of the lifted pose over the spread of the joints; good ones have 0.01
         )
@@ -237,6 +239,11 @@ class MetricPose(nn.Module):
             )
             whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
+            body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
+            # What is found at an edge of the picture is beyond it.
+            within = inside & (across > 0.01) & (across < 0.99)
+            tells = whole.to(precision.dtype) * precision + 1e-4
+            hips_range = range_over_feet(hips_range, image, depth, within, body_px, tells, fps)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
             body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
             valid = valid & (many | (scale > self.least_size * body_px))

@@ -139,7 +139,7 @@ def test_steps_at_even_times_lead_along_the_same_path() -> None:
 
 def observed(keypoints: Tensor, size: tuple[int, int]) -> Tracks:
     valid = torch.ones(1, 1, keypoints.shape[2], dtype=torch.bool)
-    boxes = keypoint_boxes(keypoints, torch.ones_like(keypoints[..., 0]), margin=0.06)
+    boxes = keypoint_boxes(keypoints, torch.ones_like(keypoints[..., 0]))
     edge = torch.tensor([size[1] - 1.0, size[0] - 1.0]).repeat(2)
     return Tracks(boxes.clamp(min=0).minimum(edge), valid, valid)
 

@@ -1,0 +1,83 @@
+"""Feet that stand on the floor: the hips move as far as they move about a foot that stays.
+
+The size of a body tells its range to some per cent, and the error changes within a second, which looks like motion
+along the line of sight. A foot that stays in the picture stays in the world, and how far the hips are ahead of it is
+part of the pose: from this follows how the range changes from frame to frame, though not the range itself.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from tensorsim.vision.smoothing.along_time import local_linear
+
+
+def squared_speed(image: Tensor, seen: Tensor, fps: float, smoothing_s: float) -> Tensor:
+    """Squared speeds (..., J, T - 1) in pixels per second of points (..., T, J, 2) that are smoothed along time."""
+    points = image.transpose(-3, -2).transpose(-2, -1)
+    weights = seen.transpose(-2, -1).unsqueeze(-2).expand_as(points).to(points.dtype) + 1e-4
+    smooth = local_linear(points, weights, smoothing_s * fps)
+    return ((smooth[..., 1:] - smooth[..., :-1]) * fps).square().sum(dim=-2)
+
+
+def range_over_feet(
+    hips_range: Tensor,
+    image: Tensor,
+    depth: Tensor,
+    seen: Tensor,
+    body_px: Tensor,
+    precision: Tensor,
+    fps: float,
+) -> Tensor:
+    """Ranges of the hips that change as pose and feet tell where a foot stands, and not at all where a body is at rest.
+
+    With a foot at depth d about the hips that stands, ``y(t + 1) - y(t) = d(t) - d(t + 1)``. A foot stands as far as it
+    is slow in the picture (0.15 standing heights per second) and, its depth added to the given range, along the line of
+    sight (0.4 m/s, more where the range is less precise): of somebody who comes straight towards the camera both feet
+    are slow in the picture. One foot alone is believed by half, as near and far leg are easily mistaken in a step. A
+    body is at rest as far as all joints but two are slow (0.08 heights per second) and the given range is (0.2 m/s).
+    The values are standard deviations of Gaussian weights. What the sum of all steps differs by from the given ranges
+    is averaged over 1.5 s: their slow part stays.
+
+    Args:
+        hips_range: (..., T) m, of the size and the floor, smoothed.
+        image: (..., T, 14, 2) joints in pixels.
+        depth: (..., T, 14) of the joints about the hips, m.
+        seen: (..., T, 14) bool, the joints whose place in the picture counts.
+        body_px: (..., T) standing heights in pixels.
+        precision: (..., T) positive, of the given range: 1 of somebody upright.
+        fps: frames per second.
+
+    Returns:
+        (..., T) m. Differentiable.
+    """
+    if hips_range.shape[-1] < 2:
+        return hips_range
+    steps = hips_range[..., 1:] - hips_range[..., :-1]
+    both_seen = (seen[..., 1:, :] & seen[..., :-1, :]).transpose(-2, -1)
+    unit = body_px[..., 1:].unsqueeze(-2).square()
+    weight = precision[..., 1:]
+
+    ankles = depth[..., 10:14:3].transpose(-2, -1)  # joints 10 and 13
+    ankles = local_linear(ankles, torch.ones_like(ankles), 0.06 * fps)
+    about = ankles[..., :-1] - ankles[..., 1:]
+    slides = (steps.unsqueeze(-2) - about) * fps
+    slides = local_linear(slides, torch.ones_like(slides), 0.12 * fps)
+    across = squared_speed(image[..., 10:14:3, :], seen[..., 10:14:3], fps, 0.06) / unit
+    stands = torch.exp(-0.5 * (across / 0.15**2 + weight.unsqueeze(-2) * (slides / 0.4).square()))
+    stands = stands * both_seen[..., 10:14:3, :].all(dim=-2, keepdim=True)
+    change = (stands * about).sum(dim=-2) / stands.sum(dim=-2).clamp(min=1e-6)
+    believed = torch.maximum(stands.amin(dim=-2), 0.5 * stands.amax(dim=-2))
+
+    across = torch.where(both_seen, squared_speed(image, seen, fps, 0.2) / unit, 0.0)
+    third = across.topk(3, dim=-2)[0][..., 2, :]
+    drifts = local_linear(steps * fps, torch.ones_like(steps), 0.12 * fps)
+    rests = torch.exp(-0.5 * (third / 0.08**2 + weight * (drifts / 0.2).square()))
+    rests = rests * (both_seen.sum(dim=-2) >= 6)
+    change = change * believed / (believed + rests).clamp(min=1e-6)
+    believed = torch.maximum(believed, rests)
+
+    way = F.pad((steps + believed * (change - steps)).cumsum(dim=-1), [1, 0])
+    # A mean without a slope: a steady drift of somebody who stands is an error of the size as well.
+    level = torch.full_like(way, 30.0)
+    return way + local_linear(hips_range - way, precision, 1.5 * fps, ridge=level)
