@@ -95,9 +95,10 @@ def fused_range(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean of the ranges that the size of a body, the floor, and where the person stood tell, each with its precision.
 
-    The size of an upright body is good to 3 %, and taken alone; of any other to 15 %. The height of the floor is good
-    to 6 cm where the person stood, and to 12 cm more per metre from there (the camera's tilt, a mattress). Hips are
-    within three tenths of the standing height from there (standard deviations). All three change smoothly, so that
+    The size of an upright body is good to 3 %, and taken alone; of any other to 15 %, with the long tails of a Cauchy
+    distribution about the place where the person stood: who lies may look twice as far away. The height of the floor is
+    good to 6 cm where the person stood, and to 12 cm more per metre from there (the camera's tilt, a mattress). Hips
+    are within three tenths of the standing height from there (standard deviations). All three change smoothly, so that
     nobody who lies still jumps from one range to another.
 
     Args:
@@ -118,6 +119,7 @@ def fused_range(
     gain = torch.where(usable, gain, torch.ones_like(gain))
     bent = 1.0 - upright
     size = 1.0 / (by_size * (0.03 + 0.12 * bent)).square().clamp(min=1e-4)
+    size = size / (1.0 + bent * ((by_size / stood).log() / 0.15).square())
     floor = usable * bent / (gain.square() * (0.06**2 + (0.12 * (by_floor - stood)).square()))
     place = known * bent / (0.3 * height).square()
     total = size + floor + place

@@ -69,8 +69,9 @@ def test_size_counts_while_upright_and_floor_and_last_stand_otherwise() -> None:
     floor, gain = torch.tensor([3.0, 3.0, math.inf, 3.0]), torch.tensor([2.0, 2.0, math.inf, 2.0])
     stood = torch.tensor([3.5, 3.5, 3.5, math.inf])
     y, share, precision = fused_range(size, upright, floor, gain, stood, torch.full((4,), 1.8))
-    # Precisions of the size of a bent body, of the floor half a metre from the stand, and of the stand.
-    by_size, by_floor, by_stand = 1 / 0.6**2, 1 / (2.0**2 * 2 * 0.06**2), 1 / 0.54**2
+    # Precisions of the size of a bent body and of the floor, both half a metre from the stand, and of the stand.
+    tails = 1 + (math.log(4.0 / 3.5) / 0.15) ** 2
+    by_size, by_floor, by_stand = 1 / 0.6**2 / tails, 1 / (2.0**2 * 2 * 0.06**2), 1 / 0.54**2
     all_three, two = by_size + by_floor + by_stand, by_size + by_stand
     assert share.tolist() == pytest.approx([1.0, by_size / all_three, by_size / two, 1.0])
     mean = (4.0 * by_size + 3.0 * by_floor + 3.5 * by_stand) / all_three
@@ -126,9 +127,11 @@ def test_somebody_who_is_not_upright_is_near_where_they_stood() -> None:
     size, stood = torch.tensor([9.0, 9.0, 9.0, 1.0]), torch.full((4,), 4.0)
     upright, nothing = torch.tensor([0.0, 0.5, 1.0, 0.0]), torch.full((4,), math.inf)
     found = fused_range(size, upright, nothing, nothing, stood, torch.full((4,), 1.8))[0]
-    # Of the size, good to 15 % or, half upright, to 9 %; the stand is good to 0.54 m and then has half its say.
+    # Of the size, good to 15 % or, half upright, to 9 %, with long tails; the stand is good to 0.54 m and then has
+    # half its say.
     bent, half, near = (
-        1 / off**2 / (1 / off**2 + say / 0.54**2) for off, say in ((1.35, 1), (0.81, 0.5), (0.15, 1))
+        1 / off**2 / (1 / off**2 + (1 + say * (math.log(ratio) / 0.15) ** 2) * say / 0.54**2)
+        for off, say, ratio in ((1.35, 1, 9 / 4), (0.81, 0.5, 9 / 4), (0.15, 1, 1 / 4))
     )
     assert found.tolist() == pytest.approx([4 + 5 * bent, 4 + 5 * half, 9.0, 4 - 3 * near])
 
@@ -326,7 +329,7 @@ def test_size_floor_and_stand_are_weighed_by_their_precisions() -> None:
     by_size = torch.where(deep, 1.3 * true, true)
     ranges, tells, stands, _ = on_floor(world, by_size)
     ankle = world[:, (10, 13)].mean(dim=1)
-    size = 1 / (0.15 * by_size).square()
+    size = 1 / (0.15 * by_size).square() / (1 + ((by_size / stood).log() / 0.15).square())
     floor = 1 / ((ankle[:, 1] / 1.8).square() * (0.06**2 + (0.12 * (true - stood)).square()))
     place = 1 / (0.3 * TALL) ** 2
     expected = (size * by_size + floor * true + place * stood) / (size + floor + place)
