@@ -96,10 +96,10 @@ def fused_range(
     """Mean of the ranges that the size of a body, the floor, and where the person stood tell, each with its precision.
 
     The size of an upright body is good to 3 %, and taken alone; of any other to 15 %, with the long tails of a Cauchy
-    distribution about the place where the person stood: who lies may look twice as far away. The height of the floor is
-    good to 6 cm where the person stood, and to 12 cm more per metre from there (the camera's tilt, a mattress). Hips
-    are within three tenths of the standing height from there (standard deviations). All three change smoothly, so that
-    nobody who lies still jumps from one range to another.
+    distribution about the place where the person stood: somebody who lies may seem twice as far away. The height of the
+    floor is good to 6 cm where the person stood, and to 12 cm more per metre from there (the camera's tilt, a
+    mattress). Hips are within three tenths of the standing height from there (standard deviations). All three change
+    smoothly, so that nobody who lies still jumps from one range to another.
 
     Args:
         by_size: (...) metres.

@@ -49,6 +49,18 @@ def camera_range(focal_px: Tensor, height_m: Tensor, height_px: Tensor) -> Tenso
     return focal_px * height_m / height_px
 
 
+def standing_px(focal_px: Tensor, height_m: Tensor, hips_range: Tensor, offset: Tensor) -> Tensor:
+    """Height in pixels that a body would have upright, the inverse of :func:`camera_range`.
+
+    Args:
+        focal_px: f, focal length in pixels.
+        height_m: H, standing height in metres.
+        hips_range: y of the hips in metres.
+        offset: d, mean depth of the joints about the hips in standing heights: ``f H / (y + H d)``.
+    """
+    return focal_px / (hips_range / height_m + offset).clamp(min=1e-3)
+
+
 def accumulated_displacement(u: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
     r"""The paper's position: displacement of every frame times the scale of that frame, accumulated.
 
@@ -85,8 +97,8 @@ class MetricPose(nn.Module):
 
     ``mode="camera"``: a pinhole camera. A standing person of height H at range y has a height of ``s = f H / y``
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
-    joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm, and
-    changes as standing feet tell (:mod:`tensorsim.vision.lifting.standing_feet`).
+    joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm.
+    While a foot stands on the floor, changes of y follow the pose (:mod:`tensorsim.vision.lifting.standing_feet`).
     The less upright a body is, the more its range depends on where the person stood last, and on the range at which its
     lowest joint rests on the floor (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on its line of sight at its
     own depth. Frames with fewer than eight visible joints, or whose pose the lifter does not know (people who lie), do
@@ -221,7 +233,8 @@ class MetricPose(nn.Module):
             many = seen.sum(dim=-1) >= self.whole_body_joints
             # Of who is cut off by the left or right edge of the picture, the network puts what is beyond at the edge.
             across = keypoints[..., 0] / max(image_width - 1, 1)
-            beyond = (seen & ((across < 0.01) | (across > 0.99))).any(dim=-1)
+            beside = (across < 0.01) | (across > 0.99)
+            beyond = (seen & beside).any(dim=-1)
             if cut_off is not None:
                 beyond = beyond | cut_off
             whole = valid & many & (lifted.distance < self.poor_fit)
@@ -239,13 +252,11 @@ class MetricPose(nn.Module):
             )
             whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
-            body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
-            # What is found at an edge of the picture is beyond it.
-            within = inside & (across > 0.01) & (across < 0.99)
+            body_px = standing_px(focal, height, hips_range, offset)
             tells = whole.to(precision.dtype) * precision + 1e-4
-            hips_range = range_over_feet(hips_range, image, depth, within, body_px, tells, fps)
+            hips_range = range_over_feet(hips_range, image, depth, inside & ~beside, body_px, tells, fps)
             # A network that sees a leg alone may take it for a small body: such a frame is discarded.
-            body_px = focal / (hips_range / height + offset).clamp(min=1e-3)
+            body_px = standing_px(focal, height, hips_range, offset)
             valid = valid & (many | (scale > self.least_size * body_px))
             seen = seen & valid[..., None]
             # Hidden joints are where the lifted pose has them, at the size of the reliable frames.

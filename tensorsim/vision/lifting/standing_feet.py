@@ -1,8 +1,9 @@
-"""Feet that stand on the floor: the hips move as far as they move about a foot that stays.
+"""Changes of range from feet that stand on the floor.
 
-The size of a body tells its range to some per cent, and the error changes within a second, which looks like motion
-along the line of sight. A foot that stays in the picture stays in the world, and how far the hips are ahead of it is
-part of the pose: from this follows how the range changes from frame to frame, though not the range itself.
+The size of a body gives its range with an error of some per cent, and that error changes within a second, which looks
+like motion along the line of sight. A foot that does not move in the picture does not move in the world, and the pose
+says how far the hips are in front of it or behind it. Together they tell how the range changes from frame to frame,
+though not the range itself.
 """
 
 import torch
@@ -29,23 +30,24 @@ def range_over_feet(
     precision: Tensor,
     fps: float,
 ) -> Tensor:
-    """Ranges of the hips that change as pose and feet tell where a foot stands, and not at all where a body is at rest.
+    """Correct how ranges change while a foot stands on the floor or the whole body is at rest.
 
-    With a foot at depth d about the hips that stands, ``y(t + 1) - y(t) = d(t) - d(t + 1)``. A foot stands as far as it
-    is slow in the picture (0.15 standing heights per second) and, its depth added to the given range, along the line of
-    sight (0.4 m/s, more where the range is less precise): of somebody who comes straight towards the camera both feet
-    are slow in the picture. One foot alone is believed by half, as near and far leg are easily mistaken in a step. A
-    body is at rest as far as all joints but two are slow (0.08 heights per second) and the given range is (0.2 m/s).
-    The values are standard deviations of Gaussian weights. What the sum of all steps differs by from the given ranges
-    is averaged over 1.5 s: their slow part stays.
+    If a foot at depth d about the hips stands, ``y(t + 1) - y(t) = d(t) - d(t + 1)``. A foot is taken to stand if it is
+    slow in the picture (0.15 standing heights per second) and also along the line of sight, where its speed is that of
+    the given range and of d together (0.4 m/s, more where the range is less precise): both feet of somebody who walks
+    straight towards the camera are slow in the picture. While only one foot stands, half of its change and half of
+    the given one are taken, because the near and the far leg are easily mistaken for each other in a step. A body is at
+    rest, and y does not change, if all joints but two are slow (0.08 heights per second) and the given range is too
+    (0.2 m/s). All these limits are standard deviations of Gaussian weights. The sum of the changes drifts away from the
+    given ranges; their mean difference over 1.5 s is added, so that slow changes of the given ranges remain.
 
     Args:
-        hips_range: (..., T) m, of the size and the floor, smoothed.
+        hips_range: (..., T) m, from size and floor, smoothed.
         image: (..., T, 14, 2) joints in pixels.
         depth: (..., T, 14) of the joints about the hips, m.
-        seen: (..., T, 14) bool, the joints whose place in the picture counts.
+        seen: (..., T, 14) bool, the joints that are seen inside the picture.
         body_px: (..., T) standing heights in pixels.
-        precision: (..., T) positive, of the given range: 1 of somebody upright.
+        precision: (..., T) positive, of the given range: 1 for an upright body.
         fps: frames per second.
 
     Returns:
@@ -78,6 +80,6 @@ def range_over_feet(
     believed = torch.maximum(believed, rests)
 
     way = F.pad((steps + believed * (change - steps)).cumsum(dim=-1), [1, 0])
-    # A mean without a slope: a steady drift of somebody who stands is an error of the size as well.
+    # The ridge leaves a mean without a slope: a steady drift of somebody who stands is an error of the size as well.
     level = torch.full_like(way, 30.0)
     return way + local_linear(hips_range - way, precision, 1.5 * fps, ridge=level)

@@ -66,12 +66,10 @@ def test_the_hips_move_about_the_feet_as_the_pose_tells() -> None:
 
 
 def test_one_foot_that_stands_is_believed_by_half() -> None:
-    """The range given is 0.3 m/s too fast: with one foot half of it remains."""
+    """Half of a wave in the given range remains; it is too fast for the mean over seconds to keep any of it."""
     swings = torch.zeros(FRAMES, 2, 2, dtype=torch.float64)
     swings[:, 1, 0] = BODY_PX * 1.5 * TIME
-    wave = 0.03 * torch.sin(
-        4 * math.pi * TIME
-    )  # fast enough for the mean over seconds to leave nothing of it
+    wave = 0.03 * torch.sin(4 * math.pi * TIME)
     there = found(4.0 + wave, swings)
     share = (there.diff() * wave.diff())[INSIDE].sum() / wave.diff()[INSIDE].square().sum()
     assert float(share) == pytest.approx(0.5, abs=0.05)
