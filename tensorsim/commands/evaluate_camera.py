@@ -10,6 +10,9 @@ from tensorsim.exceptions import TensorsimError
 if TYPE_CHECKING:
     from tensorsim.evaluation.camera import CameraErrors
 
+#: Standard deviation in degrees up to which an estimated field of view is called sure.
+SURE_FOV_DEG = 4.0
+
 
 @dataclass(frozen=True)
 class EvaluateCamera:
@@ -69,8 +72,15 @@ class EvaluateCamera:
         if not found:
             raise TensorsimError("evaluate camera: got no camera that has a walk in its picture")
         tilts = sum(abs(one.pitch_deg) <= 2 for one in found)
-        ranges = sum(abs(one.range) <= 0.07 for one in found)
-        print(f"tilt within 2 degrees: {tilts} of {len(found)}; range within 7 %: {ranges} of {len(found)}")
+        right = [abs(one.range) <= 0.07 for one in found]
+        print(
+            f"tilt within 2 degrees: {tilts} of {len(found)}; range within 7 %: {sum(right)} of {len(found)}"
+        )
+        sure = [within for one, within in zip(found, right, strict=True) if one.fov_sd_deg <= SURE_FOV_DEG]
+        print(
+            f"range within 7 % where the field of view is sure to {SURE_FOV_DEG:g} degrees: "
+            f"{sum(sure)} of {len(sure)}; elsewhere {sum(right) - sum(sure)} of {len(right) - len(sure)}"
+        )
 
     @staticmethod
     def _errors(row: "list[CameraErrors]") -> str:

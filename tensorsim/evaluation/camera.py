@@ -50,12 +50,14 @@ class CameraErrors(NamedTuple):
         pitch_deg: estimated less true.
         range: relative, median over the frames with an upright body.
         fov_deg, height_m: estimated less true.
+        fov_sd_deg: the standard deviation that the estimate gives for its field of view.
     """
 
     pitch_deg: float
     range: float
     fov_deg: float
     height_m: float
+    fov_sd_deg: float
 
 
 def known_camera(tilt_deg: float, height_m: float, fov_deg: float) -> CameraConfig:
@@ -144,4 +146,5 @@ def errors_of(found: CameraEstimate, camera: CameraConfig, walk: Walk) -> Camera
         float(ratio[upright].median()) - 1.0,
         math.degrees(float(found.horizontal_fov_rad) - camera.horizontal_fov_rad),
         float(found.height_m) - camera.position_m[2],
+        math.degrees(float(found.horizontal_fov_sd_rad)),
     )

@@ -20,8 +20,8 @@ PACE, PACE_SPREAD = 0.7, 0.2
 #: Walking speed in standing heights per second over the square of the cycles per second, and the standard deviation of
 #: its logarithm: steps lengthen in proportion to their rate (Sekiya and Nagasaki, "Reproducibility of the walking
 #: patterns of normal young adults", 1998, 0.0065 m per step and minute; Boulic's gait 0.89, captured walks 0.82 to
-#: 0.95).
-WALK_RATIO, WALK_RATIO_SPREAD = 0.9, 0.15
+#: 0.95, a standard deviation of about 0.05 of their own; people of other habits get some more).
+WALK_RATIO, WALK_RATIO_SPREAD = 0.9, 0.08
 
 
 def ends_of_body(keypoints: Tensor) -> Tensor:

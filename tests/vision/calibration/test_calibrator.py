@@ -127,7 +127,7 @@ def test_key_points_of_low_scores_do_not_tell_the_camera(seed: int) -> None:
         # Frames that do not count make it less sure, not wrong: whoever walks up to a gap has not stopped.
         assert abs(errors.range) < 0.12
     assert tilts[0] < 0.5
-    assert tilts[1] > 0.55
+    assert tilts[1] > 1.5 * tilts[0]
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -432,4 +432,4 @@ def test_bodies_that_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     # One cycle a second, within a tenth after two seconds, tells the speed better than none.
     assert mean[[4, 6]].tolist() == pytest.approx([0.0, 0.035 * 1.6])
     assert float(mean[5]) == pytest.approx(math.log(0.9 * 1.6), abs=0.2)
-    assert deviation[4:].tolist() == pytest.approx([0.08 / 1.6, 0.15, 0.02 * 1.6])
+    assert deviation[4:].tolist() == pytest.approx([0.08 / 1.6, 0.08, 0.02 * 1.6])
