@@ -10,8 +10,8 @@ from tensorsim.exceptions import TensorsimError
 if TYPE_CHECKING:
     from tensorsim.evaluation.camera import CameraErrors
 
-#: Standard deviation in degrees up to which an estimated field of view is called sure.
-SURE_FOV_DEG = 4.0
+#: Standard deviation of an estimated field of view, in degrees, by which walks are told apart.
+FOV_SD_DEG = 4.0
 
 
 @dataclass(frozen=True)
@@ -72,15 +72,18 @@ class EvaluateCamera:
         if not found:
             raise TensorsimError("evaluate camera: got no camera that has a walk in its picture")
         tilts = sum(abs(one.pitch_deg) <= 2 for one in found)
-        right = [abs(one.range) <= 0.07 for one in found]
+        print(f"tilt within 2 degrees: {tilts} of {len(found)}; range within 7 %: {self._right(found)}")
+        narrow = [one for one in found if one.fov_sd_deg <= FOV_SD_DEG]
+        wide = [one for one in found if one.fov_sd_deg > FOV_SD_DEG]
         print(
-            f"tilt within 2 degrees: {tilts} of {len(found)}; range within 7 %: {sum(right)} of {len(found)}"
+            f"range within 7 % where the standard deviation of the field of view is at most {FOV_SD_DEG:g} degrees: "
+            f"{self._right(narrow)}; elsewhere {self._right(wide)}"
         )
-        sure = [within for one, within in zip(found, right, strict=True) if one.fov_sd_deg <= SURE_FOV_DEG]
-        print(
-            f"range within 7 % where the field of view is sure to {SURE_FOV_DEG:g} degrees: "
-            f"{sum(sure)} of {len(sure)}; elsewhere {sum(right) - sum(sure)} of {len(right) - len(sure)}"
-        )
+
+    @staticmethod
+    def _right(rows: "list[CameraErrors]") -> str:
+        """How many ranges are within 7 %."""
+        return f"{sum(abs(one.range) <= 0.07 for one in rows)} of {len(rows)}"
 
     @staticmethod
     def _errors(row: "list[CameraErrors]") -> str:

@@ -26,7 +26,9 @@ def test_a_row_per_tilt_and_height(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[2].startswith("| 12 | 1.5 m | 2 | ")
     assert float(lines[2].split("|")[4].split()[1]) < 2.0  # median, largest
     assert lines[3].startswith("tilt within 2 degrees: 2 of 2; range within 7 %: ")
-    assert lines[4].startswith("range within 7 % where the field of view is sure to 4 degrees: ")
+    assert lines[4].startswith(
+        "range within 7 % where the standard deviation of the field of view is at most 4 degrees: "
+    )
     assert lines[4].split(": ")[1].split("; ")[0].endswith(" of 2")
 
 

@@ -20,7 +20,7 @@ PACE, PACE_SPREAD = 0.7, 0.2
 #: Walking speed in standing heights per second over the square of the cycles per second, and the standard deviation of
 #: its logarithm: steps lengthen in proportion to their rate (Sekiya and Nagasaki, "Reproducibility of the walking
 #: patterns of normal young adults", 1998, 0.0065 m per step and minute; Boulic's gait 0.89, captured walks 0.82 to
-#: 0.95, a standard deviation of about 0.05 of their own; people of other habits get some more).
+#: 0.95; the deviation is wider than theirs, as habits of walking differ more than in these few people).
 WALK_RATIO, WALK_RATIO_SPREAD = 0.9, 0.08
 
 
