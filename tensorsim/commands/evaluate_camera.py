@@ -79,6 +79,11 @@ class EvaluateCamera:
             f"range within 7 % where the standard deviation of the field of view is at most {FOV_SD_DEG:g} degrees: "
             f"{self._right(narrow)}; elsewhere {self._right(wide)}"
         )
+        within = [sum(abs(one.fov_deg) <= k * one.fov_sd_deg for one in found) for k in (1, 2)]
+        print(
+            f"field of view within one standard deviation: {within[0]} of {len(found)} (68 % expected), "
+            f"within two: {within[1]} (95 %)"
+        )
 
     @staticmethod
     def _right(rows: "list[CameraErrors]") -> str:

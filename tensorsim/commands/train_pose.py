@@ -31,6 +31,7 @@ class TrainPose(PeopleOptions):
             nearer to those of films.
         second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
             agree with the labels, they put them right and add the face.
+        validate_every: steps between measurements on held-out people, which pick the best weights.
         presence: train nothing but the head of the HRNet in --init that tells which keypoints are in the picture.
     """
 
@@ -45,6 +46,7 @@ class TrainPose(PeopleOptions):
     learning_rate: float = 2e-3
     augmentation: Literal["full", "mild"] = "full"
     second_labels: Path | None = None
+    validate_every: int = 500
     presence: bool = False
 
     def run(self) -> None:
@@ -69,7 +71,7 @@ class TrainPose(PeopleOptions):
             raise TensorsimError("--presence: got no --init of an HRNet, whose keypoints it is about")
         if self.first_steps > 0 and (min(self.first_size) < 32 or any(side % 32 for side in self.first_size)):
             raise TensorsimError(f"--first-size: got {self.first_size}, expected (H, W), multiples of 32")
-        loop = self.loop(steps=self.steps, batch=self.batch, validate_every=500)
+        loop = self.loop(steps=self.steps, batch=self.batch, validate_every=self.validate_every)
         torch.manual_seed(self.seed)
         net: HRNet | TrainedCPM
         if self.network == "cpm":

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
-from torch.optim.swa_utils import AveragedModel
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.data import DataLoader, Dataset, default_collate
 from tqdm import tqdm
 
@@ -204,7 +204,9 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
     averaged = AveragedModel(
         recipe.net,
-        avg_fn=lambda mean, new, count: new + (mean - new) * _decay(config.ema_decay, int(count)),
+        multi_avg_fn=lambda means, new, count: get_ema_multi_avg_fn(_decay(config.ema_decay, int(count)))(
+            means, new, count
+        ),
         use_buffers=True,
     )
     optimiser = recipe.optimiser()

@@ -30,6 +30,9 @@ def test_a_row_per_tilt_and_height(capsys: pytest.CaptureFixture[str]) -> None:
         "range within 7 % where the standard deviation of the field of view is at most 4 degrees: "
     )
     assert lines[4].split(": ")[1].split("; ")[0].endswith(" of 2")
+    assert lines[5] == (
+        "field of view within one standard deviation: 2 of 2 (68 % expected), within two: 2 (95 %)"
+    )
 
 
 @pytest.mark.parametrize("options", ["--tilts", "--tilts 80 --heights 0.5 --fovs 40", "--walks 0"])
