@@ -1,4 +1,4 @@
-"""Heat maps to points: the highest pixel of each map, refined to a fraction of a pixel.
+"""Heat maps to points: the highest pixel of each map, or the place that is most likely near, to a fraction of a pixel.
 
 Pixel centres are at integers, and pixel (u, v) of a map stands for pixel (4u, 4v) of the crop: a network
 trained on Gaussians drawn at keypoint / 4 is decoded without bias by multiplying with 4.
@@ -8,7 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank
+from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive
+
+METHODS = ("expected", "dark", "quarter")
 
 
 def peak(maps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -59,21 +61,22 @@ def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
         Points (..., 2), ``uv`` in heat-map pixels, and scores (...), the heights of the peaks. Both are
         differentiable by the maps, with the highest pixel held fixed.
     """
-    height, width = maps.shape[-2], maps.shape[-1]
     u, v, score = peak(maps)
-
-    half = kernel.shape[0] // 2
-    # Depthwise, because a convolution of single maps, one by one, takes over ten times as long.
-    count = maps.shape[-3] if maps.dim() > 2 else 1
-    smooth = maps.reshape(-1, count, height, width)
-    column, row = kernel.view(1, 1, -1, 1), kernel.view(1, 1, 1, -1)
-    smooth = F.conv2d(smooth, column.expand(count, -1, -1, -1), padding=[half, 0], groups=count)
-    smooth = F.conv2d(smooth, row.expand(count, -1, -1, -1), padding=[0, half], groups=count).view(maps.shape)
+    smooth = blurred(maps, kernel)
     # Back to the original height, which matters only for the lower bound under the logarithm.
     tiny = 1e-10
     smooth = smooth * (score / smooth.amax((-2, -1)).clamp_min(tiny)).unsqueeze(-1).unsqueeze(-1)
     f = smooth.clamp_min(tiny).log()
 
+    return torch.stack([u, v], -1) + newton_step(f, u, v), score
+
+
+def newton_step(f: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Step -H^-1 g (..., 2) from pixels (u, v) to the peak of maps f (..., h, w), by central differences.
+
+    Zero two pixels from the border and where the Hessian H is singular.
+    """
+    height, width = f.shape[-2], f.shape[-1]
     centre = pixel(f, u, v)
     gu = (pixel(f, u + 1, v) - pixel(f, u - 1, v)) / 2
     gv = (pixel(f, u, v + 1) - pixel(f, u, v - 1)) / 2
@@ -84,8 +87,54 @@ def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
     determinant = huu * hvv - huv * huv
     refined = (u > 1) & (u < width - 2) & (v > 1) & (v < height - 2) & (determinant != 0)
     determinant = torch.where(refined, determinant, torch.ones_like(determinant))
-    step = torch.stack([hvv * gu - huv * gv, huu * gv - huv * gu], -1) / determinant.unsqueeze(-1)
-    return torch.stack([u, v], -1) - step * refined.unsqueeze(-1), score
+    step = torch.stack([huv * gv - hvv * gu, huv * gu - huu * gv], -1) / determinant.unsqueeze(-1)
+    return step * refined.unsqueeze(-1)
+
+
+def blurred(maps: Tensor, kernel: Tensor) -> Tensor:
+    """Maps (..., h, w) smoothed with a kernel (k,), k odd, in each direction; they count as zero outside."""
+    half = kernel.shape[0] // 2
+    # Depthwise, because a convolution of single maps, one by one, takes over ten times as long.
+    count = maps.shape[-3] if maps.dim() > 2 else 1
+    smooth = maps.reshape(-1, count, maps.shape[-2], maps.shape[-1])
+    column, row = kernel.view(1, 1, -1, 1), kernel.view(1, 1, 1, -1)
+    smooth = F.conv2d(smooth, column.expand(count, -1, -1, -1), padding=[half, 0], groups=count)
+    return F.conv2d(smooth, row.expand(count, -1, -1, -1), padding=[0, half], groups=count).view(maps.shape)
+
+
+def decode_expected(maps: Tensor, sharpness: float, tolerance: float) -> tuple[Tensor, Tensor]:
+    """The place where a point is expected to be judged best: a Bayes decision instead of the highest pixel.
+
+    A map m tells how probable each pixel x is: ``p ~ exp(sharpness m) - 1``, nothing where it is zero or less. A point
+    found at q is as good as ``exp(-|x - q|^2 / (2 s^2))``, as object keypoint similarity has it, s being ``tolerance``
+    times the longer side of the map. The q with the highest mean of that over p is found, to a fraction of a pixel as
+    in :func:`decode_dark`. Where a map has one sharp peak, that is its peak; of a blunt one it is the middle, and of
+    several the one with the most about it. (J. O. Berger, "Statistical Decision Theory and Bayesian Analysis", 1985,
+    section 4.4.)
+
+    Args:
+        maps: (..., h, w).
+        sharpness: by how much high pixels count more than low ones.
+        tolerance: share of the longer side of the map.
+
+    Returns:
+        Points (..., 2), ``uv`` in heat-map pixels, and scores (...), the heights of the highest peaks. Both are
+        differentiable by the maps, with the pixel that is nearest to the point held fixed.
+    """
+    # In half precision the top of a smooth map is flat.
+    precise = maps if maps.dtype == torch.float64 else maps.float()
+    spread = tolerance * max(maps.shape[-2], maps.shape[-1])
+    half = int(3 * spread) + 1
+    distance = torch.arange(-half, half + 1, device=maps.device).to(precise.dtype)
+    height = precise.clamp_min(0.0)
+    highest = height.amax((-2, -1), keepdim=True)
+    # Over the exponential of the highest pixel, which may be large.
+    share = (sharpness * (height - highest)).exp() - (-sharpness * highest).exp()
+    f = blurred(share, torch.exp(-distance.square() / (2 * spread * spread))).clamp_min(1e-30).log()
+    u, v, _ = peak(f)
+    # The peak is within the pixel; more is the noise of a flat map.
+    step = newton_step(f, u, v).clamp(-1.0, 1.0)
+    return (torch.stack([u, v], -1) + step).to(maps.dtype), maps.flatten(-2).amax(-1)
 
 
 def sides_apart(maps: Tensor, left: Tensor, right: Tensor, share: float = 0.7, radius: float = 4.0) -> Tensor:
@@ -140,15 +189,18 @@ class HeatmapDecoder(nn.Module):
     A map without a positive value still gives its highest pixel, with a score that is not positive.
 
     Args:
-        method: ``"dark"`` (:func:`decode_dark`, differentiable) or ``"quarter"`` (:func:`decode_quarter`).
+        method: ``"expected"`` (:func:`decode_expected`) or ``"dark"`` (:func:`decode_dark`), both differentiable, or
+            ``"quarter"`` (:func:`decode_quarter`).
         kernel_size: k of the Gaussian that DARK smooths with, odd; sigma is 0.3 ((k - 1) / 2 - 1) + 0.8, that
             is 2 for 11.
         stride: how many crop pixels one heat-map pixel is wide.
         pairs: left and right maps of one body, by number, that are kept apart by :func:`sides_apart`.
+        sharpness, tolerance: of ``"expected"``. The defaults were chosen on held-out people, for crops of 1.25 times
+            the box and maps with peaks near 1.
 
     Raises:
-        TensorsimError: another method, an even kernel, a stride below 1, integer or empty maps, fewer maps than
-            ``pairs`` speaks of.
+        TensorsimError: another method, an even kernel, a stride below 1, a sharpness or tolerance that is not
+            positive, integer or empty maps, fewer maps than ``pairs`` speaks of.
     """
 
     kernel: Tensor
@@ -161,10 +213,14 @@ class HeatmapDecoder(nn.Module):
         kernel_size: int = 11,
         stride: int = 4,
         pairs: tuple[tuple[int, int], ...] = (),
+        sharpness: float = 7.0,
+        tolerance: float = 0.07,
     ) -> None:
         super().__init__()
-        if method not in ("dark", "quarter"):
-            raise TensorsimError(f"HeatmapDecoder: got method {method!r}, expected 'dark' or 'quarter'")
+        if method not in METHODS:
+            raise TensorsimError(f"HeatmapDecoder: got method {method!r}, expected one of {METHODS}")
+        check_positive(sharpness, "HeatmapDecoder.sharpness")
+        check_positive(tolerance, "HeatmapDecoder.tolerance")
         if kernel_size < 1 or kernel_size % 2 == 0:
             raise TensorsimError(
                 f"HeatmapDecoder: got kernel_size {kernel_size}, expected a positive odd number"
@@ -173,6 +229,7 @@ class HeatmapDecoder(nn.Module):
             raise TensorsimError(f"HeatmapDecoder: got stride {stride}, expected at least 1")
         self.method = method
         self.stride = stride
+        self.sharpness, self.tolerance = float(sharpness), float(tolerance)
         sigma = 0.3 * ((kernel_size - 1) / 2 - 1) + 0.8
         kernel = torch.signal.windows.gaussian(kernel_size, std=sigma, dtype=torch.float64)
         self.register_buffer("kernel", (kernel / kernel.sum()).float(), persistent=False)
@@ -197,8 +254,15 @@ class HeatmapDecoder(nn.Module):
                     f"{self.maps} maps"
                 )
             maps = sides_apart(maps, self.left, self.right)
-        if self.method == "dark":
+        if self.method == "expected":
+            points, scores = decode_expected(maps, self.sharpness, self.tolerance)
+        elif self.method == "dark":
             points, scores = decode_dark(maps, self.kernel.to(maps.dtype))
         else:
             points, scores = decode_quarter(maps)
         return self.stride * points, scores
+
+    def extra_repr(self) -> str:
+        """What print shows, and by what kept key points are told apart from those of other settings."""
+        spread = f", sharpness={self.sharpness:g}, tolerance={self.tolerance:g}" * (self.method == "expected")
+        return f"{self.method}{spread}"

@@ -70,8 +70,8 @@ class TopDownPose(nn.Module):
     Args:
         network: :class:`HRNet`, :class:`OnnxHeatmaps` or any module that maps crops (N, 3, H, W), RGB in [0,
             1], to heat maps (N, 17, H/4, W/4), or H/s and W/s if it has a ``stride`` s, as :class:`CPM`.
-        decode: ``"dark"`` or ``"quarter"``, see :class:`HeatmapDecoder`; or a module of its own, what the network gives
-            -> (points (N, 17, 2) in pixels of the crop, scores (N, 17)).
+        decode: ``"expected"``, ``"dark"`` or ``"quarter"``, see :class:`HeatmapDecoder`; or a module of its own, what
+            the network gives -> (points (N, 17, 2) in pixels of the crop, scores (N, 17)).
         flip_test: average with the mirror image, see :class:`FlipTest`: more accurate, at twice the cost.
         padding: boxes are enlarged by this factor.
         crop_size: (H, W) of the crops; None takes the ``input_size`` of the network, or (256, 192) if it has
@@ -89,7 +89,7 @@ class TopDownPose(nn.Module):
     def __init__(
         self,
         network: nn.Module,
-        decode: str | nn.Module = "dark",
+        decode: str | nn.Module = "expected",
         flip_test: bool = False,
         padding: float = 1.25,
         crop_size: tuple[int, int] | None = None,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder, sides_apart
+from tensorsim.vision.pose2d.heatmaps import METHODS, HeatmapDecoder, sides_apart
 from tests.stage import StageTester
 
 
@@ -48,6 +48,10 @@ class TestQuarter(StageTester):
 
 class TestDark(TestQuarter):
     method = "dark"
+
+
+class TestExpected(TestQuarter):
+    method = "expected"
 
 
 class TestSidesApart(TestDark):
@@ -148,7 +152,7 @@ def test_sides_apart_equals_the_definition() -> None:
     assert 10 < changed < 50
 
 
-@pytest.mark.parametrize("method", ["dark", "quarter"])
+@pytest.mark.parametrize("method", ["expected", "dark", "quarter"])
 @pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-3), (torch.bfloat16, 0.5)])
 def test_maps_of_another_precision_than_the_decoder(method: str, dtype: torch.dtype, atol: float) -> None:
     decoder, maps = HeatmapDecoder(method), gaussians(torch.tensor([[10.3, 8.4], [5.0, 12.8]]), 20, 16)
@@ -168,6 +172,15 @@ def reference_quarter(heatmap: np.ndarray) -> tuple[float, float]:
     return x + 0.25 * dx, y + 0.25 * dy
 
 
+def newton(f: np.ndarray, y: int, x: int) -> np.ndarray:
+    gradient = 0.5 * np.array([f[y, x + 1] - f[y, x - 1], f[y + 1, x] - f[y - 1, x]])
+    dxx = 0.25 * (f[y, x + 2] - 2 * f[y, x] + f[y, x - 2])
+    dyy = 0.25 * (f[y + 2, x] - 2 * f[y, x] + f[y - 2, x])
+    dxy = 0.25 * (f[y + 1, x + 1] - f[y - 1, x + 1] - f[y + 1, x - 1] + f[y - 1, x - 1])
+    hessian = np.array([[dxx, dxy], [dxy, dyy]])
+    return np.zeros(2) if np.linalg.det(hessian) == 0 else -np.linalg.inv(hessian) @ gradient
+
+
 def reference_dark(heatmap: np.ndarray, kernel: int) -> tuple[float, float]:
     height, width = heatmap.shape
     y, x = np.unravel_index(np.argmax(heatmap), heatmap.shape)
@@ -177,15 +190,56 @@ def reference_dark(heatmap: np.ndarray, kernel: int) -> tuple[float, float]:
     f = np.log(np.maximum(blurred * heatmap.max() / blurred.max(), 1e-10))
     if not (1 < x < width - 2 and 1 < y < height - 2):
         return float(x), float(y)
-    gradient = 0.5 * np.array([f[y, x + 1] - f[y, x - 1], f[y + 1, x] - f[y - 1, x]])
-    dxx = 0.25 * (f[y, x + 2] - 2 * f[y, x] + f[y, x - 2])
-    dyy = 0.25 * (f[y + 2, x] - 2 * f[y, x] + f[y - 2, x])
-    dxy = 0.25 * (f[y + 1, x + 1] - f[y - 1, x + 1] - f[y + 1, x - 1] + f[y - 1, x - 1])
-    hessian = np.array([[dxx, dxy], [dxy, dyy]])
-    if np.linalg.det(hessian) == 0:
-        return float(x), float(y)
-    dx, dy = -np.linalg.inv(hessian) @ gradient
+    dx, dy = newton(f, int(y), int(x))
     return x + dx, y + dy
+
+
+def reference_expected(heatmap: np.ndarray, sharpness: float, tolerance: float) -> tuple[float, float]:
+    """The mean similarity to a point at every pixel, by the definition."""
+    height, width = heatmap.shape
+    share = np.exp(sharpness * np.maximum(heatmap, 0)) - 1
+    spread = tolerance * max(height, width)
+    v, u = np.mgrid[:height, :width]
+    gain = np.zeros(heatmap.shape)
+    for y in range(height):
+        for x in range(width):
+            gain[y, x] = (share * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * spread**2))).sum()
+    y, x = (int(place) for place in np.unravel_index(np.argmax(gain), gain.shape))
+    if not (1 < x < width - 2 and 1 < y < height - 2):
+        return float(x), float(y)
+    dx, dy = newton(np.log(gain), y, x)
+    return x + dx, y + dy
+
+
+def test_expected_equals_the_definition() -> None:
+    maps = noisy_maps((12,), torch.float64)
+    points, scores = HeatmapDecoder("expected").double()(maps)
+    assert torch.equal(scores, maps.amax((-2, -1)))
+    at_border = 0
+    for heatmap, point in zip(maps.flatten(0, 1).numpy(), points.flatten(0, 1).numpy(), strict=True):
+        expected = reference_expected(heatmap, 7.0, 0.07)
+        # The kernel ends after three deviations, where it is 0.01.
+        np.testing.assert_allclose(point / 4, expected, atol=0.1)
+        at_border += float(expected[0]).is_integer() or float(expected[1]).is_integer()
+    assert 2 < at_border < 58
+
+
+def test_expected_takes_one_sharp_peak_as_it_is() -> None:
+    maps = gaussians(torch.tensor([[20.3, 30.7], [11.8, 40.2]], dtype=torch.float64), sigma=1.5)
+    expected, _ = HeatmapDecoder("expected").double()(maps)
+    dark, _ = HeatmapDecoder("dark").double()(maps)
+    torch.testing.assert_close(expected, dark, atol=0.1, rtol=0)  # pixels of the crop
+
+
+def test_expected_takes_the_place_with_the_most_about_it() -> None:
+    """One narrow peak against two that are a little lower and beside each other."""
+    maps = gaussians(torch.tensor([[10.0, 20.0], [34.0, 44.0], [38.0, 48.0]]), sigma=1.5)
+    map_of_three = maps[0] + 0.97 * torch.maximum(maps[1], maps[2])
+    (u, v), score = HeatmapDecoder("expected", stride=1)(map_of_three)
+    torch.testing.assert_close(torch.stack([u, v]), torch.tensor([36.0, 46.0]), atol=0.2, rtol=0)
+    assert float(score) == pytest.approx(1.0, abs=1e-5)
+    dark, _ = HeatmapDecoder("dark", stride=1)(map_of_three)
+    torch.testing.assert_close(dark, torch.tensor([10.0, 20.0]), atol=0.1, rtol=0)
 
 
 @pytest.mark.parametrize("method", ["quarter", "dark"])
@@ -221,7 +275,7 @@ def test_map_pixel_u_v_is_crop_pixel_4u_4v() -> None:
     torch.testing.assert_close(points, expected)
 
 
-@pytest.mark.parametrize("method", ["quarter", "dark"])
+@pytest.mark.parametrize("method", ["expected", "quarter", "dark"])
 @pytest.mark.parametrize("across", [False, True])
 def test_maps_of_a_single_row_or_column(method: str, across: bool) -> None:
     """Their edges have no neighbours: the point is the highest pixel itself."""
@@ -245,22 +299,37 @@ def test_maps_without_a_peak_give_finite_points_and_tell_by_the_score(method: st
     assert bool((scores == level).all())
 
 
+def test_expected_is_finite_without_a_peak() -> None:
+    points, scores = HeatmapDecoder("expected")(torch.full((2, 17, 64, 48), 0.5))
+    assert bool((points >= 0).all())
+    assert bool((points[..., 0] < 192).all())
+    assert bool((points[..., 1] < 256).all())
+    assert bool((scores == 0.5).all())
+
+
 def test_no_maps() -> None:
-    for method in ("quarter", "dark"):
+    for method in METHODS:
         points, scores = HeatmapDecoder(method)(torch.zeros(0, 17, 64, 48))
         assert points.shape == (0, 17, 2)
         assert scores.shape == (0, 17)
 
 
-def test_dark_moves_with_its_map() -> None:
+@pytest.mark.parametrize("method", ["expected", "dark"])
+def test_the_point_moves_with_its_map(method: str) -> None:
     # d point / d centre is the identity in crop pixels.
     centre = torch.tensor([20.2, 30.1], dtype=torch.float64, requires_grad=True)
-    decoder = HeatmapDecoder("dark").double()
+    decoder = HeatmapDecoder(method).double()
     jacobian = torch.autograd.functional.jacobian(lambda c: decoder(gaussians(c))[0] / 4, centre)
     torch.testing.assert_close(jacobian, torch.eye(2, dtype=torch.float64), rtol=0, atol=1e-2)
 
 
 def test_constructor_refuses() -> None:
-    for arguments in ({"method": "udp"}, {"kernel_size": 10}, {"kernel_size": -1}, {"stride": 0}):
-        with pytest.raises(TensorsimError, match="HeatmapDecoder: got"):
+    for arguments in (
+        {"method": "udp"},
+        {"kernel_size": 10},
+        {"kernel_size": -1},
+        {"stride": 0},
+        {"tolerance": 0.0},
+    ):
+        with pytest.raises(TensorsimError, match="HeatmapDecoder"):
             HeatmapDecoder(**arguments)
