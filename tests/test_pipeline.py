@@ -232,7 +232,7 @@ def test_brief_gaps_of_a_joint_are_predicted_and_longer_ones_are_not() -> None:
     assert torch.equal(stage.smoother.measured[0, 0], expected)
 
 
-@pytest.mark.parametrize(("speed_m_s", "there"), [(0.5, True), (6.0, False)])
+@pytest.mark.parametrize(("speed_m_s", "there"), [(0.5, True), (8.0, False)])
 def test_nobody_runs_while_hidden(speed_m_s: float, there: bool) -> None:
     """Somebody is hidden for half a second and stands elsewhere then."""
     stage = pipeline().video_to_pose
