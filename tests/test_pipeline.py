@@ -16,7 +16,7 @@ from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.results import people_of
-from tensorsim.vision.pose2d.topdown import FlipTest
+from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
 
@@ -232,10 +232,15 @@ def test_brief_gaps_of_a_joint_are_predicted_and_longer_ones_are_not() -> None:
     assert torch.equal(stage.smoother.measured[0, 0], expected)
 
 
-@pytest.mark.parametrize(("speed_m_s", "there"), [(0.5, True), (8.0, False)])
-def test_nobody_runs_while_hidden(speed_m_s: float, there: bool) -> None:
+# At 6 m/s two poses of the library fit equally well, and a thousandth of a pixel decides how far away the figure is.
+@pytest.mark.parametrize(
+    ("speed_m_s", "decode", "there"),
+    [(0.5, "expected", True), (0.5, "dark", True), (6.0, "dark", False), (8.0, "expected", False)],
+)
+def test_nobody_runs_while_hidden(speed_m_s: float, decode: str, there: bool) -> None:
     """Somebody is hidden for half a second and stands elsewhere then."""
     stage = pipeline().video_to_pose
+    stage.pose = TopDownPose(StandingPose(), decode, flip_test=True, stand_up=True)
     gone = slice(8, 13)
     start, stop = (
         stage(film(*walker(20, FPS, range_m, 0.0, 0.0)).unsqueeze(0), FPS)
