@@ -45,8 +45,10 @@ def test_key_points_and_maps_of_the_engines_agree(
     for name in ("range_time", "range_time_mti", "doppler_time"):
         shown = truth[name] > 1e-2 * truth[name].max()  # 40 dB
         off = np.abs(20 * np.log10(maps[name][shown] / truth[name][shown]))
-        # Rounding shows most in single cells between two parts of the body, on some processors more than on others.
-        assert np.quantile(off, 0.999) < 0.1
+        # Key points that differ by 0.0002 pixels show most in single cells between two parts of the body: 2 to 3 of
+        # 2 400 are off by 0.1 dB, on some processors more than on others.
+        assert np.quantile(off, 0.99) < 0.05
+        assert np.quantile(off, 0.998) < 0.1
         assert off.max() < 0.3
     away, _, decibels = compared("openvino")
     assert np.median(away) < 0.1
