@@ -203,7 +203,7 @@ def write_doppler_sound(
 ) -> None:
     """Write ``doppler.wav``, the micro-Doppler of the scene as sound: approaching left, receding right."""
     joints, valid = pose.joints[:1].to(device), pose.valid[:1].to(device)
-    coefficients = stage.resampler.coefficients(joints, fps)
+    coefficients = stage.curve(joints, valid, fps)
 
     def source(start: int, stop: int) -> tuple[Tensor, Tensor]:
         points, rcs = stage.scene(coefficients, valid, fps, start, stop)

@@ -69,8 +69,7 @@ def within_reach(found: Found, radar: RadarConfig) -> Found:
         TensorsimWarning,
         stacklevel=2,
     )
-    there = found.pose.valid[..., None, None]
-    nearer = found.pose.joints - there * found.pose.joints.new_tensor([0.0, ahead_m, 0.0])
+    nearer = found.pose.joints - found.pose.joints.new_tensor([0.0, ahead_m, 0.0])
     return found._replace(pose=found.pose._replace(joints=nearer), radar_ahead_m=ahead_m)
 
 
@@ -312,7 +311,7 @@ def maps_of_pose(
     """Maps (on the CPU, without a batch dimension) of the first clip of ``pose``, streamed over pulses."""
     joints, valid = pose.joints[:1].to(device), pose.valid[:1].to(device)
     pulses = stage.resampler.pulses(joints.shape[2], fps)
-    coefficients = stage.resampler.coefficients(joints, fps)
+    coefficients = stage.curve(joints, valid, fps)
 
     # The simulator passes over the motion twice: for the level of the noise, and for the maps.
     with progress_bar("radar", 2 * pulses, quiet) as bar:

@@ -10,6 +10,7 @@ from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import SimulationConfig
 from tensorsim.enhance.choice import map_denoiser
 from tensorsim.errors import TensorsimError
+from tensorsim.motion.absence import continued
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
@@ -131,7 +132,7 @@ class PoseToDoppler(nn.Module):
         Raises:
             TensorsimError: wrong shapes, fewer than 2 frames, fps not positive, motion too fast for the PRF.
         """
-        coefficients = self.resampler.coefficients(joints, fps)
+        coefficients = self.curve(joints, valid, fps)
         pulses = self.resampler.pulses(joints.shape[2], fps)
         points, rcs = self.scene(coefficients, valid, fps, 0, pulses)
         return self.denoise(self.simulator(points, rcs))
@@ -139,10 +140,19 @@ class PoseToDoppler(nn.Module):
     @torch.jit.export
     def doppler_time(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
         """Only the Doppler-time map (B, F, K) of :meth:`forward`, for data sets; with one seed the same."""
-        coefficients = self.resampler.coefficients(joints, fps)
+        coefficients = self.curve(joints, valid, fps)
         points, rcs = self.scene(coefficients, valid, fps, 0, self.resampler.pulses(joints.shape[2], fps))
         doppler_time = self.simulator.doppler_time(points, rcs)
         return self.denoiser(doppler_time) if self.denoises else doppler_time
+
+    @torch.jit.export
+    def curve(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
+        """The resampler's coefficients of joints (B, P, T, 14, 3); those of frames that are not valid do not matter.
+
+        Raises:
+            TensorsimError: see :meth:`forward`.
+        """
+        return self.resampler.coefficients(continued(joints, valid), fps)
 
     def scene(
         self, coefficients: Tensor, valid: Tensor, fps: float, start: int, stop: int
@@ -150,7 +160,7 @@ class PoseToDoppler(nn.Module):
         """Scatterers (B, M, S, 3) and their RCS (B, M, S) in pulses ``start`` to ``stop`` of the motion.
 
         Args:
-            coefficients: of the resampler, for joints (B, P, T, 14, 3).
+            coefficients: of :meth:`curve`, for joints (B, P, T, 14, 3).
             valid: (B, P, T) bool.
             fps: frames per second.
             start, stop: half-open range of pulses.

@@ -70,7 +70,7 @@ def _cubes(
     pair = replace(radar, tx_m=radar.tx_positions_m[0], rx_m=radar.rx_positions_m[0])
     stage = PoseToDoppler.from_config(config.replace(scene__radar=pair, processing__near_bins=None))
     joints, valid = scene.joints[None], scene.valid[None]
-    coefficients = stage.resampler.coefficients(joints, scene.fps)
+    coefficients = stage.curve(joints, valid, scene.fps)
     pulses = stage.resampler.pulses(joints.shape[2], scene.fps)
     points, rcs = stage.scene(coefficients, valid, scene.fps, 0, pulses)
     echo = echo_of(config.scene, config.processing.pulse_chunk, None, ())

@@ -56,7 +56,7 @@ def pair_outputs(
 
 def scatterers(stage: PoseToDoppler, joints: Tensor, valid: Tensor, fps: float) -> tuple[Tensor, Tensor]:
     """Scatterers (B, M, S, 3) and their RCS (B, M, S) of joints (B, P, T, 14, 3)."""
-    coefficients = stage.resampler.coefficients(joints, fps)
+    coefficients = stage.curve(joints, valid, fps)
     return stage.scene(coefficients, valid, fps, 0, stage.resampler.pulses(joints.shape[2], fps))
 
 

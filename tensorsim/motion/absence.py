@@ -1,0 +1,61 @@
+"""Motion while somebody is not in the scene."""
+
+import torch
+from torch import Tensor
+
+from tensorsim.errors import TensorsimError, check_min_rank
+
+#: Frames after which motion beyond the first or last frame of a run has slowed down to a third.
+_SLOWING = 6.0
+
+
+def continued(joints: Tensor, valid: Tensor) -> Tensor:
+    """Joints of frames in which somebody is absent, replaced by motion without jumps.
+
+    A spline through all frames bends for whatever stands beside it: a jump where somebody leaves would be heard while
+    that person is still there. Here motion goes on at the velocity of the last two frames, ever more slowly, and
+    changes over in a gap to that which leads into the next run in the same way.
+
+    Args:
+        joints: (..., T, J, 3); what stands in frames that are not valid does not matter.
+        valid: (..., T) bool.
+
+    Returns:
+        (..., T, J, 3), equal to ``joints`` where valid; zeros for who is never there.
+
+    Raises:
+        TensorsimError: wrong shapes, or valid not boolean.
+    """
+    check_min_rank(joints, 3, "joints", "(..., T, J, 3)")
+    if valid.dtype != torch.bool or valid.shape != joints.shape[:-2]:
+        raise TensorsimError(
+            f"valid: got {valid.dtype} of shape {list(valid.shape)}, expected bool (..., T) {list(joints.shape[:-2])}"
+        )
+    if bool(valid.all()):
+        return joints
+    frames = joints.shape[-3]
+    present = torch.where(valid[..., None, None], joints, torch.zeros_like(joints))
+    frame = torch.arange(frames, device=valid.device)
+    before = torch.cummax(torch.where(valid, frame, -1), dim=-1)[0]
+    after = torch.cummin(torch.where(valid, frame, frames).flip(-1), dim=-1)[0].flip(-1)
+    ahead = _beyond(present, valid, before, 1)
+    back = _beyond(present, valid, after, -1)
+    since, until = (frame - before).to(joints.dtype), (after - frame).to(joints.dtype)
+    share = since / (since + until).clamp(min=1.0)
+    share = torch.where(before < 0, 1.0, torch.where(after >= frames, 0.0, share**2 * (3 - 2 * share)))
+    moved = ahead + share[..., None, None] * (back - ahead)
+    return torch.where(valid[..., None, None], joints, moved)
+
+
+def _beyond(joints: Tensor, valid: Tensor, edge: Tensor, sense: int, slowing: float = _SLOWING) -> Tensor:
+    """Motion that goes on beyond the frames ``edge`` (..., T), forwards (``sense`` 1) or backwards (-1) in time."""
+    frames = valid.shape[-1]
+    last = edge.clamp(0, frames - 1)
+    previous = (last - sense).clamp(0, frames - 1)
+    shape = joints.shape
+    at_last = joints.gather(-3, last[..., None, None].expand(shape))
+    step = at_last - joints.gather(-3, previous[..., None, None].expand(shape))
+    known = valid.gather(-1, previous) & (previous != last)
+    since = (torch.arange(frames, device=valid.device) - edge).abs().to(joints.dtype)
+    way = slowing * (1 - torch.exp(-since / slowing)) * known
+    return at_last + way[..., None, None] * step
