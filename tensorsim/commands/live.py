@@ -41,8 +41,9 @@ class Live(NetworkOptions, RadarOptions):
 
     camera: str
     """Number of a camera, address of a stream (rtsp://...), or a film that is played like a camera."""
-    person_height: tuple[float, ...] = (1.80, 1.70)
-    """Body heights in metres in order of appearance; the last one serves the rest."""
+    person_height: tuple[float, ...] | None = None
+    """Body heights in metres in order of appearance, instead of those of the configuration (1.80, 1.70); the last one
+    serves the rest."""
     fps: float | None = None
     """Frames per second, instead of what the source announces."""
     every_frame: bool = False
@@ -50,14 +51,16 @@ class Live(NetworkOptions, RadarOptions):
     seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Stop after so much time of the film."""
     port: int | None = 8787
-    """Port of the page at 127.0.0.1; 0 takes a free one, none shows no page."""
+    """Port of the page at 127.0.0.1; 0 takes a free one, None shows no page."""
     record: Path | None = None
     """Film of what the page shows, ending in .webm or .mp4."""
 
     def run(self) -> None:
         """Do it."""
         self._check()
-        config = self.configuration().replace(pose__person_height_m=self.person_height)
+        config = self.configuration()
+        if self.person_height is not None:
+            config = config.replace(pose__person_height_m=self.person_height)
         config = config if self.flip_test else config.replace(pose__flip_test=False)
         networks = default_networks(
             self.detector or config.tracking.detector, self.pose or config.pose.network
@@ -79,10 +82,12 @@ class Live(NetworkOptions, RadarOptions):
                 recognizer,
                 self.least_probability,
             )
-            for message in messages:
-                print(f"tensorsim: warning: {message}", file=sys.stderr)
-            with suppress(KeyboardInterrupt):
-                self._play(live, camera)
+            said = self._warn(messages)
+            try:
+                with suppress(KeyboardInterrupt):
+                    self._play(live, camera)
+            finally:
+                self._warn(messages[said:])
         seconds = (live.index + 1) / live.fps
         print(f"{self.camera}: {seconds:.1f} s, {live.appeared} people, {camera.dropped} frames dropped")
 
@@ -101,16 +106,27 @@ class Live(NetworkOptions, RadarOptions):
             film = None if self.record is None else stack.enter_context(VideoWriter(self.record, camera.fps))
             for frame, dropped in camera.frames():
                 for _ in range(dropped):
-                    live.miss()
+                    missed = live.miss()
+                    view.add(missed)
+                    self._say(missed, camera)
                 new = live.push(frame)
+                view.add(new)
                 picture = view.draw(new, frame.permute(1, 2, 0).numpy(), camera.dropped)
                 if page is not None:
                     page.show(picture)
                 if film is not None:
-                    film.add(picture)
+                    for _ in range(1 + dropped):  # the film of the page lasts as long as what was filmed
+                        film.add(picture)
                 self._say(new, camera)
                 if self.seconds is not None and new.time_s >= self.seconds:
                     break
+
+    @staticmethod
+    def _warn(messages: list[str]) -> int:
+        """Print warnings, and return how many."""
+        for message in messages:
+            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        return len(messages)
 
     def _say(self, new: "LiveFrame", camera: "Camera") -> None:
         """Print a label when there is one."""
@@ -124,7 +140,7 @@ class Live(NetworkOptions, RadarOptions):
             if field.name in _UNUSED and getattr(self, field.name) != field.default:
                 raise TensorsimError(f"--{field.name.replace('_', '-')}: got it for live, which does without")
         super().check(Path(self.record or ".").parent)
-        for value in self.person_height:
+        for value in self.person_height or ():
             check_range(value, "body height", "--person-height")
         if self.fps is not None:
             check_range(self.fps, "frame rate", "--fps")

@@ -177,37 +177,59 @@ class VideoReader:
             yield chunk
         self._kept = kept
 
+    def timed_frames(self) -> Iterator[tuple[float, Tensor]]:
+        """The frames one by one: the time of each in seconds of the film, and the frame (3, H, W) uint8 RGB.
+
+        Warnings and errors are those of :meth:`chunks`, but for uneven times.
+        """
+        import cv2
+
+        frames = (
+            (time_s, torch.from_numpy(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)).permute(2, 0, 1))
+            for time_s, _, frame in self._decoded()
+        )
+        return ahead(frames)
+
     def _chunks(self, size: int) -> Generator[Tensor, None, None]:
         import cv2
 
+        shape = size, self.height, self.width, 3
+        buffer, filled = np.empty(shape, np.uint8), 0
+        times_s: list[float] = []
+        for _, own_s, frame in self._decoded():
+            times_s.append(own_s)
+            cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled])
+            filled += 1
+            if filled == size:
+                yield torch.from_numpy(buffer).permute(0, 3, 1, 2)
+                buffer, filled = np.empty(shape, np.uint8), 0
+        if filled:
+            yield torch.from_numpy(buffer[:filled]).permute(0, 3, 1, 2)
+        self._keep_times(torch.tensor(times_s, dtype=torch.float64))
+
+    def _decoded(self) -> Generator[tuple[float, float, np.ndarray], None, None]:
+        """Time of each frame that is kept, the same as the file has it, in seconds, and the frame (H, W, 3) BGR."""
+        import cv2
+
+        shape = self.height, self.width, 3
         with self._opened() as capture:
             clock, index, ended = self._clock(), 0, False
-            shape = size, self.height, self.width, 3
-            buffer, filled = np.empty(shape, np.uint8), 0
-            times_s: list[float] = []
             while capture.grab():
                 own_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-                ended = self._is_after(clock.time_s(index, own_s)) and index >= self._first
+                time_s = clock.time_s(index, own_s)
+                ended = self._is_after(time_s) and index >= self._first
                 if ended:
                     break
                 if index >= self._first and (index - self._first) % self._stride == 0:
                     found, frame = capture.retrieve()
                     if not found:
                         break
-                    if frame.shape != shape[1:]:
+                    if frame.shape != shape:
                         raise TensorsimError(
-                            f"{self.path}: frame {index} has shape {frame.shape}, expected {shape[1:]} as the first"
+                            f"{self.path}: frame {index} has shape {frame.shape}, expected {shape} as the first"
                         )
-                    times_s.append(own_s)
-                    cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled])
-                    filled += 1
+                    yield time_s, own_s, frame
                 index += 1
-                if filled == size:
-                    yield torch.from_numpy(buffer).permute(0, 3, 1, 2)
-                    buffer, filled = np.empty(shape, np.uint8), 0
-            if filled:
-                yield torch.from_numpy(buffer[:filled]).permute(0, 3, 1, 2)
-        self._keep_times(torch.tensor(times_s, dtype=torch.float64))
         if self._announced is not None and not ended:
             expected = self._stop(self._announced)
             # Containers count by duration and are often a frame or two off.

@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Condition, Thread
 from typing import Any, NamedTuple
@@ -19,14 +20,25 @@ _STREAMS = ("rtsp://", "rtsps://", "rtmp://", "http://", "https://", "udp://", "
 
 
 class Grabbed(NamedTuple):
-    """A frame (3, H, W) uint8 RGB, and how many frames before it were dropped."""
+    """A frame (3, H, W) uint8 RGB, and how many frames before it are missing."""
 
     frame: Tensor
     dropped: int
 
 
+@dataclass
+class _State:
+    """Of the thread that grabs frames: whether it came to its end, whether it should, and what went wrong."""
+
+    ended: bool = False
+    closed: bool = False
+    error: Exception | None = None
+
+
 class Camera:
     """Frames of a camera at a constant rate; those that come while the consumer is busy are dropped and counted.
+
+    So are those that a source does not have where its frames come at uneven times.
 
     Args:
         source: the number of a camera, the address of a stream, or a file.
@@ -66,53 +78,71 @@ class Camera:
             TensorsimError: a camera or stream that stops.
         """
         if self.every_frame:
-            for frame in self._film():
-                yield Grabbed(frame, 0)
+            yield from self._counted(self._film())
             return
         waiting: deque[tuple[int, Tensor | None]] = deque(maxlen=WAITING)
         arrived = Condition()
-        state = {"ended": False, "closed": False}
+        state = _State()
         thread = Thread(target=self._grab, args=(waiting, arrived, state), daemon=True)
         thread.start()
-        last = -1
         try:
-            while True:
-                with arrived:
-                    arrived.wait_for(lambda: waiting or state["ended"])
-                    if not waiting:
-                        break
-                    index, grabbed = waiting.popleft()
-                if grabbed is None:
-                    raise TensorsimError(f"{self.source}: the camera gave no more frames")
-                missing, last = index - last - 1, index
-                self.dropped += missing
-                yield Grabbed(grabbed, missing)
+            yield from self._counted(self._waited_for(waiting, arrived, state))
         finally:
-            state["closed"] = True
+            state.closed = True
             thread.join(timeout=2.0)
 
-    def _grab(
-        self, waiting: deque[tuple[int, Tensor | None]], arrived: Condition, state: dict[str, bool]
-    ) -> None:
+    def _counted(self, numbered: Iterator[tuple[int, Tensor]]) -> Iterator[Grabbed]:
+        """Frames with the numbers of those between them that are missing."""
+        last = -1
+        for index, frame in numbered:
+            missing, last = index - last - 1, index
+            self.dropped += missing
+            yield Grabbed(frame, missing)
+
+    def _waited_for(
+        self, waiting: deque[tuple[int, Tensor | None]], arrived: Condition, state: "_State"
+    ) -> Iterator[tuple[int, Tensor]]:
+        """Frames with their numbers, taken from the queue."""
+        while True:
+            with arrived:
+                arrived.wait_for(lambda: waiting or state.ended)
+                if not waiting:
+                    if state.error is not None:
+                        raise state.error
+                    return
+                index, frame = waiting.popleft()
+            if frame is None:
+                raise TensorsimError(f"{self.source}: the camera gave no more frames")
+            yield index, frame
+
+    def _grab(self, waiting: deque[tuple[int, Tensor | None]], arrived: Condition, state: "_State") -> None:
         """Put frames with their numbers into the queue as they come; the work of a thread."""
         start = time.monotonic()
-        numbered = enumerate(self._film()) if self.is_file else self._live(start)
-        for index, frame in numbered:
-            if self.is_file:
-                time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
+        try:
+            for index, frame in self._film() if self.is_file else self._live(start):
+                if self.is_file:
+                    time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
+                with arrived:
+                    waiting.append((index, frame))
+                    arrived.notify()
+                if state.closed:
+                    break
+        except Exception as error:  # raised again where the frames are taken
+            state.error = error
+        finally:
             with arrived:
-                waiting.append((index, frame))
+                state.ended = True
                 arrived.notify()
-            if state["closed"]:
-                break
-        with arrived:
-            state["ended"] = True
-            arrived.notify()
 
-    def _film(self) -> Iterator[Tensor]:
+    def _film(self) -> Iterator[tuple[int, Tensor]]:
+        """Frames of the file, numbered by their times."""
+        first = 0
         for _ in range(self.loops):
-            for chunk in self.reader.chunks(1):
-                yield chunk[0]
+            index = first - 1
+            for time_s, frame in self.reader.timed_frames():
+                index = max(index + 1, first + round(time_s * self.fps))
+                yield index, frame
+            first = index + 1
 
     def _live(self, start: float) -> Iterator[tuple[int, Tensor | None]]:
         """Frames numbered by the time at which they came; None once there are no more."""

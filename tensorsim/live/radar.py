@@ -59,6 +59,17 @@ def cubic_b_spline(knots: Tensor, u: Tensor) -> Tensor:
     return torch.tensordot(weights, knots, dims=1)
 
 
+def _joined(scenes: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Scatterers (1, m, S, 3) and cross sections (1, m, S) one after the other; people who come later add to S."""
+    last = scenes[-1][0]
+    places, sections = [], []
+    for points, rcs in scenes:
+        coming = last[:, :1, points.shape[2] :].expand(-1, points.shape[1], -1, -1)
+        places.append(torch.cat([points, coming], dim=2))
+        sections.append(torch.nn.functional.pad(rcs, (0, coming.shape[2])))
+    return torch.cat(places, dim=1), torch.cat(sections, dim=1)
+
+
 class LiveRadar:
     """The radar chain of a :class:`~tensorsim.PoseToDoppler`, given joints frame by frame.
 
@@ -94,6 +105,8 @@ class LiveRadar:
         self.people: dict[int, _Person] = {}
         self.frame, self.pulse = -1, 0
         self.pending: Pending | None = None
+        # Scatterers of pulses that wait for others.
+        self.begun: list[tuple[Tensor, Tensor]] = []
         self.rest = [torch.empty(0), torch.empty(0)]
 
     def push(self, joints: dict[int, tuple[Tensor, bool]]) -> NewColumns:
@@ -105,13 +118,17 @@ class LiveRadar:
         self.frame += 1
         self._remember(joints)
         stop = max(0, math.ceil((self.frame - 1) / self.fps * self.prf_hz - 1e-6))
-        # Some chains need several pulses to begin with.
-        if stop - self.pulse <= self.simulator.mti.lost_pulses:
-            return self._columns(None, self.pulse)
-        pulses = torch.arange(self.pulse, stop, dtype=torch.float64)
-        u = pulses * self.fps / self.prf_hz - (self.frame - 2)
-        first, self.pulse = self.pulse, stop
-        return self._columns(self._scene(u), first)
+        if stop > self.pulse:
+            pulses = torch.arange(self.pulse, stop, dtype=torch.float64)
+            self.begun.append(self._scene(pulses * self.fps / self.prf_hz - (self.frame - 2)))
+            self.pulse = stop
+        first = self.pulse - sum(points.shape[1] for points, _ in self.begun)
+        # The moving target indicator needs several pulses to begin with.
+        least = self.simulator.mti.lost_pulses if self.pending is None else 0
+        if self.pulse - first <= least:
+            return self._columns(None, first)
+        scene, self.begun = _joined(self.begun), []
+        return self._columns(scene, first)
 
     def _remember(self, joints: dict[int, tuple[Tensor, bool]]) -> None:
         step = 1 / max(1.0, FADE_S * self.fps)
@@ -147,11 +164,12 @@ class LiveRadar:
         return points, rcs
 
     def _columns(self, scene: tuple[Tensor, Tensor] | None, first: int) -> NewColumns:
-        end_s = self.pulse / self.prf_hz
         if scene is None:
+            end_s = first / self.prf_hz
             bins = self.simulator.range_profile.range_m.shape[0]
             empty = torch.zeros(bins, 0)
             return NewColumns(torch.zeros(self.simulator.doppler.bins, 0), empty, empty, end_s)
+        end_s = self.pulse / self.prf_hz
         piece = self.simulator.advance(*scene, first, self.pending)
         self.pending = piece.pending
         still = self._display(0, piece.profiles[0].T.abs())

@@ -69,8 +69,8 @@ class LiveFrame(NamedTuple):
 class LiveSimulator:
     """Frames of a camera in one by one, people and maps out: nothing looks ahead, nothing grows with time.
 
-    Detection in every n-th frame, tracking (:class:`~tensorsim.live.tracking.OnlineTracker`), key points, lifting and
-    the forward Kalman filter (:class:`~tensorsim.live.pose.CausalPose`), a spline and the radar
+    Detection n frames after the last one, tracking (:class:`~tensorsim.live.tracking.OnlineTracker`), key points,
+    lifting and the forward Kalman filter (:class:`~tensorsim.live.pose.CausalPose`), a spline and the radar
     (:class:`~tensorsim.live.radar.LiveRadar`). Columns of the maps come a frame after their last pulse.
 
     Args:
@@ -133,6 +133,7 @@ class LiveSimulator:
         self.order: dict[int, int] = {}
         self.states: dict[int, PoseState] = {}
         self.appeared, self.index, self.missed = 0, -1, 0
+        self.detected: int | None = None
         self.columns_done = 0
 
     @property
@@ -156,7 +157,9 @@ class LiveSimulator:
             )
         self.index += 1
         detections = None
-        if self.index % self.config.tracking.detection_interval == 0:
+        # Not by the number of the frame: of those that a busy machine drops, too many may be the ones to look at.
+        if self.detected is None or self.index - self.detected >= self.config.tracking.detection_interval:
+            self.detected = self.index
             detections = Detections(*(field[0] for field in self.vision.detect(frame[None])))
         self.tracks = self.tracker.step(self.tracks, detections)
         return self._after(frame)

@@ -36,11 +36,14 @@ class LiveView:
         self.map = LastColumns(self.columns)
         self.labels: list[LiveLabel] = []
 
-    def draw(self, new: LiveFrame, image: np.ndarray, dropped: int) -> np.ndarray:
-        """The picture (H, 640, 3) uint8 RGB of a frame (h, w, 3) uint8 RGB."""
+    def add(self, new: LiveFrame) -> None:
+        """Take the columns and the label of a frame, also of one that was missed."""
         self.map.push(new.doppler_time[torch.from_numpy(self.rows)])
         if new.label is not None:
             self.labels.append(new.label)
+
+    def draw(self, new: LiveFrame, image: np.ndarray, dropped: int) -> np.ndarray:
+        """The picture (H, 640, 3) uint8 RGB of the frame (h, w, 3) uint8 RGB that was added last."""
         self.labels = [label for label in self.labels if label.end_s > new.time_s - SHOWN_S]
         return np.concatenate([self._film(new, image, dropped), self._map(new), self._strip(new)])
 

@@ -318,7 +318,8 @@ class RadarSimulator(nn.Module):
         The noise is that of an empty scene, see the class, as the power of what is still to come is not known.
 
         Args:
-            positions: (B, m, S, 3) metres, m above the ``lost_pulses`` of the moving target indicator.
+            positions: (B, m, S, 3) metres; of the first piece, m is above the ``lost_pulses`` of the moving target
+                indicator.
             rcs: (B, m, S) m^2.
             first: number of the first of these pulses.
             pending: of the piece before; None begins.

@@ -1,5 +1,6 @@
 """Live equals the causal stages on the whole film, with a bounded delay and memory; drops are counted."""
 
+import math
 import threading
 import time
 import urllib.error
@@ -23,7 +24,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.live import LiveFrame, LiveSimulator
-from tensorsim.live.camera import Camera
+from tensorsim.live.camera import Camera, Grabbed
 from tensorsim.live.page import serving
 from tensorsim.live.radar import LiveRadar, cubic_b_spline
 from tensorsim.live.tracking import OnlineTracker
@@ -197,18 +198,27 @@ def test_spline_is_that_of_scipy() -> None:
         assert np.allclose(part.numpy(), spline(k + u), atol=1e-12)
 
 
-def test_maps_are_those_of_the_whole_motion() -> None:
-    motion = ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=2.0, rate_hz=20.0)
+@pytest.mark.parametrize(
+    ("fps", "prf_hz", "mti"),
+    [(20.0, 512.0, "two-pulse"), (120.0, 128.0, "two-pulse"), (60.0, 128.0, "n-pulse")],
+)
+def test_maps_are_those_of_the_whole_motion(fps: float, prf_hz: float, mti: str) -> None:
+    """Also where a frame has fewer pulses than the moving target indicator begins with."""
+    motion = ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=2.0, rate_hz=fps)
     joints = motion.joints[0].double()
-    config = CONFIG.replace(scene__radar__prf_hz=512.0, processing__display_rate_hz=128.0)
+    joints = (joints[:1] + joints) / 2  # slow enough for a PRF of 128 Hz
+    config = CONFIG.replace(
+        scene__radar__prf_hz=prf_hz, processing__display_rate_hz=128.0, processing__mti=mti
+    )
     stage = ts.PoseToDoppler.from_config(config)
-    radar = LiveRadar(stage, 20.0)
+    radar = LiveRadar(stage, fps)
     with torch.no_grad():
         parts = [radar.push({0: (frame, True)}) for frame in joints]
         # All moments of the curve at once; before the first frame the person stands, and fades in.
         still = torch.cat([joints[:1].expand(3, 14, 3), joints])
-        level = torch.tensor([0.0, 0.0, 0.0, 0.5] + [1.0] * (len(joints) - 1)).double()
-        time_s = torch.arange(radar.pulse) / 512.0 * 20.0
+        appears = torch.arange(1, len(joints) + 1) / (0.1 * fps)
+        level = torch.cat([torch.zeros(3), appears.clamp(max=1.0)]).double()
+        time_s = torch.arange(radar.pulse) / prf_hz * fps
         knots = np.arange(-5.0, len(still) - 1)
         curves = [
             BSpline(knots, x.flatten(1).numpy() if x.dim() > 1 else x.numpy(), 3) for x in (still, level)
@@ -216,7 +226,7 @@ def test_maps_are_those_of_the_whole_motion() -> None:
         place, fade = (torch.from_numpy(curve(time_s.numpy())) for curve in curves)
         points, rcs = stage.scatterers(place.reshape(1, 1, -1, 14, 3), fade.reshape(1, 1, -1))
         maps = stage.simulator(points, rcs)
-    assert radar.pulse == round(38 / 20 * 512)
+    assert radar.pulse == math.ceil((len(joints) - 2) / fps * prf_hz)
     for name in ("doppler_time", "range_time", "range_time_mti"):
         live = torch.cat([getattr(part, name) for part in parts], dim=-1)
         expected = getattr(maps, name)[0][:, : live.shape[-1]]
@@ -262,6 +272,14 @@ def test_missed_frames_are_bridged_and_counted(walk: Tensor) -> None:
     assert new.number == FRAMES - 1
     assert new.people[0].present
     assert float(new.people[0].joints[8, 1]) == pytest.approx(3.0 + 0.6 * 5.9, abs=0.4)
+
+
+def test_people_are_looked_for_whichever_frames_are_missed(walk: Tensor) -> None:
+    """Those that come have odd numbers, every other one of which would be looked at."""
+    live = simulator()
+    for index, frame in enumerate(walk):
+        new = live.push(frame) if index % 2 else live.miss()
+    assert [person.number for person in new.people] == [1]
 
 
 def test_somebody_who_leaves_is_forgotten(walk: Tensor) -> None:
@@ -320,6 +338,28 @@ def test_frames_that_come_too_fast_are_dropped_and_counted(clip: Path) -> None:
     assert len(indices) + camera.dropped == last + 1 <= FRAMES
 
 
+def test_frames_that_a_film_does_not_have_are_missing(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(str(clip), every_frame=True, loops=2)
+    frame = torch.zeros(3, 4, 4, dtype=torch.uint8)
+    monkeypatch.setattr(
+        camera.reader, "timed_frames", lambda: iter([(0.0, frame), (0.1, frame), (0.52, frame), (0.6, frame)])
+    )
+    assert [grabbed.dropped for grabbed in camera.frames()] == [0, 0, 3, 0, 0, 0, 3, 0]
+    assert camera.dropped == 6
+
+
+def test_an_error_while_frames_are_read_is_raised(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(str(clip), fps=200.0)
+
+    def broken() -> Iterator[tuple[float, Tensor]]:
+        yield 0.0, torch.zeros(3, 4, 4, dtype=torch.uint8)
+        raise TensorsimError("frame 1 has another shape")
+
+    monkeypatch.setattr(camera.reader, "timed_frames", broken)
+    with pytest.raises(TensorsimError, match="frame 1 has another shape"):
+        list(camera.frames())
+
+
 def test_cameras_that_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no such file"):
         Camera(str(tmp_path / "no.mp4"))
@@ -348,6 +388,13 @@ def test_the_page_streams_pictures_to_this_machine_only() -> None:
             pass
 
 
+def _every_third(camera: Camera) -> Iterator[Grabbed]:
+    """The third frame of a film, the sixth and so on, as if the others had been dropped."""
+    for index, (_, frame) in enumerate(camera.reader.timed_frames()):
+        if index % 3 == 2:
+            yield Grabbed(frame, 2)
+
+
 def test_command(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -374,6 +421,13 @@ def test_command(
     film = VideoReader(tmp_path / "live.webm")
     assert (film.width, film.height) == (640, 480 + 240 + 26)
     assert sum(chunk.shape[0] for chunk in film.chunks(16)) == 53
+    # Columns, labels and pictures of frames that are missing are not left out.
+    monkeypatch.setattr(Camera, "frames", _every_third)
+    cli.main([*arguments, "--record", str(tmp_path / "third.webm")])
+    said = capsys.readouterr()
+    assert "0 people" not in said.out
+    assert said.out.splitlines()[0].startswith("     4.")
+    assert sum(chunk.shape[0] for chunk in VideoReader(tmp_path / "third.webm").chunks(16)) == FRAMES
     with pytest.raises(SystemExit):
         cli.main([*arguments, "--sound"])
     assert "--sound: got it for live" in capsys.readouterr().err
