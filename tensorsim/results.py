@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tensorsim import plot
 from tensorsim.array_files import save_arrays
-from tensorsim.config import CameraConfig, SimulationConfig
+from tensorsim.config import CameraConfig, RadarConfig, SimulationConfig
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
 from tensorsim.device import one_thread
@@ -326,22 +326,24 @@ def _figure_pixels(figure: Any) -> np.ndarray:
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
-def people_of(pose: Pose, fps: float) -> list[dict[str, Any]]:
-    """One row per person: when it is in the scene, how far, and how fast its torso approaches."""
+def people_of(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]]:
+    """One row per person: when it is in the scene, how far its torso is from the radar, and how fast that shrinks."""
     rows = []
+    antennas = torch.tensor(radar.middle_m, dtype=torch.float64)
     for person in range(pose.joints.shape[1]):
         frames = torch.nonzero(pose.valid[0, person]).flatten()
         if frames.numel() == 0:
             continue  # a track on which no joint was seen
         torso = pose.joints[0, person, frames][:, [1, 8, 11]].double().mean(dim=1)
+        range_m = (torso - antennas).norm(dim=-1)
         duration_s = max(float(frames[-1] - frames[0]) / fps, 1 / fps)
         rows.append(
             {
                 "id": person + 1,
                 "first_frame": int(frames[0]),
                 "last_frame": int(frames[-1]),
-                "mean_range_m": round(float(torso.norm(dim=-1).mean()), 3),
-                "mean_approach_m_s": round(float(torso[0, 1] - torso[-1, 1]) / duration_s, 3),
+                "mean_range_m": round(float(range_m.mean()), 3),
+                "mean_approach_m_s": round(float(range_m[0] - range_m[-1]) / duration_s, 3),
             }
         )
     return rows
@@ -353,7 +355,7 @@ def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: R
     document = config.to_document()
     return {
         "source": {"kind": source.kind, **source.about},
-        "people": people_of(found.pose, source.fps),
+        "people": people_of(found.pose, source.fps, config.scene.radar),
         "camera": camera_row(found.camera),
         "radar_ahead_of_camera_m": round(found.radar_ahead_m, 3),
         "background_px_s": None if found.background_px_s is None else round(found.background_px_s, 1),

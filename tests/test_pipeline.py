@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -275,8 +276,21 @@ def test_a_track_that_shows_no_joint_is_nobody() -> None:
     pose = stage.lift(tracks, whole.keypoints, 0.2 * whole.keypoint_scores, 240, 320, FPS)
     assert not pose.valid.any()
     assert torch.isfinite(pose.joints).all()
-    assert people_of(pose, FPS) == []
-    assert people_of(whole, FPS)[0]["last_frame"] == 19
+    assert people_of(pose, FPS, RADAR) == []
+    assert people_of(whole, FPS, RADAR)[0]["last_frame"] == 19
+
+
+def test_ranges_of_people_are_those_from_the_antennas() -> None:
+    """The antennas are 1.5 m above the origin; who walks past does not come nearer by as much as along y."""
+    joints = torch.zeros(1, 1, 21, 14, 3)
+    joints[..., 0], joints[..., 1], joints[..., 2] = torch.linspace(-3.0, -1.0, 21)[:, None], 1.2, 1.3
+    there = torch.ones(1, 1, 21, dtype=torch.bool)
+    blank = torch.zeros(1, 1, 21, 17, 2)
+    row = people_of(ts.Pose(torch.zeros(1, 1, 21, 4), blank, blank[..., 0], joints, there), FPS, RADAR)[0]
+    x_m = np.linspace(-3.0, -1.0, 21) - RADAR.middle_m[0]
+    range_m = np.sqrt(x_m**2 + (1.2 - RADAR.middle_m[1]) ** 2 + (1.3 - RADAR.middle_m[2]) ** 2)
+    assert row["mean_range_m"] == pytest.approx(range_m.mean(), abs=1e-3)
+    assert row["mean_approach_m_s"] == pytest.approx((range_m[0] - range_m[-1]) / (20 / FPS), abs=1e-3)
 
 
 class FlatPose(nn.Module):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, check_seed, load_recognizer
+from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
 from tensorsim.exceptions import TensorsimError
 
 
@@ -87,7 +87,8 @@ class EvaluateFilms(NetworkOptions):
         reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)
         scenes: dict[str, Scene] = {}
         for name in self.scenes:
-            config = RadarOptions(scene=name, body=self.body, classifier=self.classifier).configuration()
+            options = RadarOptions(scene=name, body=self.body, classifier=self.classifier)
+            config = at_display_rate(options.configuration())
             recognizer = load_recognizer(config)
             if recognizer is None:
                 raise TensorsimError("--classifier: got 'none', expected weights")
@@ -125,7 +126,9 @@ class EvaluateFilms(NetworkOptions):
         figure = contact_sheet(film, video, found, reader.stage.keypoint_threshold, shown)
         plot.save_figure(figure, self.out / f"{film.path.stem}.png")
         verdicts = [verdict for verdict, _, _ in shown]
-        row = film_row(film, found, followed(pose, video.fps), pose.valid.shape[2], video.fps, verdicts)
+        radar = next(iter(scenes.values())).stage.simulator.radar
+        people = followed(pose, video.fps, radar)
+        row = film_row(film, found, people, pose.valid.shape[2], video.fps, verdicts)
         if not self.variants:
             return row
         of_variants = {}

@@ -101,6 +101,12 @@ class RadarConfig:
         return listed(self.rx_m)
 
     @property
+    def middle_m(self) -> Vector:
+        """Half way between the first transmitter and the first receiver: where ranges of one pair count from."""
+        tx, rx = self.tx_positions_m[0], self.rx_positions_m[0]
+        return ((tx[0] + rx[0]) / 2, (tx[1] + rx[1]) / 2, (tx[2] + rx[2]) / 2)
+
+    @property
     def has_array(self) -> bool:
         """Whether the echo has an antenna dimension: ``tx_m`` or ``rx_m`` is a list of positions."""
         return self.tx_positions_m != (self.tx_m,) or self.rx_positions_m != (self.rx_m,)

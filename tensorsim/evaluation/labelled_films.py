@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tensorsim.config import ACTIVITIES
+from tensorsim.config import ACTIVITIES, RadarConfig
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.film_variants import Observed, over_variants
@@ -256,9 +256,9 @@ def judged(
     return Verdict(scene, label, probabilities[label], label in film.accept, of_accepted), maps
 
 
-def followed(pose: Pose, fps: float) -> list[dict[str, Any]]:
+def followed(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]]:
     """A row per person: those of :func:`~tensorsim.results.people_of`, for how long, and the fastest joint."""
-    rows = people_of(pose, fps)
+    rows = people_of(pose, fps, radar)
     for row in rows:
         person = row["id"] - 1
         there = pose.valid[0, person]

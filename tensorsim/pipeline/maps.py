@@ -81,10 +81,10 @@ class PoseToDoppler(nn.Module):
         if len(rcs_scale) == 0 or not all(scale > 0 for scale in rcs_scale):
             raise TensorsimError(f"rcs_scale: got {rcs_scale}, expected positive factors, one per person")
         self.register_buffer("rcs_scale", torch.tensor(rcs_scale, dtype=torch.float64), persistent=False)
-        radar = simulator.radar
-        antennas = torch.tensor([radar.tx_positions_m[0], radar.rx_positions_m[0]], dtype=torch.float64)
-        self.register_buffer("radar_m", antennas.mean(0), persistent=False)
-        self.reach_m = radar.reach_m
+        self.register_buffer(
+            "radar_m", torch.tensor(simulator.radar.middle_m, dtype=torch.float64), persistent=False
+        )
+        self.reach_m = simulator.radar.reach_m
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "PoseToDoppler":

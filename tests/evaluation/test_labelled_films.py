@@ -262,7 +262,7 @@ def test_a_verdict_is_right_where_the_label_is_accepted() -> None:
 
 
 def test_who_was_followed_for_how_long() -> None:
-    row = followed(somebody(2.0), FPS)[0]
+    row = followed(somebody(2.0), FPS, RadarConfig())[0]
     assert row["followed_s"] == pytest.approx(1.9)
     assert row["fastest_joint_m_s"] == pytest.approx(2.0, abs=0.1)
 

@@ -41,7 +41,7 @@ def run() -> tuple[Pose, RadarMaps, Axes, dict[str, Any]]:
         "label": "S8 Walking",
         "probabilities": {"S8 Walking": 0.75, "S1 Empty": 0.25},
         "timeline": [{"start_s": 0.0, "end_s": 2.0, "label": "S8 Walking", "probability": 0.75}],
-        "people": people_of(pose, FPS),
+        "people": people_of(pose, FPS, config.scene.radar),
         "warnings": ["</script><script>document.title = 'broken out'</script>"],
         "config": document,
         **{part: document["scene"][part] for part in ("radar", "wall")},

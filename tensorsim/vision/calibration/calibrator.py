@@ -114,7 +114,8 @@ class CameraCalibrator(nn.Module):
         keypoint_threshold: score from which a key point counts. The usual 0.3 is too low for this: key points of low
             scores err to one side (feet below the picture are found at its edge), and one camera is told from all
             frames.
-        most_frames: of each person that are used, evenly spread.
+        most_frames: of those in which somebody is upright that are used, at most: evenly spread, or windows of six
+            seconds that are.
 
     Shape:
         keypoints (..., P, T, 17, 2) pixels, scores (..., P, T, 17), valid (..., P, T) bool, image height and width in
@@ -218,7 +219,7 @@ class CameraCalibrator(nn.Module):
         self, keypoints: Tensor, scores: Tensor, valid: Tensor, height: int, width: int, fps: float
     ) -> Tensor:
         """Means, deviations and number of frames (9,) of the camera of one clip of key points (P, T, 17, 2)."""
-        people, frames = valid.shape[0], valid.shape[1]
+        people = valid.shape[0]
         upright = steadily(is_upright(keypoints, scores, self.keypoint_threshold), valid, fps)
         ends = ends_of_body(keypoints)
         upright = upright & ~still_beside_others(ends, valid)[:, None]
@@ -232,8 +233,8 @@ class CameraCalibrator(nn.Module):
             for axis in range(2):
                 smooth.append(local_linear(ends[:, :, end, axis], weights, sigma))
         ends = torch.stack(smooth, dim=-1).unflatten(-1, [2, 2])
-        every = -(-frames // self.most_frames)
-        ends, upright, walking = ends[:, ::every], upright[:, ::every], walking[:, ::every]
+        chosen, apart, every = self._looked_at(upright, fps)
+        ends, upright, walking = ends[:, chosen], upright[:, chosen] & ~apart, walking[:, chosen]
 
         stature = self.stature[torch.arange(people, device=valid.device).clamp(max=self.stature.shape[0] - 1)]
         middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64, device=valid.device)
@@ -261,6 +262,34 @@ class CameraCalibrator(nn.Module):
         )
         best = int(cost.argmin())
         return self._row(at[best, :4], torch.diagonal(covariance[best])[:4].sqrt(), count)
+
+    def _looked_at(self, upright: Tensor, fps: float) -> tuple[Tensor, Tensor, int]:
+        """Frames to fit, of those in which somebody is upright and half a second about them.
+
+        Args:
+            upright: (P, T) bool.
+            fps: frames per second.
+
+        Returns:
+            Indices (n,) of the frames in steps of at most a quarter of a second; which of these (n,) keep two windows
+            of a long film apart; and the step in frames.
+        """
+        about = int(0.5 * fps + 0.5)
+        somebody = upright.any(dim=0).double()[None, None]
+        index = torch.nonzero(torch.max_pool1d(somebody, 2 * about + 1, 1, about)[0, 0])[:, 0]
+        count = index.shape[0]
+        every = max(min(-(-count // self.most_frames), int(fps / 4)), 1)
+        index = index[::every]
+        apart = torch.zeros_like(index, dtype=torch.bool)
+        if index.shape[0] <= self.most_frames:
+            return index, apart, every
+        # Of a long film windows of six seconds, the first of which only separates it from the window before.
+        length = min(int(6 * fps / every + 0.5), self.most_frames)
+        windows = max(self.most_frames // length, 1)
+        start = torch.linspace(0, index.shape[0] - length, windows, device=index.device).long()
+        within = torch.arange(length, device=index.device)
+        apart = (within < fps / every).expand(windows, length).flatten()
+        return index[(start[:, None] + within).flatten()], apart, every
 
     def _row(self, at: Tensor, sd: Tensor, count: Tensor) -> Tensor:
         """Pitch, roll, height in m, field of view, their deviations, and the number of frames (9,)."""

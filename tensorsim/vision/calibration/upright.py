@@ -171,19 +171,20 @@ def cadence(
     squared = (apart - slow).square().sum(dim=-1)
     steps = walking * (squared - local_linear(squared, walking, 0.5 * fps))
     frames = steps.shape[-1]
-    time = torch.arange(frames, dtype=steps.dtype, device=steps.device) / fps
     hertz = torch.linspace(least_hz, most_hz, 161, dtype=steps.dtype, device=steps.device)
-    phase = 2 * math.pi * time[:, None] * (2 * hertz)
+    power = torch.zeros_like(steps[..., :1] * hertz)
+    total = torch.zeros_like(steps[..., 0])
     # In windows of a second's standard deviation: after a pause the steps go on in another phase.
-    middle = torch.arange(0.0, frames / fps, 1.0, dtype=steps.dtype, device=steps.device)
-    windows = torch.exp(-0.5 * (time - middle[:, None]).square())
-    part = windows * steps.unsqueeze(-2)
-    power = torch.matmul(part, phase.cos()).square() + torch.matmul(part, phase.sin()).square()
-    power = power.sum(dim=-2)
-    # A sinusoid of amplitude A in a window W has the power (A sum(W) / 2)^2 and the energy A^2 sum(W) / 2.
-    window = windows * walking.unsqueeze(-2)
-    energy = torch.matmul(window, steps.square().unsqueeze(-1)).squeeze(-1)
-    total = (energy * window.sum(dim=-1)).sum(dim=-1) / 2
+    for middle_s in range(math.ceil(frames / fps)):
+        first, last = max(int((middle_s - 5) * fps), 0), min(int((middle_s + 5) * fps) + 1, frames)
+        time = torch.arange(first, last, dtype=steps.dtype, device=steps.device) / fps - middle_s
+        phase = 2 * math.pi * time[:, None] * (2 * hertz)
+        window = torch.exp(-0.5 * time.square())
+        part = window * steps[..., first:last]
+        power = power + torch.matmul(part, phase.cos()).square() + torch.matmul(part, phase.sin()).square()
+        # A sinusoid of amplitude A in a window W has the power (A sum(W) / 2)^2 and the energy A^2 sum(W) / 2.
+        window = window * walking[..., first:last]
+        total = total + (window * steps[..., first:last].square()).sum(dim=-1) * window.sum(dim=-1) / 2
     best = power.argmax(dim=-1)
     share = power.amax(dim=-1) / total.clamp(min=1e-12)
     inside = (best > 0) & (best < hertz.shape[0] - 1) & (walking.sum(dim=-1) >= fps)

@@ -93,6 +93,34 @@ def test_somebody_who_walks_tells_the_camera(tilt: float, height: float, fov: fl
     assert int(found.frames) > 100
 
 
+def test_a_long_film_tells_no_less_than_the_walk_in_it() -> None:
+    """Frames without anybody do not count; of somebody who walks for minutes, windows are looked at."""
+    camera = known_camera(24.0, 3.0, 60.0)
+    walk = walk_before(camera, 5)
+    stage = CameraCalibrator((walk.height_m,), 0.02)
+    keypoints, scores = walk.keypoints[None], walk.scores[None]
+    frames = keypoints.shape[1]
+
+    def told(keypoints: Tensor, scores: Tensor) -> CameraEstimate:
+        return stage(keypoints, scores, scores.any(-1), HEIGHT, WIDTH, FPS)
+
+    alone = errors_of(told(keypoints, scores), camera, walk)
+    ahead, later = 20 * frames, 55 * frames  # ten minutes
+    nothing = torch.zeros(1, ahead, 17, 2).double(), torch.zeros(1, later, 17, 2).double()
+    long = told(
+        torch.cat([nothing[0], keypoints, nothing[1]], dim=1),
+        torch.cat([nothing[0][..., 0], scores, nothing[1][..., 0]], dim=1),
+    )
+    found = errors_of(long, camera, walk)
+    assert abs(found.pitch_deg - alone.pitch_deg) < 0.3
+    assert abs(found.range - alone.range) < 0.02
+    gap = torch.zeros(1, 2 * round(FPS), 17, 2).double()
+    again = torch.cat([keypoints, gap], dim=1).repeat(1, 30, 1, 1)
+    found = errors_of(told(again, torch.cat([scores, gap[..., 0]], dim=1).repeat(1, 30, 1)), camera, walk)
+    assert abs(found.pitch_deg) < 1.0
+    assert abs(found.range) < 0.07
+
+
 def test_nobody_tells_nothing() -> None:
     module = CameraCalibrator(most_frames=10)
     args = TestCameraCalibrator().inputs((), torch.float64)
@@ -175,6 +203,19 @@ def test_cadence_is_that_of_the_ankles(hertz: float) -> None:
     assert float(share[1]) == 0.0
     # Feet that change places at random have no cadence.
     assert float(cadence((standing(400.0, 200.0) + 10 * noise)[None], walks[None], FPS)[1]) < 0.3
+
+
+def test_cadence_does_not_depend_on_how_long_the_film_is() -> None:
+    walk = walk_before(known_camera(12.0, 1.5, 60.0), 3)
+    frames = walk.keypoints.shape[0]
+    walking = torch.ones(frames, dtype=torch.float64)
+    empty = torch.zeros(7 * frames, 17, 2, dtype=torch.float64)
+    alone = cadence(walk.keypoints, walking, FPS)
+    longer = cadence(
+        torch.cat([walk.keypoints, empty]), torch.cat([walking, torch.zeros(7 * frames).double()]), FPS
+    )
+    assert torch.equal(alone[0], longer[0])
+    assert torch.allclose(alone[1], longer[1], atol=0.02)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
