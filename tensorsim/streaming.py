@@ -312,6 +312,14 @@ def maps_of_pose(
     joints, valid = pose.joints[:1].to(device), pose.valid[:1].to(device)
     pulses = stage.resampler.pulses(joints.shape[2], fps)
     coefficients = stage.curve(joints, valid, fps)
+    if bool((valid & (stage.heard(joints) == 0)).any()):
+        reach_m = stage.simulator.radar.reach_m
+        warnings.warn(
+            f"people are farther away than {1.9 * reach_m:.1f} m, 1.9 times the range axis of this radar: the receiver "
+            "filters out their echo, and no map shows them",
+            TensorsimWarning,
+            stacklevel=2,
+        )
 
     # The simulator passes over the motion twice: for the level of the noise, and for the maps.
     with progress_bar("radar", 2 * pulses, quiet) as bar:

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 import tensorsim as ts
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import JOINTS
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.results import people_of
+from tensorsim.streaming import maps_of_pose
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
@@ -488,5 +489,21 @@ def test_the_receiver_hears_everybody_on_the_range_axis() -> None:
     way = torch.stack([0.6 * radius, 0.8 * radius, 0 * radius], -1)
     there = way + torch.tensor([radar.tx_m, radar.rx_m], dtype=torch.float64).mean(0)
     heard = stage.heard(there[:, None].expand(-1, 14, -1))
-    assert heard.tolist() == pytest.approx([1, 1, 1, 0.5, 1e-4, 1e-4], rel=1e-3)
+    assert heard.tolist() == pytest.approx([1, 1, 1, 0.5, 0, 0], abs=1e-6)
     assert heard[:3].eq(1.0).all()
+
+
+def test_who_is_too_far_away_alone_leaves_an_empty_scene() -> None:
+    """The noise is not set by an echo that the receiver does not hear."""
+    joints, there = torch.zeros(1, 1, 20, 14, 3), torch.ones(1, 1, 20, dtype=torch.bool)
+    joints[..., 1] = 2.5 * RADAR.reach_m - 0.1 * torch.arange(20)[:, None]
+    stage = PoseToDoppler(ts.radar.RadarSimulator(RADAR, snr_db=50.0))
+    torch.manual_seed(0)
+    far = stage(joints, there, FPS)
+    torch.manual_seed(0)
+    empty = stage(joints, ~there, FPS)
+    assert torch.equal(far.doppler_time, empty.doppler_time)
+    blank = torch.zeros(1, 1, 20, 17, 2)
+    pose = ts.Pose(torch.zeros(1, 1, 20, 4), blank, blank[..., 0], joints, there)
+    with pytest.warns(TensorsimWarning, match="the receiver filters out"):
+        maps_of_pose(stage, pose, FPS, torch.device("cpu"), quiet=True)

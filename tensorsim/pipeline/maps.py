@@ -159,21 +159,30 @@ class PoseToDoppler(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Scatterers (B, M, S, 3) and their RCS (B, M, S) in pulses ``start`` to ``stop`` of the motion.
 
+        Of people who are not there in any of these pulses there are none.
+
         Args:
             coefficients: of :meth:`curve`, for joints (B, P, T, 14, 3).
             valid: (B, P, T) bool.
             fps: frames per second.
             start, stop: half-open range of pulses.
         """
+        presence = visibility_fade(valid, fps, self.resampler.prf_hz, start, stop)
+        person = torch.arange(valid.shape[1], device=valid.device)
+        # Small motions have a seed for each person, by order.
+        if len(self.small_motions) == 0 and person.shape[0] > 1:
+            there = (presence > 0).any(-1).any(0)
+            there[:1] |= ~there.any()
+            person = person[there]
+            presence, coefficients = presence[:, person], coefficients[:, person]
         pulses = self.resampler.pulses(valid.shape[2], fps)
         first, last = max(0, start - self.halo), min(pulses, stop + self.halo)
         positions = self.pulse_smoother(self.resampler.evaluate(coefficients, fps, first, last))
         positions = positions[:, :, start - first : stop - first]
         for motion in self.small_motions:
             positions = motion(positions, start)
-        presence = visibility_fade(valid, fps, self.resampler.prf_hz, start, stop)
         # Scatterers scale cross sections with the square of the presence.
-        person = torch.arange(valid.shape[1], device=valid.device).clamp(max=self.rcs_scale.shape[0] - 1)
+        person = person.clamp(max=self.rcs_scale.shape[0] - 1)
         presence = presence * self.rcs_scale[person].sqrt().unsqueeze(-1) * self.heard(positions)
         points, rcs = self.scatterers(positions, presence)
         return points, rcs
@@ -183,13 +192,13 @@ class PoseToDoppler(nn.Module):
         """Amplitude (..., M) with which the receiver hears people with joints (..., M, 14, 3): its low-pass filter.
 
         A range of twice that of the last bin has a beat frequency of the sample rate and would appear at the radar.
-        Receivers filter before they sample: here the amplitude falls as a raised cosine, by 80 dB from 1.5 to 1.9
-        times the range of the last bin. What is there does not appear in the maps in any case.
+        Receivers filter before they sample: here the amplitude falls as a raised cosine, from 1 at 1.5 times the range
+        of the last bin to 0 at 1.9 times. What is there does not appear in the maps in any case.
         """
         distance = torch.linalg.vector_norm(mid_hips(joints) - self.radar_m.to(joints), dim=-1)
         beyond = ((distance / self.reach_m - 1.5) / 0.4).clamp(0.0, 1.0)
-        filtered = 1e-4 + (1.0 - 1e-4) * (0.5 + 0.5 * torch.cos(math.pi * beyond))
-        return torch.where(beyond > 0, filtered, torch.ones_like(filtered))
+        # Exactly 0 there: who is not heard does not set the level of the noise.
+        return torch.where(beyond < 1, 0.5 + 0.5 * torch.cos(math.pi * beyond), 0.0)
 
     def denoise(self, maps: RadarMaps) -> RadarMaps:
         """Clean the processed maps and take the ridges again, if there is a denoiser."""
