@@ -248,6 +248,11 @@ def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
     return fetch(find(str(source), *networks))
 
 
+def name_of(path: Path) -> str:
+    """The name of weights that are shipped, which is the same on every machine, or the path of others."""
+    return next((entry.name for entry in shipped() if entry.path == path), str(path))
+
+
 def fetch(entry: ModelEntry, quiet: bool = False, unverified: bool = False) -> Path:
     """The file of an entry, downloaded if it is not there. An interrupted download goes on where it stopped.
 

@@ -193,8 +193,9 @@ def strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
 
 def doppler_span(maps: RadarMaps, axes: Axes) -> float:
     """Half of the part of the Doppler axis that has something to show, in Hz."""
-    level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB)
-    shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB).any(1)]
+    level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB).max(1)
+    # Most of the axis is noise, which may be above the floor of the colours.
+    shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB) & (level > np.median(level) + 6)]
     return 1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8))
 
 

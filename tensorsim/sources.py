@@ -20,7 +20,7 @@ from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.pipeline import VideoToPose
 from tensorsim.pipeline.reach import NEAREST_M
-from tensorsim.streaming import Found, people_of_film
+from tensorsim.streaming import Found, lifted_film, people_of_film
 from tensorsim.types import Pose, Tracks
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
@@ -113,6 +113,7 @@ def keypoint_source(
     fps: float | None,
     size: tuple[int, int] | None = None,
     cut: Cut = Cut(),  # noqa: B008  # immutable
+    calibrate: bool = False,
 ) -> Source:
     """People whose COCO or BlazePose keypoints are known; only lifting, placing and smoothing of ``stage`` run.
 
@@ -122,9 +123,10 @@ def keypoint_source(
         fps: frames per second; no such file tells them.
         size: (height, width) of the pictures; None where the file says it.
         cut: the frames to keep.
+        calibrate: estimate the camera from the people in place of that of the stage.
 
     Raises:
-        TensorsimError: no frame rate, no size, a file that cannot be read.
+        TensorsimError: no frame rate, no size, a file that cannot be read, or pictures of another size.
     """
     if fps is None:
         raise TensorsimError(f"{path}: got keypoints without a frame rate, expected --fps")
@@ -136,21 +138,36 @@ def keypoint_source(
             f"{path}: got keypoints without the size of their pictures, expected --image-size"
         )
     kept = cut.frames(found.valid.shape[0], fps, path)
-    pose = _lifted(found, stage, kept, size, fps / cut.stride)
-    count = pose.valid.shape[2]
+    _check_size(found, size)
+    people = _lifted(found, stage, kept, size, fps / cut.stride, calibrate)
+    count = people.pose.valid.shape[2]
     return Source(
         "keypoints",
         fps / cut.stride,
         count,
-        lambda quiet: Found(pose),
+        lambda quiet: people,
         lambda: blank_frames(count, size),
         stage.keypoint_threshold,
         {"image_size": list(size)},
     )
 
 
-def _lifted(found: Keypoints2D, stage: VideoToPose, kept: slice, size: tuple[int, int], fps: float) -> Pose:
-    """The Pose of known keypoints."""
+def _check_size(found: Keypoints2D, size: tuple[int, int]) -> None:
+    """Refuse pictures (height, width) that do not hold most of the key points that were seen."""
+    seen = found.keypoints[(found.scores > 0.3) & found.valid[..., None]]
+    inside = ((seen >= 0) & (seen < seen.new_tensor([size[1], size[0]]))).all(dim=-1)
+    if len(seen) and float(inside.float().mean()) < 0.5:
+        right, low = seen.quantile(0.95, dim=0).tolist()
+        raise TensorsimError(
+            f"--image-size: got {size[1]} x {size[0]} pixels, expected the width and height of the pictures in which "
+            f"the key points were found, which reach to ({right:.0f}, {low:.0f})"
+        )
+
+
+def _lifted(
+    found: Keypoints2D, stage: VideoToPose, kept: slice, size: tuple[int, int], fps: float, calibrate: bool
+) -> Found:
+    """The people of known keypoints."""
     keypoints = found.keypoints[kept].transpose(0, 1)
     scores = found.scores[kept].transpose(0, 1)
     matched = found.valid[kept].transpose(0, 1)
@@ -161,7 +178,7 @@ def _lifted(found: Keypoints2D, stage: VideoToPose, kept: slice, size: tuple[int
     nearest = nearest_valid(matched)[..., None].expand(-1, -1, 4)
     boxes = keypoint_boxes(keypoints, scores).gather(1, nearest) * valid[..., None]
     tracks = Tracks(boxes[None], valid[None], matched[None])
-    return stage.lift(tracks, keypoints[None], scores[None], size[0], size[1], fps)
+    return lifted_film(stage, tracks, keypoints[None], scores[None], size, fps, calibrate)
 
 
 def motion_source(

@@ -98,7 +98,7 @@ def test_simulate_writes_everything(
          *stand_ins]
     )  # fmt: skip
     assert {p.name for p in out.iterdir()} == FILES
-    assert "1 people in 25 frames" in capsys.readouterr().out
+    assert "1 person in 25 frames" in capsys.readouterr().out
     maps, pose = np.load(out / "maps.npz"), np.load(out / "pose.npz")
     assert maps["range_time"].shape == (200, 320)
     assert maps["range_time_mti"].shape == (200, 319)

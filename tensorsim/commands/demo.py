@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
+from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer, number_of_people
 from tensorsim.exceptions import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
@@ -110,15 +110,17 @@ class Demo(NetworkOptions, RadarOptions):
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
-        found = f"{ACTIVITIES[activity]}, {int(pose.valid[0].any(1).sum())} people found"
+        found = f"{ACTIVITIES[activity]}, {number_of_people(int(pose.valid[0].any(1).sum()))} found"
         print(f"{self.out}: {found}; {described_likeness(likeness, empty_likeness)}")
 
     def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":
-        """The configuration for a film of the demonstration, with the files of its networks."""
+        """The configuration for a film of the demonstration, with its networks."""
+        from tensorsim.registry import name_of
+
         config = at_display_rate(self.configuration(), self.full_rate)
         if not self.flip_test:
             config = config.replace(pose__flip_test=False)
-        return config.replace(tracking__detector=str(detector), pose__network=str(pose_network))
+        return config.replace(tracking__detector=name_of(detector), pose__network=name_of(pose_network))
 
 
 class Filmed(NamedTuple):
@@ -198,6 +200,8 @@ def likeness_to_truth(maps: "RadarMaps", truth: "RadarMaps") -> tuple[dict[str, 
 def described_likeness(likeness: dict[str, Any], empty: dict[str, Any]) -> str:
     """The figures of the Doppler-time map in one line."""
     figures = likeness["doppler_time"]
+    if figures["psnr_linear_db"] is None:
+        return "the Doppler-time map from the film is that of the true motion"
     return (
         "Doppler-time map from the film against that of the true motion: "
         f"PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']} "

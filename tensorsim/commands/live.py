@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, load_recognizer
+from tensorsim.commands.options import RadarOptions, load_recognizer, number_of_people
 from tensorsim.exceptions import TensorsimError, collected_warnings
 from tensorsim.limits import check_range
 
@@ -89,7 +89,9 @@ class Live(NetworkOptions, RadarOptions):
             finally:
                 self._warn(messages[said:])
         seconds = (live.index + 1) / live.fps
-        print(f"{self.camera}: {seconds:.1f} s, {live.appeared} people, {camera.dropped} frames dropped")
+        print(
+            f"{self.camera}: {seconds:.1f} s, {number_of_people(live.appeared)}, {camera.dropped} frames dropped"
+        )
 
     def _play(self, live: "LiveSimulator", camera: "Camera") -> None:
         """Simulate frame by frame, and show and record what comes out."""
@@ -144,6 +146,8 @@ class Live(NetworkOptions, RadarOptions):
             check_range(value, "body height", "--person-height")
         if self.fps is not None:
             check_range(self.fps, "frame rate", "--fps")
+        if self.seconds is not None:
+            check_range(self.seconds, "time", "--seconds")
         if self.port is not None and not 0 <= self.port < 65536:
             raise TensorsimError(f"--port: got {self.port}, expected a number from 0 to 65535")
         if self.record is not None and self.record.suffix.lower() not in (".mp4", ".webm"):

@@ -290,6 +290,11 @@ class Run(NamedTuple):
     device: "torch.device"
 
 
+def number_of_people(count: int) -> str:
+    """``1 person``, ``2 people``."""
+    return f"{count} {'person' if count == 1 else 'people'}"
+
+
 def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "SimulationConfig":
     """The configuration with range-time maps of a display rate, or of every pulse."""
     if full_rate:

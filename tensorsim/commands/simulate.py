@@ -10,7 +10,7 @@ import tyro
 
 from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer
+from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer, number_of_people
 from tensorsim.exceptions import TensorsimError, collected_warnings
 from tensorsim.limits import check_range
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import torch
 
     from tensorsim.config import SimulationConfig
+    from tensorsim.pipeline import PoseToDoppler
     from tensorsim.sources import Source
 
 #: Options that say something of some kinds of source only.
@@ -38,7 +39,7 @@ _MEANT_FOR = {
     "flip_test": ("video",),
     "engine": ("video",),
     "person_height": ("video", "keypoints"),
-    "calibrate": ("video",),
+    "calibrate": ("video", "keypoints"),
     "camera_fov": ("video", "keypoints"),
     "position": ("video", "keypoints"),
     "lifter": ("video", "keypoints"),
@@ -123,6 +124,7 @@ class Simulate(NetworkOptions, RadarOptions):
             source, config = self._source(kind, config, device)
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
+            self._check_length(source, stage)
             with complete_or_nothing(self.out) as folder:
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)
                 with simulated as (found, maps, strip):
@@ -144,7 +146,21 @@ class Simulate(NetworkOptions, RadarOptions):
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         shown = f", {label['label']}" if label["label"] else ""
-        print(f"{self.out}: {int(pose.valid[0].any(1).sum())} people in {pose.valid.shape[2]} frames{shown}")
+        people = number_of_people(int(pose.valid[0].any(1).sum()))
+        print(f"{self.out}: {people} in {pose.valid.shape[2]} frames{shown}")
+
+    def _check_length(self, source: "Source", stage: "PoseToDoppler") -> None:
+        """Refuse what is shorter than a Doppler window before anybody is looked for."""
+        if source.frame_count is None:
+            return
+        # Files announce a frame or two too few.
+        longest = stage.resampler.pulses(source.frame_count + 2, source.fps)
+        if longest < stage.simulator.min_pulses:
+            prf_hz = stage.resampler.prf_hz
+            raise TensorsimError(
+                f"{self.source}: got {source.frame_count / source.fps:.3g} s, expected at least "
+                f"{stage.simulator.min_pulses / prf_hz:.3g} s for one Doppler window (--stft-window)"
+            )
 
     def configuration(self) -> "SimulationConfig":
         """The configuration with the options that say how people are found."""
@@ -198,6 +214,7 @@ class Simulate(NetworkOptions, RadarOptions):
         from tensorsim import sources
         from tensorsim.data.video import KEPT_MB, VideoReader
         from tensorsim.pipeline import VideoToPose
+        from tensorsim.registry import name_of
 
         cut = sources.Cut(self.start, self.end, self.stride)
         if kind == "motion":
@@ -212,11 +229,12 @@ class Simulate(NetworkOptions, RadarOptions):
         if kind == "keypoints":
             size = None if self.image_size is None else (self.image_size[1], self.image_size[0])
             stage = VideoToPose.from_config(config, nn.Identity(), nn.Identity())
-            return sources.keypoint_source(self.source, stage, self.fps, size, cut), config
+            calibrate = config.pose.calibrate
+            return sources.keypoint_source(self.source, stage, self.fps, size, cut, calibrate), config
         detector, pose = default_networks(
             self.detector or config.tracking.detector, self.pose or config.pose.network
         )
-        config = config.replace(tracking__detector=str(detector), pose__network=str(pose))
+        config = config.replace(tracking__detector=name_of(detector), pose__network=name_of(pose))
         reader = VideoReader(
             self.source,
             fps=self.fps,

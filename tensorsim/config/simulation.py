@@ -165,6 +165,10 @@ class SimulationConfig:
 def _replaced(config: Any, path: list[str], value: Any) -> Any:
     """A configuration with another value at the end of a path of fields."""
     known = list(config.__dataclass_fields__) if hasattr(config, "__dataclass_fields__") else []
+    if config is None:
+        raise TensorsimError(
+            f"got {path[0]!r} of what this scene does not have, such as a wall in free space"
+        )
     if path[0] not in known:
         raise TensorsimError(
             f"got no {path[0]!r} in {config!r}, expected one of its fields{suggestion(path[0], known)}"

@@ -129,7 +129,8 @@ def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) ->
         key = next(iter(clips))
     if key not in clips:
         shown = ", ".join(list(clips)[:12])
-        raise TensorsimError(f"{path}: got key {key!r}, expected a subject and action such as {shown}")
+        got = "several motions" if key is None else f"the motion {key!r}"
+        raise TensorsimError(f"{path}: got {got}, expected a subject and action such as {shown} (--clip)")
     positions = torch.from_numpy(clips[key].numbers().astype(np.float64))
     if positions.dim() != 3 or positions.shape[1:] != (32, 3):
         raise TensorsimError(f"{path}: got {key} of shape {list(positions.shape)}, expected (T, 32, 3)")

@@ -104,7 +104,8 @@ def read_npz(
         key = candidates[0] if len(candidates) == 1 else preferred(candidates)
     if key not in candidates:
         shown = ", ".join(candidates) or "arrays (T, J, 3), but there are none"
-        raise TensorsimError(f"{path}: got key {key!r}, expected one of {shown}")
+        got = "several motions" if key is None and candidates else f"the motion {key!r}"
+        raise TensorsimError(f"{path}: got {got}, expected one of {shown} (--clip)")
     for name in (f"{key}_fps", "fps", "mocap_framerate", "mocap_frame_rate"):
         if fps is None and name in arrays.files:
             fps = float(arrays[name])

@@ -112,9 +112,20 @@ class VideoToDoppler(nn.Module):
         Raises:
             TensorsimError: weights that are not there or of another network.
 
+        Warns:
+            TensorsimWarning: ``pose.calibrate``, which takes a whole film: the graph has the camera ``pose.camera``.
+                :func:`tensorsim.streaming.people_of_film` estimates it, as ``tensorsim simulate`` does.
+
         Example:
             >>> sim = ts.VideoToDoppler.from_config(ts.SimulationConfig.through_wall())
         """
+        if config.pose.calibrate:
+            warnings.warn(
+                "pose.calibrate: a graph does not estimate the camera and has that of pose.camera; "
+                "tensorsim.streaming.people_of_film(..., calibrate=True) does",
+                TensorsimWarning,
+                stacklevel=2,
+            )
         return cls(
             video_to_pose=VideoToPose.from_config(config, detector, pose),
             pose_to_doppler=PoseToDoppler.from_config(config),

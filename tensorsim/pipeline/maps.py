@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import SimulationConfig
 from tensorsim.enhance.choice import map_denoiser
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_tensor
 from tensorsim.motion.absence import continued
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.body_scatterers import BodyScatterers
@@ -152,6 +152,7 @@ class PoseToDoppler(nn.Module):
         Raises:
             TensorsimError: see :meth:`forward`.
         """
+        check_tensor(joints, "joints", "(B, P, T, 14, 3) metres", finite=False)
         return self.resampler.coefficients(continued(joints, valid), fps)
 
     def scene(

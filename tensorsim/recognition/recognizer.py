@@ -171,6 +171,8 @@ class ActivityRecognizer(nn.Module):
         from tensorsim.registry import locate
 
         path = locate(source, "SPGNet", "SPNet")
+        if not path.is_file():
+            raise TensorsimError(f"{path}: no such file, expected the weights of a classifier")
         stated = read_metadata(path)
         if stated.get("network") not in NETWORKS or "size" not in stated:
             raise TensorsimError(

@@ -7,7 +7,7 @@ import pytest
 
 from tensorsim.commands.options import load_recognizer
 from tensorsim.config import SceneConfig, SimulationConfig
-from tensorsim.errors import TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.presets import PRESETS
 
 
@@ -29,6 +29,13 @@ def test_others_get_none_and_a_reason(change, message):
     radar = replace(PRESETS["through-wall"].radar, **change)
     with pytest.warns(TensorsimWarning, match=message):
         assert load_recognizer(SimulationConfig(scene=SceneConfig(radar))) is None
+
+
+def test_a_file_that_is_not_there():
+    with pytest.raises(
+        TensorsimError, match=r"nofile\.safetensors: no such file, expected the weights of a class"
+    ):
+        load_recognizer(SimulationConfig(classifier="nofile.safetensors"))
 
 
 def test_none_is_wanted():

@@ -91,7 +91,7 @@ def test_place_heading_and_part(walk: np.ndarray, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_keypoints_give_what_a_video_gives(
-    motion: ts.motion.GeneratedMotion, walk: np.ndarray, tmp_path: Path
+    motion: ts.motion.GeneratedMotion, walk: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joints, valid = torch.from_numpy(walk)[None], torch.ones(1, 45, dtype=torch.bool)
     # The command takes a camera that looks level along +y.
@@ -116,6 +116,16 @@ def test_keypoints_give_what_a_video_gives(
     assert found - truth == pytest.approx(0 * truth, abs=0.4)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["source"] == {"kind": "keypoints", "image_size": [720, 720]}
+    assert summary["camera"] is None
+    # Where nothing tells the camera, it is estimated as for a film.
+    cli.main([*arguments, "--person-height", height, *QUICK])
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["config"]["pose"]["calibrate"] is True
+    assert summary["camera"]["frames"] > 10
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        cli.main([*arguments[:-2], "90", "60", *QUICK])
+    assert "--image-size: got 90 x 60 pixels, expected" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -133,8 +143,9 @@ def test_keypoints_give_what_a_video_gives(
         ("walk.json", ["--image-size", "0", "9"], "--image-size: got 0, expected image side"),
         ("walk.npz", ["--heading", "nan"], "--heading: got nan"),
         ("walk.npz", ["--initial-distance", "1", "2"], "--initial-distance: got .* the first person"),
-        ("walk.npz", ["--clip", "nothing"], "got key 'nothing', expected one of joints"),
+        ("walk.npz", ["--clip", "nothing"], r"got the motion 'nothing', expected one of joints \(--clip\)"),
         ("walk.npz", ["--stride", "40"], "got 1 of its 30 frames"),
+        ("walk.npz", ["--stft-window", "60"], r"got 1 s, expected at least 60 s for one Doppler window"),
         ("nothing.bvh", [], "nothing.bvh: no such file"),
         ("nothing.json", ["--fps", "30"], "nothing.json: no such file"),
         ("walk.json", [], "walk.json: got keypoints without a frame rate, expected --fps"),

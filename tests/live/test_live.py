@@ -415,7 +415,7 @@ def test_command(
     arguments += ["--scene", "through-wall", "--every-frame", "--record", str(tmp_path / "live.webm")]
     cli.main([*arguments, "--seconds", "5.2"])
     said = capsys.readouterr()
-    assert "5.3 s, 1 people, 0 frames dropped" in said.out
+    assert "5.3 s, 1 person, 0 frames dropped" in said.out
     assert "dropped 0" in said.out.splitlines()[0], "a label after four seconds"
     assert "showing http://127.0.0.1:" in said.err
     film = VideoReader(tmp_path / "live.webm")
@@ -425,7 +425,7 @@ def test_command(
     monkeypatch.setattr(Camera, "frames", _every_third)
     cli.main([*arguments, "--record", str(tmp_path / "third.webm")])
     said = capsys.readouterr()
-    assert "0 people" not in said.out
+    assert "1 person, 40 frames dropped" in said.out
     assert said.out.splitlines()[0].startswith("     4.")
     assert sum(chunk.shape[0] for chunk in VideoReader(tmp_path / "third.webm").chunks(16)) == FRAMES
     with pytest.raises(SystemExit):
