@@ -12,6 +12,7 @@ from torch import nn
 
 import tensorsim as ts
 from tensorsim.body.skeleton import mid_hips
+from tensorsim.data.coco import load_coco_keypoints
 from tensorsim.data.video import VideoReader
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
@@ -220,6 +221,20 @@ def test_every_second_frame_is_a_file_of_half_the_rate(
     kept = keypoint_source(whole, lifter(camera, 1.75), 2 * FPS, CANVAS, Cut(None, None, 2)).find(True).pose
     alone = keypoint_source(half, lifter(camera, 1.75), FPS, CANVAS).find(True).pose
     assert torch.equal(kept.joints, alone.joints)
+
+
+@pytest.mark.parametrize("step", [1, 5])
+def test_frames_without_anybody_are_not_left_out_of_results(step: int, tmp_path: Path) -> None:
+    person = {"keypoints": [1.0, 2.0, 0.9] * 17, "score": 1.0, "category_id": 1}
+    numbers = [*range(4), *range(7, 10)]
+    results = [{"image_id": 3 + step * number, **person} for number in numbers]
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    found = load_coco_keypoints(tmp_path / "results.json")
+    assert torch.nonzero(found.valid[:, 0]).flatten().tolist() == numbers
+    # Pictures of a data set are not frames of a film.
+    pictures = [{"image_id": number, **person} for number in (139, 397133, 37777)]
+    (tmp_path / "pictures.json").write_text(json.dumps(pictures))
+    assert load_coco_keypoints(tmp_path / "pictures.json").valid.shape == (3, 1)
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ class Control:
                     raise ValueError
                 return int(float(given))
             return float(given) if self.kind == "number" else str(given).strip()
-        except ValueError:
+        except (ValueError, OverflowError):
             expected = "a whole number" if self.kind == "integer" else "numbers"
             raise TensorsimError(f"{self.label}: got {given!r}, expected {expected}") from None
 

@@ -54,7 +54,7 @@ def application(largest_mb: float, longest_s: float) -> Iterator[Any]:
             build(runs, longest_s),
             path="/",
             server_name="127.0.0.1",
-            max_file_size=f"{largest_mb:g}mb",
+            max_file_size=round(largest_mb * 2**20),
             theme=theme,
             css=CSS,
             ssr_mode=False,

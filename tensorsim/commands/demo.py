@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer, number_of_people
+from tensorsim.commands.options import (
+    RadarOptions,
+    Run,
+    at_display_rate,
+    check_drawable,
+    load_recognizer,
+    number_of_people,
+)
 from tensorsim.exceptions import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
@@ -72,6 +79,7 @@ class Demo(NetworkOptions, RadarOptions):
             recognizer = load_recognizer(config)
             networks = load_networks(detector, pose_network, config.pose.flip_test, self.engine)
             maps_stage = PoseToDoppler.from_config(config).to(device)
+            check_drawable(maps_stage)
             # The true motion is known at many moments: it needs no smoothing.
             true_stage = PoseToDoppler.from_config(config.replace(smoothing=SmoothingConfig())).to(device)
             frames = round(self.duration * FILM_FPS)

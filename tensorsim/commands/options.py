@@ -290,6 +290,12 @@ class Run(NamedTuple):
     device: "torch.device"
 
 
+def check_drawable(stage: "PoseToDoppler") -> None:
+    """Refuse range-time maps of one row, before anybody is looked for."""
+    if stage.simulator.range_profile.range_m.shape[0] < 2:
+        raise TensorsimError("range_gate_m: got a gate that holds one range bin, expected two or more")
+
+
 def number_of_people(count: int) -> str:
     """``1 person``, ``2 people``."""
     return f"{count} {'person' if count == 1 else 'people'}"

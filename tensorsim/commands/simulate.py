@@ -10,7 +10,14 @@ import tyro
 
 from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, Run, at_display_rate, load_recognizer, number_of_people
+from tensorsim.commands.options import (
+    RadarOptions,
+    Run,
+    at_display_rate,
+    check_drawable,
+    load_recognizer,
+    number_of_people,
+)
 from tensorsim.exceptions import TensorsimError, collected_warnings
 from tensorsim.limits import check_range
 
@@ -124,6 +131,7 @@ class Simulate(NetworkOptions, RadarOptions):
             source, config = self._source(kind, config, device)
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
+            check_drawable(stage)
             self._check_length(source, stage)
             with complete_or_nothing(self.out) as folder:
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)

@@ -1,6 +1,8 @@
 """COCO keypoints of a video, as JSON."""
 
+import itertools
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,9 +34,10 @@ class Keypoints2D(NamedTuple):
 def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     """Read COCO keypoints of a video: annotations or results in one JSON file, or a folder with one file per frame.
 
-    Frames are in ascending order of their image ids, or of the names of the files in a folder. People are told apart by
-    ``track_id`` where there is one, else by their order in each frame. ``keypoints`` are 51 numbers: x, y, and
-    visibility or score of each.
+    Frames are in ascending order of their image ids, or of the names of the files in a folder. Results do not list
+    images in which nobody was found: numbers that are left out between others, in even steps, are such frames. People
+    are told apart by ``track_id`` where there is one, else by their order in each frame. ``keypoints`` are 51 numbers:
+    x, y, and visibility or score of each.
 
     Raises:
         TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, a
@@ -68,10 +71,11 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
         contents: see :func:`json_files`.
     """
     people: dict[Any, list[dict[str, Any]]] = {}
-    size = None
+    size, listed = None, path.is_dir()
     for number, (file, content) in enumerate(contents):
         with reading(file, "JSON of COCO keypoints"):
             whole = isinstance(content, dict)
+            listed = listed or (whole and "images" in content)
             for image in content.get("images", []) if whole else []:
                 people.setdefault(number if path.is_dir() else image["id"], [])
                 if "height" in image and "width" in image:
@@ -96,7 +100,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
         )
 
     with reading(path, "JSON of COCO keypoints"):
-        frames = [people[frame] for frame in sorted(people)]
+        frames = [people[frame] for frame in (sorted(people) if listed else _numbered(people))]
         tracks = sorted({person["track_id"] for person in everybody if tracked})
         count = len(tracks) or max(len(frame) for frame in frames)
         check_range(max(len(frame) for frame in frames), "people in a frame", str(path))
@@ -114,3 +118,18 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
     if bool((scores == scores.round()).all()) and float(scores.max()) <= 2:
         scores = (scores > 0).float()
     return Keypoints2D(data[..., :2], scores, valid, size)
+
+
+def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:
+    """The image ids of results in order; frames without anybody are added to ``people`` where ids number the frames."""
+    ids = sorted(people)
+    if len(ids) < 3 or not all(isinstance(id_, int) for id_ in ids):
+        return ids
+    step = math.gcd(*(after - before for before, after in itertools.pairwise(ids)))
+    every = range(ids[0], ids[-1] + step, step)
+    # Numbers of a data set's pictures are far apart and count nothing.
+    if len(every) > 4 * len(ids):
+        return ids
+    for id_ in every:
+        people.setdefault(id_, [])
+    return list(every)

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.labelled_films import read_labels
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
 from tensorsim.evaluation.measured.training import fit_pictures, predict, square
 from tensorsim.experiments import figures
@@ -150,6 +151,10 @@ def _on_measured(config: RealConfig, sets: list[MeasuredSet], work: Work) -> Rep
 def _on_films(config: RealConfig, work: Work) -> Report:
     """Real films labelled by networks trained on maps of everyday motion, all of the same maps."""
     films = film_pictures(Path(config.films), config.size, work, config.film_count)
+    labelled = [
+        (film.path.name, film.path.stat().st_size, film.start_s, film.end_s, film.accept)
+        for film in read_labels(Path(config.films))[: config.film_count or None]
+    ]
     filmed, true = config.group_clips
     maps = Path(config.maps) if config.maps else work.cache / f"everyday-maps-{filmed}-{true}"
     made = EverydaySettings(filmed=filmed, true=true)
@@ -158,7 +163,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     results: dict[str, list[dict[str, float]]] = {name: [] for name in config.networks}
     for name, seed in tqdm(jobs, desc="films", unit="training", disable=work.quiet):
         settings = {
-            "films": str(Path(config.films).resolve()), "film_count": config.film_count,
+            "films": labelled,
             "maps": str(maps.resolve()), "groups": config.groups, "size": config.size, "steps": config.film_steps,
             "network": name, "seed": seed, "weights": shipped_weights(*WATCHERS),
         }  # fmt: skip

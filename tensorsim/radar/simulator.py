@@ -334,22 +334,25 @@ class RadarSimulator(nn.Module):
         """Pieces of a source, checked: number of the first pulse, positions (1, m, S, 3), RCS (1, m, S), way ahead.
 
         All but the last are a multiple of ``pulse_chunk`` long. The way until the next pulse (1, m, S, 3) is for
-        transmitters in turn, else None; for it the source is asked for one pulse more.
+        transmitters in turn, else None; for it the source is asked for one pulse more, or for the one before.
         """
         span = max(self.piece_chunks * self.recorder.pulse_chunk, self.mti.lost_pulses + 1)
         for start in range(0, pulses, span):
             own = min(span, pulses - start)
-            stop = min(start + own + (self.echo.paths.transmitters > 1), pulses)
-            positions, rcs = source(start, stop)
-            if positions.dim() != 3 or positions.shape[0] != stop - start:
+            in_turn = self.echo.paths.transmitters > 1
+            stop = min(start + own + in_turn, pulses)
+            # The last pulse goes on as the one before.
+            first = start - 1 if in_turn and stop == start + 1 and start > 0 else start
+            positions, rcs = source(first, stop)
+            if positions.dim() != 3 or positions.shape[0] != stop - first:
                 raise TensorsimError(
-                    f"source({start}, {stop}): got positions of shape {list(positions.shape)}, expected "
-                    f"({stop - start}, scatterers, 3)"
+                    f"source({first}, {stop}): got positions of shape {list(positions.shape)}, expected "
+                    f"({stop - first}, scatterers, 3)"
                 )
             rcs = check_scene(positions, rcs)
             ahead = self.echo.displacements(positions)
-            ahead = None if ahead is None else ahead[None, :own]
-            yield start, positions[None, :own], rcs[None, :own], ahead
+            here = slice(start - first, start - first + own)
+            yield start, positions[None, here], rcs[None, here], None if ahead is None else ahead[None, here]
 
     def _check_pulses(self, pulses: int) -> None:
         if pulses < self.min_pulses:

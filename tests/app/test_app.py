@@ -73,6 +73,8 @@ def test_values_of_controls_become_options() -> None:
         options_of({"person_height": "tall"})
     with pytest.raises(TensorsimError, match=r"Number of ridges: got 2.5, expected a whole number"):
         options_of({"ridges": 2.5})
+    with pytest.raises(TensorsimError, match=r"Number of ridges: got '1e400', expected a whole number"):
+        options_of({"ridges": "1e400"})
     with pytest.raises(TensorsimError, match="initial distance: got it for a generated person"):
         for_demo({"initial_distance": (4.0,)})
 

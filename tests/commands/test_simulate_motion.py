@@ -145,6 +145,7 @@ def test_keypoints_give_what_a_video_gives(
         ("walk.npz", ["--initial-distance", "1", "2"], "--initial-distance: got .* the first person"),
         ("walk.npz", ["--clip", "nothing"], r"got the motion 'nothing', expected one of joints \(--clip\)"),
         ("walk.npz", ["--stride", "40"], "got 1 of its 30 frames"),
+        ("walk.npz", ["--config", "one_bin.yaml"], "range_gate_m: got a gate that holds one range bin"),
         ("walk.npz", ["--stft-window", "60"], r"got 1 s, expected at least 60 s for one Doppler window"),
         ("nothing.bvh", [], "nothing.bvh: no such file"),
         ("nothing.json", ["--fps", "30"], "nothing.json: no such file"),
@@ -157,6 +158,8 @@ def test_bad_options_are_refused_before_work_starts(
 ) -> None:
     np.savez(tmp_path / "walk.npz", joints=np.ones((30, 14, 3)), fps=FPS)
     (tmp_path / "walk.json").write_text("no JSON")
+    (tmp_path / "one_bin.yaml").write_text("processing: {range_gate_m: [2.99, 3.0]}")
+    options = [str(tmp_path / option) if option.endswith(".yaml") else option for option in options]
     with pytest.raises(SystemExit) as exit_:
         cli.main(["simulate", str(tmp_path / name), "--out", str(tmp_path / "out"), *options, *QUICK])
     assert exit_.value.code == 2

@@ -193,7 +193,7 @@ def test_damaged_folders_are_refused(tmp_path):
     with pytest.raises(TensorsimError, match=r"maps\.npz: no such file"):
         SETS[2].load(tmp_path)
     np.savez(tmp_path / "radhar_points" / "maps.npz", other=np.zeros(3))
-    with pytest.raises(TensorsimError, match="not the measured clips of radhar_points"):
+    with pytest.raises(TensorsimError, match="cannot be read as the measured clips of radhar_points"):
         SETS[2].load(tmp_path)
 
 

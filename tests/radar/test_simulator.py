@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -410,3 +411,16 @@ def test_warnings_of_several_clips_have_one_text():
             one_foot[:, 2] = mover(-speed, 128)[:, 2]
             check_unambiguous(one_foot, rcs, THROUGH)
     assert len({str(w.message) for w in caught}) == 1 < len(caught)
+
+
+def test_a_last_pulse_alone_in_its_piece_goes_on_as_the_one_before():
+    """Transmitters in turn see people who move on between pulses."""
+    radar = replace(
+        RadarConfig.through_wall(), tx_m=((-0.1, 0, 1.5), (0.0, 0, 1.5)), rx_m=((0.1, 0, 1.5), (0.15, 0, 1.5))
+    )
+    simulator = RadarSimulator(radar, snr_db=None, pulse_chunk=8)
+    time_s = torch.arange(65).double() / radar.prf_hz
+    p = torch.stack([0 * time_s, 4 - time_s, 1 + 0 * time_s], -1)[:, None]
+    rcs = torch.ones(1, dtype=torch.float64)
+    streamed = simulator.stream(lambda start, stop: (p[start:stop], rcs.expand(stop - start, 1)), 65)
+    assert_same(streamed.range_time, simulator(p, rcs).range_time, atol=1e-5)

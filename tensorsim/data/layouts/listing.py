@@ -4,6 +4,7 @@ Names of clips are relative to the folder, so that a data set does not depend on
 """
 
 import csv
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -123,9 +124,12 @@ def _seconds(value: Any, where: str) -> float | None:
     if value is None or str(value).strip() == "":
         return None
     try:
-        return float(value)
+        seconds = float(value)
     except ValueError:
-        raise TensorsimError(f"{where}: got {value!r}, expected a number of seconds") from None
+        seconds = math.nan
+    if not 0 <= seconds < math.inf:
+        raise TensorsimError(f"{where}: got {value!r}, expected a number of seconds from 0 on")
+    return seconds
 
 
 def table(source: SourceConfig) -> list[Clip]:

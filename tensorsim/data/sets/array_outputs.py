@@ -43,6 +43,10 @@ def array_outputs(config: SimulationConfig, wanted: OutputConfig, scene: Scene) 
     profile = RangeProfile(radar, processing.range_window, _fixed(processing.range_gate_m))
     frames = DopplerFrames(radar, processing.window_s, processing.overlap)
     cubes = list(_cubes(config, wanted, scene, profile, frames))
+    if not cubes:
+        raise TensorsimError(
+            f"duration_s: got a sample shorter than the window of {processing.window_s:g} s, expected a longer one"
+        )
     found = {}
     if "range_doppler_angle" in wanted.kinds:
         beams = torch.stack([_beams(cube, radar, wanted) for cube in cubes])

@@ -131,6 +131,7 @@ def build_dataset(
         engine = Serial() if engine is None else engine
         people = out / ".people" if cache is None else cache
         document, kept = json.dumps(recipe.to_document(), sort_keys=True), str(people.resolve())
+        plan_of.cache_clear()  # files may have changed since the last build
         plan = plan_of(document, kept)
 
         def job(number: int) -> Job:

@@ -43,6 +43,8 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
     samples = sum(counts.values())
     if samples == 0:
         reason = failures[0]["reason"] if failures else "there are none"
+        for path in finished:
+            path.unlink()  # to be tried again
         raise TensorsimError(f"{out}: got no sample at all ({reason}), expected some")
     _write_manifest(out, plan.recipe, finished)
     draw_sheet(out, plan.recipe)

@@ -47,7 +47,7 @@ def finite_everywhere(motion: Motion, name: str) -> Motion:
 
 
 class PeopleFinder:
-    """Reads or finds the people of files.
+    """Reads or finds the people of files; the camera of films and key points is estimated from their people.
 
     Args:
         source: its ``fps`` and ``image_size`` serve where files do not tell them.
@@ -87,7 +87,7 @@ class PeopleFinder:
         from tensorsim.sources import keypoint_source
 
         stage = VideoToPose.from_config(SimulationConfig(), nn.Identity(), nn.Identity())
-        found = keypoint_source(file, stage, self.source.fps, self.source.image_size)
+        found = keypoint_source(file, stage, self.source.fps, self.source.image_size, calibrate=True)
         pose = found.find(True).pose
         return Motion(pose.joints[0], pose.valid[0], found.fps)
 
@@ -128,9 +128,15 @@ class PeopleFinder:
         from tensorsim.data.video import VideoReader
         from tensorsim.streaming import people_of_film
 
+        try:
+            reader = VideoReader(file)
+        except TensorsimError:
+            if self.source.fps is None:
+                raise
+            reader = VideoReader(file, fps=self.source.fps)  # the file's own rate makes no sense
         with one_thread():  # for the same bits everywhere
-            pose = people_of_film(self.networks, VideoReader(file), torch.device("cpu"), quiet=True).pose
-        return Motion(pose.joints[0], pose.valid[0], VideoReader(file).fps)
+            pose = people_of_film(self.networks, reader, torch.device("cpu"), True, calibrate=True).pose
+        return Motion(pose.joints[0], pose.valid[0], reader.fps)
 
     @cached_property
     def networks(self) -> VideoToPose:
@@ -147,6 +153,7 @@ class PeopleFinder:
 
     def _digest(self, file: Path) -> str:
         content = hashlib.sha256(self.of_networks)
+        content.update(f"fps {self.source.fps}, camera estimated".encode())
         with file.open("rb") as source:
             for block in iter(lambda: source.read(1 << 20), b""):
                 content.update(block)

@@ -236,11 +236,16 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
     def __iter__(self) -> Iterator[dict[str, Any]]:
         number, count = share_of_worker()
         numbers = [n for n in range(len(self.plan)) if self.split in (None, self.plan.clip_of_sample(n)[0])]
+        own = numbers[number::count]
         done = 0
-        while numbers and (self.rounds is None or done < self.rounds):
-            own = numbers[number::count]
+        while own and (self.rounds is None or done < self.rounds):
+            made = 0
             for first in range(0, len(own), self.batch):
-                yield from self._samples(own[first : first + self.batch], done)
+                for sample in self._samples(own[first : first + self.batch], done):
+                    made += 1
+                    yield sample
+            if made == 0:
+                raise TensorsimError(f"SimulatedMaps: none of {len(own)} samples of a round could be made")
             done += 1
 
     def _samples(self, numbers: Sequence[int], done: int) -> Iterator[dict[str, Any]]:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -179,6 +180,11 @@ _PROCESSING = ProcessingConfig(
 )
 
 
+def matlab_name(array: str) -> str:
+    """The variable of an array ``RADAR.OUTPUT`` in a ``.mat`` file: MATLAB's names have letters, digits and ``_``."""
+    return re.sub(r"\W", "_", array)[:31]
+
+
 @dataclass(frozen=True)
 class DatasetRecipe:
     """Everything that the samples of a data set depend on, beside the films and files that it names.
@@ -248,6 +254,13 @@ class DatasetRecipe:
             raise TensorsimError(
                 f"DatasetRecipe.outputs: got {', '.join(self.outputs.kinds)} for the format png, expected picture"
             )
+        if self.storage.format == "mat":
+            arrays = [f"{name}.{kind}" for name in names for kind in self.outputs.kinds]
+            if len({matlab_name(array) for array in arrays}) < len(arrays):
+                raise TensorsimError(
+                    f"DatasetRecipe.radars: got the names {names}, expected ones that differ in the first 31 "
+                    "characters of RADAR_OUTPUT: names in .mat files are not longer"
+                )
         if round(self.duration_s * self.motion_hz) < 2:
             raise TensorsimError(
                 f"DatasetRecipe.duration_s: got {self.duration_s}, expected at least two moments of motion"

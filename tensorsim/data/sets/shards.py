@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tensorsim.data.sets.recipe import StorageConfig
+from tensorsim.data.sets.recipe import StorageConfig, matlab_name
 from tensorsim.data.sets.samples import Sample
 from tensorsim.files import complete_file
 
@@ -108,7 +108,7 @@ def _mat(samples: Sequence[Sample]) -> bytes:
     for name in names:
         arrays = [_for_matlab(sample.arrays[name]) for sample in samples]
         alike = len({array.shape for array in arrays}) == 1
-        variables[re.sub(r"\W", "_", name)[:31]] = np.stack(arrays) if alike else _cells(arrays)
+        variables[matlab_name(name)] = np.stack(arrays) if alike else _cells(arrays)
     file = io.BytesIO()
     savemat(file, variables, do_compression=True, oned_as="column")
     # The header holds the time at which it was written.

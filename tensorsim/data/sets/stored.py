@@ -1,7 +1,6 @@
 """Arrays of stored samples, whatever the format of their shards."""
 
 import io
-import re
 import tarfile
 from functools import lru_cache
 from pathlib import Path
@@ -10,21 +9,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tensorsim.data.sets.recipe import DatasetRecipe
+from tensorsim.data.sets.recipe import DatasetRecipe, matlab_name
 from tensorsim.data.sets.shards import folder_name, shard_path
 from tensorsim.errors import TensorsimError
 from tensorsim.files import reading
 
 
 @lru_cache(maxsize=256)
-def _members(path: Path) -> dict[str, tuple[int, int]]:
-    """Offset and size of every file in a tar."""
+def _members(path: Path, changed_ns: int) -> dict[str, tuple[int, int]]:
+    """Offset and size of every file in a tar that was last changed at a time."""
     with reading(path, "a shard"), tarfile.open(path) as tar:
         return {member.name: (member.offset_data, member.size) for member in tar}
 
 
 @lru_cache(maxsize=4)
-def _matlab(path: Path) -> dict[str, Any]:
+def _matlab(path: Path, changed_ns: int) -> dict[str, Any]:
     from scipy.io import loadmat
 
     with reading(path, "a shard"):
@@ -63,14 +62,14 @@ class StoredArrays:
             with reading(path, "a shard"), h5py.File(path) as store:
                 array: npt.NDArray[Any] = store[row["id"]][name][()]
             return array
-        content = _matlab(path)
+        content = _matlab(path, path.stat().st_mtime_ns)
         place = [str(cell[0]) for cell in content["id"][:, 0]].index(row["id"])
-        stacked = content[re.sub(r"\W", "_", name)[:31]]
+        stacked = content[matlab_name(name)]
         return np.asarray(stacked[place, 0] if stacked.dtype == object else stacked[place])
 
     def _of_tar(self, path: Path, row: dict[str, Any], name: str) -> npt.NDArray[Any]:
         member = f"{row['id']}.{name}.npy"
-        members = _members(path)
+        members = _members(path, path.stat().st_mtime_ns)
         if member not in members:
             raise TensorsimError(f"{path}: got no {member}, expected one of {', '.join(list(members)[:5])}")
         offset, size = members[member]

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured import glasgow, radhar, sense2gol
 from tensorsim.evaluation.measured.training import Augment
+from tensorsim.files import reading
 
 #: Clips that are simulated at once.
 _CHUNK = 10
@@ -57,12 +58,8 @@ class MeasuredSet:
         path = folder / self.name / self.file
         if not path.is_file():
             raise TensorsimError(f"{path}: no such file, expected the measured clips of {self.name}")
-        try:
+        with reading(path, f"the measured clips of {self.name}"):
             maps, labels = self.read(path.parent)
-        except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
-            raise TensorsimError(
-                f"{path}: not the measured clips of {self.name} ({type(error).__name__}: {error})"
-            ) from error
         if len(labels) == 0:
             raise TensorsimError(f"{path}: got no clips, expected at least one")
         return self.pictures(maps), labels

@@ -217,6 +217,13 @@ def test_tables_of_both_kinds(tmp_path: Path) -> None:
         listing.table(SourceConfig("table", str(tmp_path / "t.csv")))
 
 
+@pytest.mark.parametrize("start", ["nan", "inf", "-0.5", "soon"])
+def test_times_of_a_table_are_seconds(start: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(f"path,label,start\na.npz,walk,{start}\n")
+    with pytest.raises(TensorsimError, match=f"got '{start}', expected a number of seconds from 0 on"):
+        listing.table(SourceConfig("table", str(tmp_path / "t.csv")))
+
+
 def test_captured_motion_in_folders_of_classes(tmp_path: Path) -> None:
     for label in ("walk", "run"):
         (tmp_path / label).mkdir()

@@ -21,12 +21,13 @@ from tensorsim.data.sets.build import build_dataset, plan_of
 from tensorsim.data.sets.engines import Processes, RayCluster
 from tensorsim.data.sets.manifest import recipe_of, rows_of
 from tensorsim.data.sets.outputs import OutputConfig
-from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, StorageConfig
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.samples import content_hash, make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.data.sets.stored import StoredArrays
 from tensorsim.data.sets.variations import VariationConfig
 from tensorsim.errors import TensorsimError
+from tensorsim.motion import ActivityGenerator
 from tests.data.sets.recipes import small_recipe
 
 
@@ -134,6 +135,23 @@ class Interrupted:
             if number == self.jobs:
                 raise KeyboardInterrupt
             yield work(job)
+
+
+def test_files_that_were_changed_are_read_again(tmp_path: Path) -> None:
+    """A table that was corrected counts in the next build of the same process, and failures are tried again."""
+    motion = ActivityGenerator().generate("walking", seed=0, duration_s=1.0, rate_hz=30.0).joints[0].numpy()
+    table = tmp_path / "table.csv"
+    table.write_text("path,label\na.npz,run\n")
+    recipe = small_recipe(
+        sources=(SourceConfig("table", str(table)),), split=SplitConfig(shares=(1.0, 0.0, 0.0))
+    )
+    with pytest.raises(TensorsimError, match="got no sample at all"):
+        build_dataset(recipe, tmp_path / "set", quiet=True)
+    np.savez(tmp_path / "a.npz", joints_m=motion, fps=30.0)
+    assert build_dataset(recipe, tmp_path / "set", quiet=True).samples == 1
+    table.write_text("path,label\na.npz,walk\n")
+    build_dataset(recipe, tmp_path / "other", quiet=True)
+    assert [row["label"] for row in rows_of(tmp_path / "other")] == ["walk"]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_files(

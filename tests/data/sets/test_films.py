@@ -19,6 +19,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.motion import ActivityGenerator, PeopleConfig
 from tensorsim.pipeline import VideoToPose
 from tensorsim.render.renderer import PersonRenderer
+from tensorsim.streaming import people_of_film
 from tests.data.sets.recipes import small_recipe
 from tests.film import RectangleDetector, StandingPose, film, walker
 
@@ -119,8 +120,11 @@ def test_strict_stops_at_the_first(films: Path, tmp_path: Path) -> None:
 def test_joints_are_those_of_the_pipeline(films: Path) -> None:
     path = films / "leave" / "good.avi"
     motion = PeopleFinder(SourceConfig("films", str(films)), None).motion(str(path), "")
-    video = torch.cat(list(VideoReader(path).chunks(64)))[None]
-    pose = PeopleFinder.networks(video, FPS)  # type: ignore[operator]
+    reader = VideoReader(path)
+    pose = people_of_film(
+        PeopleFinder.networks,  # type: ignore[arg-type]
+        reader, torch.device("cpu"), quiet=True, calibrate=True,
+    ).pose  # fmt: skip
     there = pose.valid[0]
     assert motion.fps == FPS
     assert torch.allclose(motion.joints[there], pose.joints[0][there], atol=1e-5)

@@ -117,6 +117,18 @@ def test_simulated_maps_are_those_of_the_data_set_and_then_others(folder: Path) 
         assert not other["map"].equal(stored["map"])
 
 
+def test_a_worker_without_samples_ends_and_a_round_without_any_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulated = ts.data.SimulatedMaps(ts.data.MapDataset(folder, "train").recipe, "train")
+    monkeypatch.setattr("tensorsim.data.sets.reading.share_of_worker", lambda: (7, 8))
+    assert list(simulated) == []
+    monkeypatch.setattr("tensorsim.data.sets.reading.share_of_worker", lambda: (0, 1))
+    monkeypatch.setattr(simulated, "_samples", lambda numbers, done: iter(()))
+    with pytest.raises(TensorsimError, match="none of 2 samples of a round could be made"):
+        list(simulated)
+
+
 def test_bands_are_masked_in_training_only() -> None:
     maps = torch.ones(6, 1, 40, 60)
     augment = ts.data.SpecAugment(0.5, 0.5)

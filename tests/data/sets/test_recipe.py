@@ -57,6 +57,10 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ("sources: [{people: 1, classes: [flying]}]", "activity: got 'flying'"),
         ("radars: [{preset: nothing}]", "got 'nothing', which is no file"),
         ("radars: [{}, {}]", "got the names"),
+        (
+            f"{{radars: [{{name: {31 * 'a'}_1}}, {{name: {31 * 'a'}_2}}], storage: {{format: mat}}}}",
+            "expected ones that differ in the first 31 characters",
+        ),
         ("radars: [{name: a/b}]", "expected letters, digits"),
         ("radars: [{preset: ti-awr1843-array}]", "need one antenna pair"),
         ("outputs: {kinds: [point_cloud]}", "is no array"),
