@@ -24,6 +24,7 @@ from tensorsim.motion import everyday, exercises, martial_arts, scripts
 from tensorsim.motion.act import Act
 from tensorsim.motion.footwork import step_about
 from tensorsim.motion.people import People, PeopleConfig, draw_people
+from tensorsim.motion.timing import bell, segment
 
 #: Bodies and manners: untrained people, in every heading.
 PEOPLE = PeopleConfig(
@@ -31,8 +32,8 @@ PEOPLE = PeopleConfig(
 )
 #: Where the middle of a path is: x to either side, and nearest and farthest y, in metres.
 SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
-#: Share of those who walk in curves.
-_STROLLING = 0.35
+#: Shares of those who walk in curves and of those who walk round corners.
+_STROLLING, _CORNERING = 0.3, 0.25
 #: Steps per second of those who step about while they do something.
 _STEPS_HZ = 1.0
 
@@ -118,6 +119,26 @@ def _stroll(time: Tensor, people: People, draw: Draw) -> Tensor:
     return along(scripts.walk, heading, pace, people)
 
 
+def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
+    """Joints (N, K, 14, 3) of people who walk straight and turn at corners, as round a table or from room to room."""
+    corners = 5
+    start = torch.cumsum(draw(0.8, 3.0, corners), dim=1) - draw(0.0, 2.5)
+    lasts = draw(0.4, 1.0, corners)
+    # Most go round one way.
+    side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0) * torch.where(
+        draw(0.0, 1.0, corners) < 0.8, 1.0, -1.0
+    )
+    angle = side * draw(0.6, 2.2, corners)
+    slower = draw(0.0, 0.45, corners)
+    heading, pace = torch.zeros_like(time), torch.ones_like(time)
+    for c in range(corners):
+        first = start[:, c, None]
+        last = first + lasts[:, c, None]
+        heading = heading + segment(time, first, last) * angle[:, c, None]
+        pace = pace - bell(time, first, last) * slower[:, c, None]
+    return along(scripts.walk, heading, pace, people)
+
+
 def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:
     """Clocks (N, K) of which half run unevenly: the person now and then slows down or holds still."""
     band = draw(0.2, 0.5)
@@ -134,8 +155,9 @@ def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, d
         long = torch.where(draw(0.0, 1.0) < 0.5, 20.0, draw(1.5, 4.5))
         first = torch.where(long > 10, 0.0 * long, draw(0.0, 1.0) * long)
         straight = to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
-        strolls = draw(0.0, 1.0)[..., None, None] < _STROLLING
-        return torch.where(strolls, _stroll(time, people, draw), straight)
+        way = draw(0.0, 1.0)[..., None, None]
+        bent = torch.where(way < _STROLLING, _stroll(time, people, draw), _round_corners(time, people, draw))
+        return torch.where(way < _STROLLING + _CORNERING, bent, straight)
     rate = draw(*variant.rate)
     began = _began(variant, duration_s, rate, draw)
     clock = (time - began) * rate + variant.first_s
