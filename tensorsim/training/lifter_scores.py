@@ -32,7 +32,7 @@ _PEAK, _SLOWEST_M_S = 0.98, 0.5
 
 
 class LiftErrors(NamedTuple):
-    """Errors of lifted people; lower is better but for ``peak``.
+    """Errors of lifted people; lower is better but for ``peak``, ``within`` and ``radial``, which are 1 at best.
 
     Attributes:
         depth_cm: mean absolute error along the horizontal line of sight of the joints about the hips.
@@ -41,6 +41,8 @@ class LiftErrors(NamedTuple):
         peak: median ratio of estimated and true peak speeds of wrists and ankles.
         within: share of these in which the ratio is within 20 %.
         speed_m_s: mean error of the velocity of all joints.
+        radial: how much of the velocity of wrists and ankles along the line of sight is found: the slope of estimated
+            over true velocities.
     """
 
     depth_cm: float
@@ -49,6 +51,7 @@ class LiftErrors(NamedTuple):
     peak: float
     within: float
     speed_m_s: float
+    radial: float
 
 
 class Seen(NamedTuple):
@@ -158,7 +161,7 @@ def _peaks(joints: Tensor, valid: Tensor) -> Tensor:
 
 def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
     """Mean errors over people; frames in which nobody is followed do not count."""
-    sums = torch.zeros(5, dtype=torch.float64)
+    sums, radial = torch.zeros(5, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     ratios = []
     for seen in people:
         found, valid = lifted(make, seen)
@@ -171,6 +174,13 @@ def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
         off = ((mid_hips(found) - place).norm(dim=-1) / away - 1).abs()
         moved = torch.diff(found - true, dim=1).norm(dim=-1).mean(dim=-1) * FPS
         moved = torch.cat([moved[:, :1], moved], dim=1)
+        approach, truly = (
+            (torch.diff(joints[..., ENDS, :], dim=1) * sight[:, 1:, None]).sum(dim=-1)[
+                valid[:, 1:] & valid[:, :-1]
+            ]
+            for joints in (found, true)
+        )
+        radial += torch.stack([(approach * truly).sum(), truly.square().sum()])
         columns = torch.stack([torch.ones_like(depth), depth, error.norm(dim=-1).mean(dim=-1), off, moved])
         sums += columns[:, valid].sum(dim=-1)
         for one, other, there in zip(found, true, valid, strict=True):
@@ -186,4 +196,5 @@ def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
         float(ratio.median()),
         float(((ratio - 1).abs() <= 0.2).double().mean()),
         mean[3],
+        float(radial[0] / radial[1].clamp(min=1e-12)),
     )

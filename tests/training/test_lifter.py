@@ -177,6 +177,16 @@ def test_scores_of_the_truth_are_perfect(pool: MotionPool, monkeypatch: pytest.M
     assert errors.range_percent == pytest.approx(0.0, abs=1e-6)
     assert errors.peak == pytest.approx(1.0)
     assert errors.within == 1.0
+    assert errors.radial == pytest.approx(1.0)
+    # Wrists and ankles that move half as fast towards the camera, and as fast across its picture.
+    place = seen.joints.new_tensor(seen.camera.position_m)
+    way = torch.nn.functional.normalize(
+        (mid_hips(seen.joints) - place).mean(1) * place.new_tensor([1.0, 1, 0]), dim=-1
+    )
+    along = (seen.joints * way[:, None, None]).sum(-1, keepdim=True) * way[:, None, None]
+    slow = seen.joints - 0.5 * (along - along.mean(1, keepdim=True))
+    monkeypatch.setattr("tensorsim.training.lifter_scores.lifted", lambda make, people: (slow, people.valid))
+    assert judge(nearest, iter([seen])).radial == pytest.approx(0.5, abs=0.05)
 
 
 def test_the_pipeline_takes_a_temporal_lifter(pool: MotionPool) -> None:
