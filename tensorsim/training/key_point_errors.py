@@ -1,7 +1,8 @@
 """Key points as networks find them in films from any camera, and what the pipeline makes of them.
 
 Networks do not err at random: a hidden arm stays in the wrong place for as long as it is hidden, left and right are
-mixed up for a while, people who lie down are lost. Sizes of errors are shares of the body's height in the picture.
+mixed up for a while, a wrist or ankle jumps to something else for a moment, people who lie down are lost. Sizes of
+errors are shares of the body's height in the picture.
 """
 
 import math
@@ -22,6 +23,10 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
 #: Errors of each COCO key point relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
 RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2
+#: Jumps per second of each: a limb is taken for something else, or for that of the other side, for some frames. Their
+#: mean length in seconds, and how far they lead.
+JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
+JUMP_S, JUMP = 0.12, 0.2
 #: Key points that are mixed up with those of the other side: arms, legs, all.
 MIXED_UP = ((5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16), tuple(range(5, 17)))
 #: Pictures: height, width.
@@ -82,6 +87,17 @@ def _spell(frames: int, rate: float, shortest: float, longest: float, draw: Draw
     return (draw(0.0, 1.0) < rate) & (time >= start) & (time < start + length)
 
 
+def _jumps(frames: int, fps: float, often: Tensor, each: Draw) -> tuple[Tensor, Tensor]:
+    """Which of N points jump (T, N) bool, and in which frame each last began to (T, N); ``often`` is their factor."""
+    time = torch.arange(frames)[:, None]
+    chance = often * torch.tensor(JUMPS_HZ, dtype=torch.float64) / fps
+    began = chance > each(0.0, 1.0, frames).T
+    since = torch.where(began, time, -1).cummax(dim=0)[0]
+    lasts = 1 - JUMP_S * fps * each(1e-6, 1.0, frames).T.log()  # exponential
+    jumps = (since >= 0) & (time - since < lasts.gather(0, since.clamp(min=0)))
+    return jumps, since.clamp(min=0)
+
+
 def project_key_points(joints: Tensor, filming: Filming) -> tuple[Tensor, Tensor]:
     """Key points of joints (T, 14, 3) m in the pictures, (T, 17, 2) pixels, and their depths (T, 17) m."""
     focal = focal_length(filming.camera, filming.width)
@@ -103,7 +119,7 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
         )
         for band in (4.0, 0.6)
     )
-    error = level * (0.006 * quick + 0.009 * slow)
+    error = level * (0.0025 * quick + 0.009 * slow)
     # Somebody whose trunk is not upright is found badly, half of those who lie not at all: points anywhere on them.
     trunk = (joints[:, 1] - (joints[:, 8] + joints[:, 11]) / 2)[:, 2] / (0.3 * height_m)
     tilted = (1.0 - trunk).clamp(0.0, 1.0)
@@ -111,7 +127,7 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
     error = error * (1 + worse * tilted)[:, None, None]
     each = Draw(17, draw.generator)
     # A point that is lost is taken for something else nearby, and its score is low for a part of that time.
-    wild = _spell(frames, 0.12, 0.03, 0.3, each).T
+    wild = _spell(frames, 0.06, 0.03, 0.3, each).T
     away = smooth_noise(draw, frames, fps, torch.full((1, 1), 1.0, dtype=torch.float64), 34)[0]
     error = error + 0.1 * wild[..., None] * away.unflatten(-1, (17, 2))
     found = true + unit * error
@@ -128,11 +144,20 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
         spell = _spell(frames, 0.12, 0.02, 0.25, draw)[0]
         found = torch.where((spell[:, None] & mixed)[..., None], found[:, list(MIRRORED)], found)
 
+    often = torch.exp(draw.normal(1)) * (1 + 2 * tilted.mean())
+    jumps, since = _jumps(frames, fps, often, each)
+    led = JUMP * each.normal(frames, 2).transpose(0, 1).gather(0, since[..., None].expand(-1, -1, 2))
+    across = (each(0.0, 1.0, frames).T < 0.44).gather(0, since)
+    landed = torch.where(across[..., None], found[:, list(MIRRORED)], found + unit * led)
+    found = torch.where(jumps[..., None], landed, found)
+
     inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
     usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
-    scores = (usual - 3.0 * error.norm(dim=-1) + 0.06 * each.normal(frames).T).clamp(0.35, 0.98)
+    # Networks are nearly as sure of points that are wrong.
+    scores = usual - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
+    scores = (scores - jumps * each(0.15, 0.25, frames).T).clamp(0.35, 0.98)
     scores = torch.where(merged[..., 0], scores - 0.2, scores)
-    hidden = _spell(frames, 0.12, 0.1, 1.0, each).T
+    hidden = _spell(frames, 0.06, 0.1, 1.0, each).T
     scores = torch.where(hidden, 0.2, scores) * (inside & (depth > NEAR_M))
     return Seen(found, scores, _followed(found, scores, tilted, fps, draw))
 
