@@ -136,6 +136,40 @@ def test_key_points_are_near_the_true_ones(standing):
     assert 0.008 < float(torch.stack(errors).median()) / span < 0.06
 
 
+def test_limbs_jump_for_a_moment_and_their_scores_hardly_fall(standing):
+    """As in real films: 1.9 % of the steps of elbows and knees and 2.4 % of those of wrists and ankles."""
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.5))
+    filming = Filming(camera, camera, 360, 640)
+    moves, scores = [], []
+    for seed in range(40):
+        seen = find_key_points(standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
+        size = (seen.keypoints[:, 5] - seen.keypoints[:, 15]).norm(dim=-1).median()
+        moves.append(seen.keypoints.diff(dim=0).norm(dim=-1) / size)
+        scores.append(seen.scores[1:])
+    far, sure = torch.stack(moves) > 0.2, torch.stack(scores) > 0.3
+    trunk, limbs, ends = (
+        far[..., ids].double().mean() for ids in ((5, 6, 11, 12), (7, 8, 13, 14), (9, 10, 15, 16))
+    )
+    assert float(trunk) < 0.006
+    assert 0.01 < float(limbs) < 0.03
+    assert 0.015 < float(ends) < 0.04
+    assert float(sure[far].double().mean()) > 0.7
+
+
+def test_those_who_walk_round_corners_walk_straight_between_them():
+    generator = torch.Generator().manual_seed(0)
+    people = draw_people(40, everyday.PEOPLE, generator)
+    time = torch.arange(5 * 120, dtype=torch.float64).expand(40, -1) / KNOT_HZ
+    joints = everyday._round_corners(time, people, Draw(40, generator))
+    hips = joints[:, :, (8, 11), :2].mean(2)
+    way = hips[:, 60::60] - hips[:, :-60:60]
+    heading = torch.atan2(way[..., 1], way[..., 0])
+    turned = (torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi).abs()
+    assert 0.2 < float((turned < 0.15).double().mean()) < 0.8
+    assert float(turned.amax(1).median()) > 0.5
+    assert float(turned.amax()) < 2.4
+
+
 def test_cameras_have_people_in_view_and_are_known_to_some_degrees(standing):
     hips = (standing[:, 8] + standing[:, 11]) / 2
     wrong = []
