@@ -86,10 +86,10 @@ def test_the_radar_is_moved_where_the_camera_was_estimated_and_it_is_said():
     with pytest.warns(TensorsimWarning, match=r"put \d\.\d m in front of the camera"):
         after = within_reach(before, RADAR)
     moved = before.pose.joints - after.pose.joints
-    assert float(moved[0, 0, 1:, :, 1].min()) == pytest.approx(after.radar_ahead_m)
+    # Frames without anybody as well: a jump there would bend the curve beside it.
+    assert float(moved[..., 1].min()) == pytest.approx(after.radar_ahead_m)
+    assert float(moved[..., 1].max()) == pytest.approx(after.radar_ahead_m)
     assert float(moved[..., [0, 2]].abs().max()) == 0
-    # Frames without anybody stay zero.
-    assert float(after.pose.joints[0, 0, 0].abs().max()) == 0
     camera = camera_config(after.camera, after.radar_ahead_m)
     assert camera.position_m == (0.0, -after.radar_ahead_m, float(after.camera.height_m))
     assert float(mean_range(after.pose.joints[0, 0, 1:], RADAR).max()) < RADAR.reach_m

@@ -64,7 +64,7 @@ def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: P
     ("change", "message"),
     [
         ({"scene__snr": 3.0}, "'snr'.*perhaps 'snr_db'"),
-        ({"scene__wall__loss_tangent": 0.1}, "got no 'loss_tangent' in None"),
+        ({"scene__wall__loss_tangent": 0.1}, "got 'loss_tangent' of what this scene does not have"),
         ({"scene": 3}, "SimulationConfig.scene: got 3, expected a SceneConfig"),
         ({"pose__person_weight_kg": ()}, "person_weight_kg: got no values"),
         ({"scene__paths": ("direct",), "scene__leakage": True}, "got names of paths and leakage"),
@@ -107,7 +107,7 @@ def test_options_change_the_configuration_of_a_file(tmp_path: Path) -> None:
     assert config == expected
     paper = RadarOptions(paper=True, scene="through-wall").configuration()
     assert paper == ts.SimulationConfig.paper(ts.SimulationConfig.through_wall())
-    with pytest.raises(TensorsimError, match="--wall-permittivity: got no 'relative_permittivity' in None"):
+    with pytest.raises(TensorsimError, match="--wall-permittivity: got 'relative_permittivity' of what this scene does not have"):
         RadarOptions(wall_permittivity=4.0).configuration()
 
 

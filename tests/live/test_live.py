@@ -392,6 +392,7 @@ def _every_third(camera: Camera) -> Iterator[Grabbed]:
     """The third frame of a film, the sixth and so on, as if the others had been dropped."""
     for index, (_, frame) in enumerate(camera.reader.timed_frames()):
         if index % 3 == 2:
+            camera.dropped += 2
             yield Grabbed(frame, 2)
 
 
