@@ -33,8 +33,7 @@ def radar_ahead_m(joints: Tensor, valid: Tensor, radar: RadarConfig) -> float:
     check_points(joints, 4, 14, 3, "joints", "(P, T, 14, 3) joints in metres")
     if not bool(valid.any()):
         return 0.0
-    antennas = joints.new_tensor([radar.tx_positions_m[0], radar.rx_positions_m[0]]).mean(dim=0)
-    x, y, z = (joints - antennas).unbind(-1)
+    x, y, z = (joints - joints.new_tensor(radar.middle_m)).unbind(-1)
     # On the end of the axis a joint beside the line of sight is less far ahead.
     end = ((radar.reach_m - _ROOM_M) ** 2 - x.square() - z.square()).clamp(min=0.0).sqrt()
     there = valid[..., None]

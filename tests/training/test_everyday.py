@@ -39,6 +39,13 @@ def test_walks_have_all_headings_and_half_of_them_turn():
     assert float(hips[..., 1].min()) > 1.0
 
 
+def way_and_turns(hips, step):
+    """Ways (N, n, 2) of hips (N, K, 2) over every ``step`` frames, and the angles (N, n - 1) from one to the next."""
+    way = hips[:, step::step] - hips[:, :-step:step]
+    heading = torch.atan2(way[..., 1], way[..., 0])
+    return way, torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi
+
+
 def test_those_who_stroll_walk_in_curves_and_go_where_they_face():
     generator = torch.Generator().manual_seed(0)
     people = draw_people(12, everyday.PEOPLE, generator)
@@ -46,9 +53,7 @@ def test_those_who_stroll_walk_in_curves_and_go_where_they_face():
     joints = everyday._stroll(time, people, Draw(12, generator))
     hips = joints[:, :, (8, 11), :2].mean(2)
     # Over a second, so that the hips' own to and fro is left out.
-    way = hips[:, 120::120] - hips[:, :-120:120]
-    heading = torch.atan2(way[..., 1], way[..., 0])
-    turned = torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi
+    way, turned = way_and_turns(hips, 120)
     assert float(turned.abs().mean(1).median()) > 0.2
     across = joints[:, 60::120, 8, :2] - joints[:, 60::120, 11, :2]
     facing = torch.stack([-across[..., 1], across[..., 0]], dim=-1)[:, : way.shape[1]]
@@ -162,9 +167,7 @@ def test_those_who_walk_round_corners_walk_straight_between_them():
     time = torch.arange(5 * 120, dtype=torch.float64).expand(40, -1) / KNOT_HZ
     joints = everyday._round_corners(time, people, Draw(40, generator))
     hips = joints[:, :, (8, 11), :2].mean(2)
-    way = hips[:, 60::60] - hips[:, :-60:60]
-    heading = torch.atan2(way[..., 1], way[..., 0])
-    turned = (torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi).abs()
+    turned = way_and_turns(hips, 60)[1].abs()
     assert 0.2 < float((turned < 0.15).double().mean()) < 0.8
     assert float(turned.amax(1).median()) > 0.5
     assert float(turned.amax()) < 2.4
