@@ -313,10 +313,9 @@ def maps_of_pose(
     pulses = stage.resampler.pulses(joints.shape[2], fps)
     coefficients = stage.curve(joints, valid, fps)
     if bool((valid & (stage.heard(joints) == 0)).any()):
-        reach_m = stage.simulator.radar.reach_m
         warnings.warn(
-            f"people are farther away than {1.9 * reach_m:.1f} m, 1.9 times the range axis of this radar: the receiver "
-            "filters out their echo, and no map shows them",
+            f"people are farther away than {stage.unheard_m:.1f} m, 1.9 times the range axis of this radar: the "
+            "receiver filters out their echo, and no map shows them",
             TensorsimWarning,
             stacklevel=2,
         )

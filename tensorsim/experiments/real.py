@@ -20,6 +20,7 @@ from tensorsim.experiments.real_films import (
     SCENES,
     WATCHERS,
     EverydayTraining,
+    described,
     film_accuracy,
     film_pictures,
     titled,
@@ -152,7 +153,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     """Real films labelled by networks trained on maps of everyday motion, all of the same maps."""
     films = film_pictures(Path(config.films), config.size, work, config.film_count)
     labelled = [
-        (film.path.name, film.path.stat().st_size, film.start_s, film.end_s, film.accept)
+        (*described(film), film.accept)
         for film in read_labels(Path(config.films))[: config.film_count or None]
     ]
     filmed, true = config.group_clips

@@ -79,6 +79,11 @@ class EverydayTraining:
         return EverydayStore(self.maps, range(self.groups))
 
 
+def described(film: LabelledFilm) -> tuple[str, int, float, float]:
+    """What tells a film and its part from others: name, size of the file, start and end in seconds."""
+    return film.path.name, film.path.stat().st_size, film.start_s, film.end_s
+
+
 def film_pictures(folder: Path, size: int, work: Work, count: int = 0) -> list[FilmPictures]:
     """Pictures of the films of a folder with ``labels.json``, by the shipped networks; kept in the cache.
 
@@ -94,9 +99,8 @@ def film_pictures(folder: Path, size: int, work: Work, count: int = 0) -> list[F
     from safetensors.torch import load_file, save_file
 
     films = read_labels(folder)[: count or None]
-    described = [(film.path.name, film.path.stat().st_size, film.start_s, film.end_s) for film in films]
     settings = {
-        "films": described, "size": size, "weights": shipped_weights(*WATCHERS),
+        "films": [described(film) for film in films], "size": size, "weights": shipped_weights(*WATCHERS),
     }  # fmt: skip
     path = work.cache / "results" / f"films-{digest(settings)}.safetensors"
     if not path.is_file():

@@ -85,6 +85,7 @@ class PoseToDoppler(nn.Module):
             "radar_m", torch.tensor(simulator.radar.middle_m, dtype=torch.float64), persistent=False
         )
         self.reach_m = simulator.radar.reach_m
+        self.unheard_m = 1.9 * self.reach_m  # from here on the receiver hears nobody
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "PoseToDoppler":
@@ -197,7 +198,8 @@ class PoseToDoppler(nn.Module):
         of the last bin to 0 at 1.9 times. What is there does not appear in the maps in any case.
         """
         distance = torch.linalg.vector_norm(mid_hips(joints) - self.radar_m.to(joints), dim=-1)
-        beyond = ((distance / self.reach_m - 1.5) / 0.4).clamp(0.0, 1.0)
+        filtered_m = 1.5 * self.reach_m
+        beyond = ((distance - filtered_m) / (self.unheard_m - filtered_m)).clamp(0.0, 1.0)
         # Exactly 0 there: who is not heard does not set the level of the noise.
         return torch.where(beyond < 1, 0.5 + 0.5 * torch.cos(math.pi * beyond), 0.0)
 
