@@ -183,7 +183,3 @@ def main(arguments: list[str] | None = None) -> None:
         command = parse(arguments)
         process.load_torch()
         command.run()
-
-
-if __name__ == "__main__":
-    main()

@@ -21,8 +21,8 @@ SPIN_ROUNDS = 100
 
 
 def is_command() -> bool:
-    """Whether this process was started as ``tensorsim`` or ``python -m tensorsim.cli``."""
-    return Path(sys.argv[0]).stem == "tensorsim" or "tensorsim.cli" in sys.orig_argv[1:3]
+    """Whether this process was started as ``tensorsim`` or ``python -m tensorsim``."""
+    return Path(sys.argv[0]).stem == "tensorsim" or sys.orig_argv[1:3] == ["-m", "tensorsim"]
 
 
 def prepare() -> None:

@@ -240,7 +240,7 @@ def test_command_line_refuses(
 )
 def test_a_typo_gets_a_suggestion(arguments: list[str], hint: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tensorsim.cli", *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "tensorsim", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
     assert hint in done.stderr
@@ -248,7 +248,7 @@ def test_a_typo_gets_a_suggestion(arguments: list[str], hint: str) -> None:
 
 
 def test_libraries_stay_quiet_about_a_broken_video(folder: Path) -> None:
-    command = [sys.executable, "-m", "tensorsim.cli", "simulate", "text.mp4", *GOOD[1:], "--out", "out"]
+    command = [sys.executable, "-m", "tensorsim", "simulate", "text.mp4", *GOOD[1:], "--out", "out"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
     assert done.returncode == 2
     assert done.stdout == ""

@@ -339,7 +339,7 @@ def test_nobody_in_the_film_is_said(
 
 def test_help_shows_examples() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tensorsim.cli", "--help"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "tensorsim", "--help"], capture_output=True, text=True, check=True
     )
     assert "tensorsim simulate clip.mp4 --out out/ --scene through-wall" in done.stdout
 
@@ -363,7 +363,7 @@ def test_importing_tensorsim_is_light() -> None:
 def test_a_reader_who_has_seen_enough_ends_the_program_quietly() -> None:
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "tensorsim.cli", "models", "list"]
+    command = [sys.executable, "-m", "tensorsim", "models", "list"]
     with os.fdopen(write, "w") as nobody:
         done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, text=True, check=False)
     assert done.stderr == ""

@@ -78,7 +78,7 @@ def test_signals_leave_nothing_behind(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("redirect", [">&-", ">/dev/full"])
 def test_output_that_nobody_can_take(redirect: str) -> None:
     root = Path(__file__).resolve().parents[1]
-    command = f"exec '{sys.executable}' -m tensorsim.cli models list {redirect}"
+    command = f"exec '{sys.executable}' -m tensorsim models list {redirect}"
     done = subprocess.run(
         ["bash", "-c", command],
         stderr=subprocess.PIPE,

@@ -2,7 +2,7 @@
 
 A recipe says what is trained, on which samples and by which loss; the loop does the rest. Samples come from an
 endless stream and depend on their number alone, and the random state is set anew before every step, so a run
-that was interrupted goes on to the same result. Several GPUs: ``torchrun --nproc-per-node N -m tensorsim.cli train
+that was interrupted goes on to the same result. Several GPUs: ``torchrun --nproc-per-node N -m tensorsim train
 ...``; each process takes its share of every batch.
 """
 

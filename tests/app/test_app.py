@@ -157,7 +157,7 @@ def server(tmp_path: Path) -> Iterator[str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    arguments = ["-m", "tensorsim.cli", "app", "--port", str(port), "--longest-s", "5", "--largest-mb", "1"]
+    arguments = ["-m", "tensorsim", "app", "--port", str(port), "--longest-s", "5", "--largest-mb", "1"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path), "OMP_NUM_THREADS": "2"}
     process = subprocess.Popen([sys.executable, *arguments], env=environment, cwd=ROOT)
     address = f"http://127.0.0.1:{port}"
