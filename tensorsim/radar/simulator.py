@@ -147,7 +147,9 @@ class RadarSimulator(nn.Module):
         self.gate: nn.Module | None = None
         if isinstance(gate_m, float | int):
             self.gate = FollowingGate(radar, self.range_profile.range_m, gate_m)
-        self.mti = mti if isinstance(mti, MovingTargetIndicator) else MovingTargetIndicator(processing.mti)
+        self.mti = (
+            mti if isinstance(mti, MovingTargetIndicator) else MovingTargetIndicator(processing.mti, radar)
+        )
         self.doppler = doppler or DopplerTimeMap(
             radar, processing.window_s, processing.overlap, processing.integration
         )

@@ -3,12 +3,14 @@
 import math
 import warnings
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
+from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around, radial_speed
 from tensorsim.radar.processing.columns import block_rms
@@ -219,6 +221,13 @@ def test_pieces_and_the_doppler_map_alone_equal_forward(options):
         streamed = module.stream(lambda a, b: (p[0, a:b], rcs), 300)
         torch.manual_seed(3)
         assert_same(streamed, module(p[0], rcs), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", get_args(Mti))
+def test_every_moving_target_indicator_by_name(method):
+    p, rcs = tensors(swinging(60, 3, 256.0), np.ones(3))
+    ready = RadarSimulator(SMALL, snr_db=None, mti=MovingTargetIndicator(method, SMALL))
+    assert_same(RadarSimulator(SMALL, snr_db=None, mti=method)(p, rcs), ready(p, rcs))
 
 
 def test_ready_stages_take_the_place_of_their_settings():

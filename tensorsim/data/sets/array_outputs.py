@@ -84,7 +84,7 @@ def _cubes(
     few, nothing = points[:, some], torch.zeros(1, dtype=torch.float64)
     _, energies = recorder.survey(few, rcs[:, some], 0, None if ahead is None else ahead[:, some])
     levels = recorder.add(Levels(nothing, nothing), energies, few.shape[1])
-    mti = MovingTargetIndicator(config.processing.mti)
+    mti = MovingTargetIndicator(config.processing.mti, radar)
     length = frames.length + mti.lost_pulses
     hop = max(1, round(radar.prf_hz / wanted.frames_per_s))
     window = frames.shifting_window.float()

@@ -9,6 +9,7 @@ import torch
 
 from tensorsim import cli
 from tensorsim.config import SceneConfig, WallConfig
+from tensorsim.config.processing import Mti
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.plan import Plan, shared_out
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig
@@ -307,7 +308,8 @@ def test_one_noise_for_each_radar() -> None:
     assert (made.arrays["a.doppler_time"] != made.arrays["b.doppler_time"]).any()
 
 
-def test_an_array_tells_range_direction_and_speed() -> None:
+@pytest.mark.parametrize("mti", ["two-pulse", "high-pass"])
+def test_an_array_tells_range_direction_and_speed(mti: Mti) -> None:
     outputs = OutputConfig(
         kinds=("range_doppler_angle", "point_cloud"), frames_per_s=4.0, beams=16, cube_size=(48, 32)
     )
@@ -315,6 +317,7 @@ def test_an_array_tells_range_direction_and_speed() -> None:
         duration_s=0.3,
         sources=(SourceConfig(people=1, classes=("walking",)),),
         radars=(RadarView("array", "ti-awr1843-array"),),
+        processing=replace(DatasetRecipe().processing, mti=mti),
         outputs=outputs,
         variations=VariationConfig(heading_deg=(0.0, 0.0), side_m=(0.0, 0.0), distance_m=(3.5, 3.5)),
     )
