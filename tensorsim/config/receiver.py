@@ -26,7 +26,8 @@ class ReceiverConfig:
         iq_phase_rad: angle by which Q is not a quarter turn from I.
         dc_offset_db: power of a constant offset over the mean power of the echo that the noise refers to; None is
             no offset.
-        real: the receiver has one channel, I alone, see :class:`tensorsim.radar.RealReceiver`.
+        real: the receiver has one channel, I alone, see :class:`tensorsim.radar.RealReceiver`. With the same
+            ``snr_db``, which is that of samples, range bins have 3 dB less.
         adc_bits: bits of the converters of I and Q, see :class:`tensorsim.radar.Converter`; None does not quantise.
         adc_headroom_db: full scale of the converters over the root mean square magnitude of what arrives at them,
             over the clip; 0 dB is a wave of full scale, less saturates more.

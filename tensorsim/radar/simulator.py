@@ -160,7 +160,7 @@ class RadarSimulator(nn.Module):
         if processing.display_rate_hz is not None:
             self.range_time_block = max(1, round(radar.prf_hz / processing.display_rate_hz))
         self.min_pulses = self.doppler.length + self.mti.lost_pulses
-        self.radar = radar
+        self.radar, self.one_channel = radar, scene.receiver.real
 
     def forward(self, positions: Tensor, rcs: Tensor) -> RadarMaps:
         """Positions (..., M, S, 3) m and RCS (..., S) or (..., M, S) m^2 to maps."""
@@ -241,7 +241,7 @@ class RadarSimulator(nn.Module):
         rcs = check_scene(positions, rcs)
         self._check_pulses(positions.shape[-3])
         if not torch.jit.is_scripting() and not is_exporting():
-            check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m)
+            check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m, self.one_channel)
         return flatten_batch(positions, 3), flatten_batch(rcs, 2)
 
     def span(self, positions: Tensor) -> int:
@@ -267,7 +267,7 @@ class RadarSimulator(nn.Module):
                 "whole clip"
             )
         self._check_pulses(pulses)
-        speeds = SpeedCheck(self.radar, self.fixed_gate_m)
+        speeds = SpeedCheck(self.radar, self.fixed_gate_m, self.one_channel)
         levels = Levels(torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
         # Echoes of a short clip are kept for the second pass, in which noise is added to them.
         bins = self.range_profile.range_m.shape[0] * self.channels

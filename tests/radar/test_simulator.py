@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tensorsim.config import FloorConfig, RadarConfig, WallConfig
+from tensorsim.config import FloorConfig, RadarConfig, ReceiverConfig, SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around, radial_speed
@@ -392,6 +392,18 @@ def test_says_that_a_scatterer_beyond_twice_the_range_axis_appears_too_near() ->
     shown = maps.range_time[0].double().square().mean(-1)
     at = torch.arange(len(shown)) * radar.range_resolution_m
     assert float(shown[at < 3.0].sum()) < 0.01 * float(shown.sum())
+
+
+def test_says_that_one_channel_shows_a_scatterer_beyond_the_range_axis_too_near() -> None:
+    radar = RadarConfig.free_space()
+    p, rcs = mover(0.0, radar.prf_hz, 1).repeat(23, 1, 1) + torch.tensor([0.0, 5.5, 0.0]), torch.ones(1)
+    scene = SceneConfig(radar, receiver=ReceiverConfig(real=True), snr_db=None)
+    simulator = RadarSimulator(scene)
+    for run in (lambda: simulator(p, rcs), lambda: simulator.stream(lambda a, b: (p[a:b], rcs), len(p))):
+        with pytest.warns(TensorsimWarning, match=r"beyond 7.49 m, the range axis .* appears too near"):
+            maps = run()
+        peak = int(maps.range_time.mean(-1).argmax())
+        assert peak * radar.range_resolution_m == pytest.approx(2 * radar.reach_m - 9.5, abs=0.04)
 
 
 @pytest.mark.parametrize(("near_m", "far_m"), [(0.0, 0.0), (0.5, 0.0), (0.0, -0.5)])

@@ -57,16 +57,20 @@ class SpeedCheck:
     whole map is wrong: an error. If only some scatterers are, a foot for instance: a warning. A scatterer at a range
     larger than that of the last bin has a beat frequency above half the sample rate and is not in the map; from twice
     to three times that range the frequency is above the sample rate and the scatterer appears too near: warnings. A
-    scatterer outside of a fixed range gate is cut off: a warning. Scatterers with RCS 0, such as people before they
-    appear, are ignored.
+    receiver of one channel cannot tell frequencies above half the sample rate from those below, and shows everybody
+    beyond the last bin too near. A scatterer outside of a fixed range gate is cut off: a warning. Scatterers with RCS
+    0, such as people before they appear, are ignored.
 
     Args:
         radar: the radar.
         gate_m: (nearest, farthest) m of a fixed range gate; None is all of the range axis.
+        real: the receiver has one channel.
     """
 
-    def __init__(self, radar: RadarConfig, gate_m: tuple[float, float] | None = None) -> None:
-        self.radar, self.gate_m = radar, gate_m
+    def __init__(
+        self, radar: RadarConfig, gate_m: tuple[float, float] | None = None, real: bool = False
+    ) -> None:
+        self.radar, self.gate_m, self.real = radar, gate_m, real
         self.weighted, self.weight = torch.zeros(()), torch.zeros(())
         self.fastest, self.farthest, self.nearest = 0.0, 0.0, math.inf
         self.strongest, self.folded = 0.0, 0.0
@@ -81,9 +85,11 @@ class SpeedCheck:
         self.nearest = min(self.nearest, float(torch.where(rcs > 0, distance, math.inf).min()))
         self.strongest = max(self.strongest, float(rcs.max()))
         reach_m = self.radar.reach_m
-        if self.farthest > 2 * reach_m:
+        if self.farthest > reach_m:
             # Beat frequencies are known up to multiples of the sample rate: the range axis is seen again and again.
-            folded = (distance > 2 * reach_m) & (torch.remainder(distance, 2 * reach_m) < reach_m)
+            # Of one channel they are known but for the sign: between, it is seen backwards.
+            seen_again = torch.remainder(distance, 2 * reach_m) < reach_m
+            folded = (distance > reach_m) & (seen_again | self.real)
             self.folded = max(self.folded, float(torch.where(folded, rcs, 0.0).max()))
         weight = torch.minimum(rcs[..., 1:, :], rcs[..., :-1, :])
         speed = torch.where(weight > 0, distance.diff(dim=-2).abs() * self.radar.prf_hz, 0.0)
@@ -95,9 +101,16 @@ class SpeedCheck:
         """Raise TensorsimError or warn; see the class."""
         reach_m = self.radar.reach_m
         if self.folded > _FILTERED * self.strongest:
+            limit_m, axis, rate = 2 * reach_m, "twice the range axis of this radar", "the sample rate"
+            if self.real:
+                limit_m, axis, rate = (
+                    reach_m,
+                    "the range axis of this radar",
+                    "half the sample rate of one channel",
+                )
             warnings.warn(
-                f"positions: some scatterer is beyond {2 * reach_m:.2f} m, twice the range axis of this radar: its "
-                "beat frequency is above the sample rate, and it appears too near; leave out who is that far away",
+                f"positions: some scatterer is beyond {limit_m:.2f} m, {axis}: its beat frequency is above {rate}, "
+                "and it appears too near; leave out who is that far away",
                 TensorsimWarning,
                 stacklevel=3,
             )
@@ -136,9 +149,13 @@ class SpeedCheck:
 
 
 def check_unambiguous(
-    positions: Tensor, rcs: Tensor, radar: RadarConfig, gate_m: tuple[float, float] | None = None
+    positions: Tensor,
+    rcs: Tensor,
+    radar: RadarConfig,
+    gate_m: tuple[float, float] | None = None,
+    real: bool = False,
 ) -> None:
     """:class:`SpeedCheck` of a whole scene: positions (..., M, S, 3) m and RCS per pulse (..., M, S) m^2."""
-    check = SpeedCheck(radar, gate_m)
+    check = SpeedCheck(radar, gate_m, real)
     check.add(positions, rcs)
     check.judge()

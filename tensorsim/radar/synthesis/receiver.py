@@ -17,7 +17,8 @@ class QuadratureImbalance(nn.Module):
     """Makes Q larger than I by a gain and turns it by an angle: an image at the negative frequency.
 
     ``y = a x + b conj(x)`` with ``a = (1 + g exp(-j phi)) / 2``, ``b = (1 - g exp(j phi)) / 2``. In a continuous-wave
-    radar the image is at the opposite Doppler; behind a sweep it is at the negative beat, beyond the range profile.
+    radar the image is at the opposite Doppler; behind a sweep it is at the negative beat: beyond the range profile for
+    a target within it, in it, at the opposite Doppler, for one whose beat is above half the sample rate.
 
     Args:
         gain_db: g, gain of Q over I.
@@ -79,8 +80,10 @@ class DcOffset(nn.Module):
 class RealReceiver(nn.Module):
     """Keeps I alone. Spectra are mirror-symmetric: ``(x + conj x) / 2`` has the wave and its image at half amplitude.
 
-    A continuous-wave radar then cannot tell approaching from receding; behind a sweep the image is at the negative
-    beat, beyond the range profile, and only the level changes.
+    A continuous-wave radar then cannot tell approaching from receding. Behind a sweep the image is at the negative
+    beat, beyond the range profile; a target whose beat is above half the sample rate is seen by its image alone, too
+    near and at the opposite Doppler. The ratio of signal to noise of the samples stays; in a range bin it falls by
+    3 dB, since the noise of the negative beats comes on top.
 
     Shapes: IF (..., M, N) complex -> likewise, with imaginary part 0. Differentiable.
 

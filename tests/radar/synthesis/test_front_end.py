@@ -98,6 +98,20 @@ def test_real_receivers_have_mirror_symmetric_spectra() -> None:
     assert float(both[2 * zero - int(both.argmax())] / both.max()) < 1e-4
 
 
+def test_real_receivers_have_the_noise_of_the_image_in_their_range_bins() -> None:
+    """The ratio of samples is that asked for, that of range bins 3 dB below a receiver of two channels."""
+    radar = RadarConfig.free_space()
+    p = mover(radar, 900, 0.0, 80.5 * radar.range_resolution_m)
+    found = []
+    for receiver in (ReceiverConfig(adc_bits=24), ReceiverConfig(adc_bits=24, real=True)):
+        torch.manual_seed(0)
+        maps = maps_of(radar, p, receiver, snr_db=0.0)
+        assert float(maps.snr_db) == pytest.approx(0.0, abs=0.05)
+        power = maps.range_time.square().mean(1)
+        found.append(float(power[78:84].max() / power[120:190].mean()))
+    assert 10 * math.log10(found[1] / found[0]) == pytest.approx(-3.01, abs=0.3)
+
+
 @pytest.mark.parametrize(("bits", "headroom_db"), [(8, 12.0), (10, 6.0), (12, 3.0)])
 def test_quantisation_noise_floor(bits: int, headroom_db: float) -> None:
     """A wave of full scale has 6.02 bits + 1.76 dB, spread over all bins; headroom costs as much."""
