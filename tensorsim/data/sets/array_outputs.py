@@ -119,7 +119,7 @@ def _points(
     steps = virtual_elements(radar).diff(dim=0)
     if not torch.allclose(steps, steps[:1] * torch.tensor([1.0, 0, 0]).double(), atol=1e-6):
         raise TensorsimError("point_cloud: got other antennas, expected an even line along x")
-    cfar = CfarDetector(_GUARD, _TRAINING, _FALSE_ALARM, edges=("reflect", "circular"))
+    cfar = CfarDetector(_GUARD, _TRAINING, _FALSE_ALARM, edges=("reflect", "circular"), looks=cubes.shape[1])
     cloud = PointCloud(
         radar.range_resolution_m,
         radar.prf_hz / frames.bins * radar.doppler_wavelength_m / 2,

@@ -32,8 +32,9 @@ class OutputConfig:
             the lowest speed; ``"profiles"`` (M, R, 2) and ``"if_signal"`` (M, N, 2): real and imaginary part over the
             largest magnitude, float16; ``"range_doppler_angle"`` (frames, R, F, beams) in decibels and
             ``"point_cloud"`` (frames, points, 4) float32: range in m, speed in m/s, sine of the azimuth and power in
-            dB, NaN where there is no point, both of an array; ``"joints"`` (P, T, 14, 3) float32: metres, as the
-            radar sees them, NaN where nobody is.
+            dB, NaN where there is no point, both of an array (above a ratio of signal to noise of 20 dB the side lobes
+            of ``range_window="hamming"`` are points as well, those of ``"hann"`` hardly); ``"joints"`` (P, T, 14, 3)
+            float32: metres, as the radar sees them, NaN where nobody is.
         dtype: of maps: ``"uint8"``, 255 at the peak and 0 at ``range_db`` below it, or ``"float16"``, decibels.
         range_db: range of uint8 maps.
         size: (rows, columns) of maps, every cell the mean power of what it covers; None keeps them.

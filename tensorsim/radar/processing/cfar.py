@@ -1,7 +1,7 @@
 """Detection with a constant rate of false alarms: a cell is compared with the cells around it.
 
 Sources: Finn and Johnson, RCA Review 29 (1968), for cell averaging; Rohling, IEEE Trans. AES-19 (1983), for ordered
-statistics.
+statistics; Abramowitz and Stegun, *Handbook of Mathematical Functions*, 26.5 and 26.6, for means of several looks.
 """
 
 import math
@@ -10,16 +10,32 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, is_exporting
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    is_exporting,
+)
 from tensorsim.ops import flatten_batch, unflatten_batch
 
 METHODS = ("cell-averaging", "ordered-statistic")
 EDGES = ("circular", "reflect")
 
 
-def cell_averaging_factor(false_alarm: float, cells: int) -> float:
-    """``N (P^(-1/N) - 1)``: threshold over mean of N cells of exponentially distributed power."""
-    return cells * (false_alarm ** (-1 / cells) - 1)
+def cell_averaging_factor(false_alarm: float, cells: int, looks: int = 1) -> float:
+    r"""Threshold over mean of N cells, whose power is a mean of V independent exponentially distributed powers.
+
+    The ratio of a cell to that mean has an F distribution of 2 V and 2 N V degrees of freedom, so that
+
+    $$ P = I_{N / (N + a)}(N V, V) $$
+
+    with the regularised incomplete beta function; for one look ``a = N (P^(-1/N) - 1)``.
+    """
+    from scipy.special import betaincinv
+
+    return float(cells * (1 / betaincinv(cells * looks, looks, false_alarm) - 1))
 
 
 def ordered_statistic_factor(false_alarm: float, cells: int, rank: int) -> float:
@@ -55,7 +71,8 @@ class CfarDetector(nn.Module):
 
     The reference cells of a cell are those of the rectangle that reaches ``guard + training`` cells to each side,
     less the rectangle that reaches ``guard`` cells. False alarms come at the rate asked for where the reference
-    cells are independent and their power is exponentially distributed (a square-law detector in Gaussian noise).
+    cells are independent and their power is exponentially distributed (a square-law detector in Gaussian noise), or a
+    mean of ``looks`` such powers.
 
     Args:
         guard: cells on each side of the cell that are left out, along both axes.
@@ -65,13 +82,14 @@ class CfarDetector(nn.Module):
             of them in the order of size.
         rank: which of N cells that is, as a share of N: 0.75 is usual.
         edges: what lies beyond the edges of each axis, ``"circular"`` or ``"reflect"``.
+        looks: independent powers, such as those of antennas, whose mean each cell is; with cell averaging.
 
     Shapes: power (..., H, W), not negative -> (..., H, W) bool. :meth:`threshold` is differentiable, a detection is
     not.
 
     Raises:
-        TensorsimError: settings without reference cells, a probability or rank outside (0, 1), unknown names, a map
-            smaller than the reach, negative power, NaN.
+        TensorsimError: settings without reference cells, a probability or rank outside (0, 1), unknown names, fewer
+            than one look, several with ordered statistics, a map smaller than the reach, negative power, NaN.
     """
 
     def __init__(
@@ -82,6 +100,7 @@ class CfarDetector(nn.Module):
         method: str = "cell-averaging",
         rank: float = 0.75,
         edges: tuple[str, str] = ("circular", "reflect"),
+        looks: int = 1,
     ) -> None:
         super().__init__()
         if min(*guard, *training) < 0 or max(training) == 0:
@@ -97,6 +116,9 @@ class CfarDetector(nn.Module):
             raise TensorsimError(f"CfarDetector.method: got {method!r}, expected one of {METHODS}")
         if any(edge not in EDGES for edge in edges):
             raise TensorsimError(f"CfarDetector.edges: got {edges}, expected two of {EDGES}")
+        check_count(looks, 1, 2**16, "looks")
+        if looks > 1 and method == "ordered-statistic":
+            raise TensorsimError(f"looks: got {looks} with the method {method!r}, expected 1")
         self.guard_rows, self.guard_columns = guard
         self.reach_rows, self.reach_columns = guard[0] + training[0], guard[1] + training[1]
         outer = (2 * self.reach_rows + 1) * (2 * self.reach_columns + 1)
@@ -106,7 +128,7 @@ class CfarDetector(nn.Module):
         if self.ordered:
             self.factor = ordered_statistic_factor(false_alarm, self.cells, self.rank)
         else:
-            self.factor = cell_averaging_factor(false_alarm, self.cells)
+            self.factor = cell_averaging_factor(false_alarm, self.cells, looks)
         self.row_edges, self.column_edges = edges
 
     @torch.jit.export

@@ -109,8 +109,10 @@ class PointDetector(nn.Module):
         window_s, overlap: frames, see :class:`RangeDopplerCube`.
         points: the most points of a frame.
         nearest_m: range of the first bin of the profiles.
-        cfar: detector over (range, Doppler); None is cell averaging with a false alarm rate of 1e-5, along Doppler
-            alone where the radar has hardly any range, as one of continuous wave.
+        cfar: detector over (range, Doppler) of the mean power of the V channels; None is cell averaging of V looks
+            with a false alarm rate of 1e-5, along Doppler alone where the radar has hardly any range, as one of
+            continuous wave. Side lobes that stand out of the noise are detected too: profiles of strong echoes want
+            ``range_window="hann"``.
 
     Shapes: profiles (..., V, M, R) complex, after a moving target indicator where what stands still is not wanted ->
     :class:`Points` (..., K, points). Differentiable as :class:`PointCloud`.
@@ -151,7 +153,9 @@ class PointDetector(nn.Module):
         if cfar is None:
             ranges = radar.samples_per_chirp // 2 > 10
             guard, training = ((2, 4), (8, 8)) if ranges else ((0, 4), (0, 16))
-            cfar = CfarDetector(guard, training, 1e-5, edges=("reflect", "circular"))
+            cfar = CfarDetector(
+                guard, training, 1e-5, edges=("reflect", "circular"), looks=self.cube.channels
+            )
         self.cfar = cfar
         speed_step = self.cube.prf_hz / self.cube.bins * radar.doppler_wavelength_m / 2
         self.cloud = PointCloud(

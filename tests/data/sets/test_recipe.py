@@ -319,7 +319,9 @@ def test_an_array_tells_range_direction_and_speed(mti: Mti) -> None:
         radars=(RadarView("array", "ti-awr1843-array"),),
         processing=replace(DatasetRecipe().processing, mti=mti),
         outputs=outputs,
-        variations=VariationConfig(heading_deg=(0.0, 0.0), side_m=(0.0, 0.0), distance_m=(3.5, 3.5)),
+        variations=VariationConfig(
+            heading_deg=(0.0, 0.0), side_m=(0.0, 0.0), distance_m=(3.5, 3.5), snr_db=(20.0, 20.0)
+        ),
     )
     plan = Plan(recipe)
     variation = plan.variation(0, 0)

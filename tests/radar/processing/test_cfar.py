@@ -88,11 +88,13 @@ def test_edges_wrap_or_reflect_as_asked():
     np.testing.assert_allclose(stage.threshold(power).numpy(), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["cell-averaging", "ordered-statistic"])
+@pytest.mark.parametrize(
+    ("method", "looks"), [("cell-averaging", 1), ("cell-averaging", 8), ("ordered-statistic", 1)]
+)
 @pytest.mark.parametrize("false_alarm", [0.1, 0.01])
-def test_false_alarms_in_noise_come_at_the_rate_asked_for(method, false_alarm):
-    noise = exponential(8, 256, 128, seed=1)
-    stage = CfarDetector((1, 1), (2, 2), false_alarm, method, edges=("circular", "circular"))
+def test_false_alarms_in_noise_come_at_the_rate_asked_for(method, looks, false_alarm):
+    noise = exponential(8, looks, 256, 128, seed=1).mean(1)
+    stage = CfarDetector((1, 1), (2, 2), false_alarm, method, edges=("circular", "circular"), looks=looks)
     rate = float(stage(noise).double().mean())
     # Neighbours share reference cells: the deviation is a few times that of independent cells.
     assert rate == pytest.approx(
@@ -104,6 +106,9 @@ def test_factors_have_their_closed_forms():
     # One reference cell: P = 1 / (1 + a) for both.
     assert cell_averaging_factor(0.2, 1) == pytest.approx(4.0)
     assert ordered_statistic_factor(0.2, 1, 1) == pytest.approx(4.0)
+    # Of two looks x = a / (N + a) has P = (1 - x)^(2 N) (1 + 2 N x).
+    x = cell_averaging_factor(0.01, 16, 2) / (16 + cell_averaging_factor(0.01, 16, 2))
+    assert (1 - x) ** 32 * (1 + 32 * x) == pytest.approx(0.01)
     # The smallest of N: P = N / (N + a).
     assert ordered_statistic_factor(0.01, 16, 1) == pytest.approx(16 * 99)
 
@@ -132,6 +137,11 @@ def test_the_threshold_is_differentiable():
         ({"guard": (0, 0), "training": (1, 1), "rank": 0.0}, "rank 0.0, expected both between 0 and 1"),
         ({"guard": (0, 0), "training": (1, 1), "method": "greatest-of"}, "greatest-of"),
         ({"guard": (0, 0), "training": (1, 1), "edges": ("zero", "reflect")}, "edges"),
+        ({"guard": (0, 0), "training": (1, 1), "looks": 0}, "looks: got 0"),
+        (
+            {"guard": (0, 0), "training": (1, 1), "looks": 2, "method": "ordered-statistic"},
+            "looks: got 2 with the method 'ordered-statistic', expected 1",
+        ),
     ],
 )
 def test_bad_settings_are_refused(settings, message):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig, SceneConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import PRESETS
-from tensorsim.radar.processing.cfar import CfarDetector
+from tensorsim.radar.processing.cfar import CfarDetector, cell_averaging_factor
 from tensorsim.radar.processing.doppler import RangeDopplerVideo
 from tensorsim.radar.processing.range_doppler import PointDetector, RangeDopplerAngle, RangeDopplerCube
 from tensorsim.radar.simulator import RadarSimulator
@@ -181,6 +181,11 @@ def test_the_cube_has_the_power_of_the_video() -> None:
     profiles = complex_noise(40, 3)
     cube = RangeDopplerCube(SMALL, overlap=0.5)(profiles[None])
     assert_same(cube[:, 0].abs().square(), RangeDopplerVideo(SMALL, overlap=0.5)(profiles), atol=1e-5)
+
+
+def test_the_detector_knows_that_cells_are_means_over_antennas() -> None:
+    cfar = PointDetector(TDM).cfar
+    assert cfar.factor == cell_averaging_factor(1e-5, cfar.cells, 8)
 
 
 def test_points_of_a_radar_without_range() -> None:
