@@ -3,8 +3,14 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from tensorsim.config.checks import require_choices, require_counts, require_positive
-from tensorsim.errors import TensorsimError
+from tensorsim.config.checks import (
+    as_positions,
+    is_finite,
+    require_choices,
+    require_counts,
+    require_positive,
+)
+from tensorsim.errors import TensorsimError, check_count
 
 RangeWindow = Literal["hamming", "hann", "blackman"]
 Mti = Literal["two-pulse", "n-pulse", "mean", "high-pass"]
@@ -22,7 +28,7 @@ class ProcessingConfig:
         window_s: length of the STFT window in seconds (panel: STFT window, 0.1 s).
         overlap: shared part of neighbouring STFT windows (panel: overlap, 0.9).
         integration: sum over range bins, see :class:`tensorsim.radar.DopplerTimeMap`.
-        ridge_count: ridges of the Doppler-time map (panel: 3).
+        ridge_count: ridges of the Doppler-time map, 1 to 6 (panel: 3).
         denoiser: what cleans the maps (panel: denoiser on/off): ``"none"``, ``"perona-malik"``, ``"ksvd"``,
             ``"dncnn"``, or DnCNN weights by name or file, see :func:`tensorsim.enhance.choice.map_denoiser`; None
             is off.
@@ -55,20 +61,37 @@ class ProcessingConfig:
     pulse_chunk: int = 1024
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "range_gate_m", as_positions(self.range_gate_m))
         require_choices(self, mti=Mti, integration=Integration)
+        if self.range_window is not None:
+            require_choices(self, range_window=RangeWindow)
         if self.engine not in ("time", "range-bins"):
             raise TensorsimError(f"engine: got {self.engine!r}, expected 'time' or 'range-bins'")
-        require_counts(self, "ridge_count", "pulse_chunk", "energy_stride")
+        require_counts(self, "pulse_chunk", "energy_stride")
+        check_count(self.ridge_count, 1, 6, "ProcessingConfig.ridge_count")
         require_positive("ProcessingConfig", window_s=self.window_s)
-        if not 0 <= self.overlap < 1:
-            raise TensorsimError(f"overlap: got {self.overlap}, expected a number in [0, 1)")
+        if not (is_finite(self.overlap) and 0 <= self.overlap < 1):
+            raise TensorsimError(f"overlap: got {self.overlap!r}, expected a number in [0, 1)")
+        self._check_gate()
         if self.display_rate_hz is not None:
             require_positive("ProcessingConfig", display_rate_hz=self.display_rate_hz)
         if self.energy_stride > 1 and self.engine == "time":
             raise TensorsimError(
                 f"energy_stride: got {self.energy_stride} with the engine 'time', expected 'range-bins'"
             )
-        if self.near_bins is not None and self.engine == "time":
-            raise TensorsimError(
-                f"near_bins: got {self.near_bins} with the engine 'time', expected 'range-bins'"
-            )
+        if self.near_bins is not None:
+            require_counts(self, "near_bins")
+            if self.engine == "time":
+                raise TensorsimError(
+                    f"near_bins: got {self.near_bins} with the engine 'time', expected 'range-bins'"
+                )
+
+    def _check_gate(self) -> None:
+        gate_m = self.range_gate_m
+        if isinstance(gate_m, tuple):
+            if not (len(gate_m) == 2 and all(map(is_finite, gate_m)) and 0 <= gate_m[0] <= gate_m[1]):
+                raise TensorsimError(
+                    f"ProcessingConfig.range_gate_m: got {gate_m}, expected (nearest, farthest) metres from 0 on"
+                )
+        elif gate_m is not None:
+            require_positive("ProcessingConfig", range_gate_m=gate_m)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tensorsim.config.checks import is_finite, require_choices, require_positive
+from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
 from tensorsim.config.radar import RadarConfig
 from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
@@ -104,12 +104,12 @@ class SceneConfig:
             )
         if not self.wall_attenuation and self.wall is None:
             raise TensorsimError("SceneConfig.wall_attenuation: got False without a wall, expected a wall")
-        if self.bounces < 0:
-            raise TensorsimError(f"SceneConfig.bounces: got {self.bounces}, expected at least 0")
-        if self.snr_db is not None and not is_finite(self.snr_db):
-            raise TensorsimError(f"SceneConfig.snr_db: got {self.snr_db!r}, expected a finite number of dB")
-        if self.snr_db is not None:
-            check_range(self.snr_db, "ratio of powers", "SceneConfig.snr_db")
+        require_counts(self, "bounces")
+        for name in ("noise_figure_db", *(["snr_db"] if self.snr_db is not None else [])):
+            value = getattr(self, name)
+            if not is_finite(value):
+                raise TensorsimError(f"SceneConfig.{name}: got {value!r}, expected a finite number of dB")
+            check_range(value, "ratio of powers", f"SceneConfig.{name}")
         require_positive("SceneConfig", transmit_power_w=self.transmit_power_w)
 
     @property

@@ -88,6 +88,20 @@ def test_names() -> None:
         (lambda: ts.WallConfig(center_m=3.0), "center_m: got 3.0"),  # type: ignore[arg-type]
         (lambda: ts.WallConfig(loss_tangent="no"), "loss_tangent: got no"),  # type: ignore[arg-type]
         (lambda: FloorConfig(reflection="no"), "reflection: got no"),  # type: ignore[arg-type]
+        (lambda: ts.SceneConfig(bounces=0), "SceneConfig.bounces: got 0, expected an integer of at least 1"),
+        (lambda: ts.SceneConfig(bounces=1.5), "bounces: got 1.5"),  # type: ignore[arg-type]
+        (lambda: ts.SceneConfig(bounces=True), "bounces: got True"),
+        (lambda: ts.SceneConfig(noise_figure_db=math.nan), "noise_figure_db: got nan"),
+        (lambda: ts.ProcessingConfig(overlap="x"), "overlap: got 'x'"),  # type: ignore[arg-type]
+        (lambda: ts.ProcessingConfig(ridge_count=7), "ridge_count: got 7, expected an integer from 1 to 6"),
+        (lambda: ts.ProcessingConfig(range_window="foo"), "range_window: got 'foo'"),  # type: ignore[arg-type]
+        (lambda: ts.ProcessingConfig(range_gate_m=(1.0, 2.0, 3.0)), "range_gate_m: got"),  # type: ignore[arg-type]
+        (
+            lambda: ts.ProcessingConfig(range_gate_m=(5.0, 2.0)),
+            r"range_gate_m: got \(5.0, 2.0\), expected \(near",
+        ),
+        (lambda: ts.ProcessingConfig(range_gate_m=(1.0, math.nan)), "range_gate_m: got"),
+        (lambda: ts.ProcessingConfig(range_gate_m=-1.0), "range_gate_m: got -1.0, expected a positive"),
     ],
 )
 def test_refuses(make: object, message: str) -> None:

@@ -266,7 +266,7 @@ def test_fixed_gate_is_a_cut_through_the_maps():
     for gate in ((3.0, 3.01), (9.0, 10.0), (3.0, 2.0), (0.0, math.nan)):
         with pytest.raises(TensorsimError, match="gate_m: got"):
             RadarSimulator(FREE, range_gate_m=gate)
-    with pytest.raises(TensorsimError, match="width_m: got 0"):
+    with pytest.raises(TensorsimError, match="range_gate_m: got 0"):
         RadarSimulator(FREE, range_gate_m=0)
 
 

@@ -18,7 +18,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_scene
+from tensorsim.errors import TensorsimError, check_count, check_scene
 from tensorsim.radar.processing.range_profile import RangeProfile
 from tensorsim.radar.synthesis.dechirp import phasor, tone_sum
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
@@ -147,8 +147,8 @@ class RangeBinSynthesizer(nn.Module):
             fraction of the window's energy in the other bins, averaged over fractions of a bin. 0 for all bins.
 
     Raises:
-        TensorsimError: ``near_bins`` or ``energy_stride`` below 1, an echo with several antennas or a closed Airy
-            slab; see :class:`~tensorsim.radar.EchoSynthesizer`.
+        TensorsimError: ``near_bins`` or ``energy_stride`` that are no counts, an echo with several antennas or a
+            closed Airy slab; see :class:`~tensorsim.radar.EchoSynthesizer`.
     """
 
     table: Tensor
@@ -162,11 +162,10 @@ class RangeBinSynthesizer(nn.Module):
         energy_stride: int = 1,
     ) -> None:
         super().__init__()
-        if energy_stride < 1:
-            raise TensorsimError(f"energy_stride: got {energy_stride}, expected at least 1")
+        check_count(energy_stride, 1, 2**31, "energy_stride")
         self.energy_stride = energy_stride
-        if near_bins is not None and near_bins < 1:
-            raise TensorsimError(f"near_bins: got {near_bins}, expected at least 1 or None for all")
+        if near_bins is not None:
+            check_count(near_bins, 1, 2**31, "near_bins")
         if echo.paths.airy or echo.paths.has_array:
             raise TensorsimError(
                 "echo: got a wall with incidence 'airy' or several antennas, expected one antenna of each kind and "

@@ -199,8 +199,11 @@ def test_energy_of_every_nth_pulse_stands_for_those_up_to_the_next():
 
 
 def test_refuses_bad_settings():
-    with pytest.raises(TensorsimError, match="near_bins: got 0"):
-        synthesizer(FREE, near_bins=0)
+    for bins in (0, 8.5):
+        with pytest.raises(TensorsimError, match=f"near_bins: got {bins}, expected an integer"):
+            synthesizer(FREE, near_bins=bins)
+        with pytest.raises(TensorsimError, match=f"near_bins: got {bins}, expected an integer"):
+            RadarSimulator(FREE, engine="range-bins", near_bins=bins)
     with pytest.raises(TensorsimError, match="engine: got 'magic'"):
         RadarSimulator(FREE, engine="magic")
     with pytest.raises(TensorsimError, match="near_bins: got 4 with the engine 'time'"):
