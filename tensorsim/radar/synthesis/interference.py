@@ -72,9 +72,11 @@ class Interference(nn.Module):
             -1
         )
         own = torch.arange(self.samples, dtype=torch.float64, device=device) / self.rate_hz
-        since = pulse / self.prf_hz + own - self.delay_s
-        sweep = torch.floor(since * self.other_prf_hz)
-        theirs = since - sweep / self.other_prf_hz  # time in the sweep that is heard
+        begin = pulse / self.prf_hz - self.delay_s
+        sweep = torch.floor((begin + own) * self.other_prf_hz)
+        # Time in the sweep that is heard. The long times are subtracted first: their rounding is that of the pulse, a
+        # phase that all of its samples share.
+        theirs = (begin - sweep / self.other_prf_hz) + own
 
         beat = self.apart_hz + self.slope * own - self.other_slope * theirs
         heard = (beat.abs() < self.rate_hz / 2) & (theirs < self.other_chirp_s)

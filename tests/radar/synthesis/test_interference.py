@@ -1,7 +1,9 @@
 """Another radar in the band: its level, its frequencies, and when it is heard."""
 
+import cmath
 import math
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -77,6 +79,31 @@ def test_sweeps_that_drift_are_heard_now_and_then() -> None:
     found = (module(silence(256))[:, 100:300].abs() > 0).all(-1)
     assert torch.equal(found, expected)
     assert 5 < int(expected.sum()) < 20
+
+
+def test_an_hour_later_the_samples_of_a_pulse_are_as_exact() -> None:
+    """Against fractions; a pulse as a whole has an error of phase, from the time since the beginning in float64."""
+    other = replace(OTHER, chirp_s=52e-6, prf_hz=0.99 / 52e-6)
+    module = Interference(RADAR, other)
+    slopes = [Fraction(r.bandwidth_hz) / Fraction(r.chirp_s) for r in (RADAR, other)]
+
+    def exact(pulse: int, sample: int) -> complex:
+        own = Fraction(sample) / Fraction(RADAR.sample_rate_hz)
+        theirs = (Fraction(pulse) / Fraction(RADAR.prf_hz) + own) % (1 / Fraction(other.prf_hz))
+        if abs(slopes[0] * own - slopes[1] * theirs) >= RADAR.sample_rate_hz / 2 or theirs >= other.chirp_s:
+            return 0.0
+        turns = (
+            slopes[0] * own**2 / 2 - Fraction(other.carrier_hz) * (theirs - own) - slopes[1] * theirs**2 / 2
+        )
+        return cmath.rect(module.amplitude, 2 * math.pi * float(turns % 1))
+
+    first = 3600 * 8192
+    found = module(silence(12), first).numpy()
+    expected = np.array([[exact(first + k, n) for n in range(400)] for k in range(12)])
+    assert (abs(expected) > 0).any(1).sum() >= 3
+    common = np.exp(1j * np.angle((expected * found.conj()).sum(1, keepdims=True)))
+    assert abs(found * common - expected).max() < 2e-3 * module.amplitude
+    assert abs(np.angle(common)).max() < 0.5
 
 
 def test_power_and_pieces() -> None:
