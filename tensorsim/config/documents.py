@@ -13,7 +13,8 @@ T = TypeVar("T")
 
 
 def to_document(value: Any) -> Any:
-    """A configuration as mappings, lists, numbers and strings."""
+    """A configuration as mappings, lists, numbers and strings; those of NumPy become Python's."""
+    value = value.tolist() if hasattr(value, "tolist") else value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_document(getattr(value, f.name)) for f in dataclasses.fields(value)}
     return [to_document(item) for item in value] if isinstance(value, (tuple, list)) else value

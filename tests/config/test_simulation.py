@@ -37,6 +37,15 @@ def test_a_yaml_file_holds_everything(tmp_path: Path) -> None:
     config.to_yaml(tmp_path / "run.yaml")
     assert ts.SimulationConfig.from_yaml(tmp_path / "run.yaml") == config
     assert ts.SimulationConfig.from_document(json.loads(json.dumps(config.to_document()))) == config
+    numpy = {
+        "scene__radar__carrier_hz": np.float64(60e9),
+        "scene__radar__tx_m": np.zeros(3, dtype=np.float32),
+        "scene__snr_db": np.float32(20.5),
+        "processing__display_rate_hz": np.int64(30),
+    }
+    config = ts.SimulationConfig().replace(**numpy)
+    config.to_yaml(tmp_path / "run.yaml")
+    assert ts.SimulationConfig.from_yaml(tmp_path / "run.yaml") == config
     (tmp_path / "some.yaml").write_text("scene: {radar: {prf_hz: 4e3}}\nseed: 3\n")
     expected = ts.SimulationConfig().replace(scene__radar__prf_hz=4000.0, seed=3)
     assert ts.SimulationConfig.from_yaml(tmp_path / "some.yaml") == expected
