@@ -4,9 +4,9 @@ from typing import Any
 
 from tensorsim.errors import TensorsimError
 
-#: Characters of a document, of a value, and nesting; configurations need a tenth of each.
+#: Characters of a document, of a value, and nesting; configurations need a tenth of each, but for long paths of files.
 MAX_CHARACTERS = 100_000
-MAX_VALUE = 200
+MAX_VALUE = 4096
 MAX_DEPTH = 20
 
 
@@ -51,7 +51,17 @@ def load_limited_yaml(text: str, name: str) -> Any:
         raise TensorsimError(f"{name}: not valid YAML: {error}") from None
 
 
-def _loader() -> type:
+def dump_limited_yaml(document: Any) -> str:
+    """YAML from which :func:`load_limited_yaml` reads the same: text that it would take for a number is quoted."""
+    import yaml
+
+    class Dumper(yaml.SafeDumper):
+        yaml_implicit_resolvers = _loader().yaml_implicit_resolvers
+
+    return str(yaml.dump(document, Dumper=Dumper, sort_keys=False))
+
+
+def _loader() -> Any:
     """YAML's safe loader with decimal numbers, without dates, and without equal keys."""
     import re
 

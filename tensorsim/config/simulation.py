@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tensorsim.config.documents import from_document, suggestion, to_document
+from tensorsim.config.limited_yaml import dump_limited_yaml
 from tensorsim.config.people import PANEL_DISTANCES_M, PoseConfig, SmoothingConfig, TrackerConfig
 from tensorsim.config.processing import ProcessingConfig
 from tensorsim.config.radar import RadarConfig
@@ -156,10 +157,8 @@ class SimulationConfig:
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
         """Write a file from which :meth:`from_yaml` reads the same."""
-        import yaml
-
         with complete_file(Path(path)) as scratch:
-            scratch.write_text(yaml.safe_dump(self.to_document(), sort_keys=False), encoding="utf-8")
+            scratch.write_text(dump_limited_yaml(self.to_document()), encoding="utf-8")
 
 
 def _replaced(config: Any, path: list[str], value: Any) -> Any:

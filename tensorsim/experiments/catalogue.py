@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from tensorsim.config.documents import find_named, from_document, to_document
+from tensorsim.config.limited_yaml import dump_limited_yaml
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
 from tensorsim.experiments import ablations, networks, paper, real, video
@@ -132,7 +131,7 @@ def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
     with complete_or_nothing(out) as new:
         (new / f"{name}.md").write_text(report.markdown(experiment.title), encoding="utf-8")
         settings = {"experiment": name} | to_document(config)
-        (new / f"{name}.yaml").write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
+        (new / f"{name}.yaml").write_text(dump_limited_yaml(settings), encoding="utf-8")
         for table in report.tables:
             stem = f"{name}-{table.file}" if table.file else name
             (new / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, SceneConfig, WallConfig
 from tensorsim.config.documents import from_document, suggestion, to_document
+from tensorsim.config.limited_yaml import dump_limited_yaml
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
@@ -193,10 +194,8 @@ def save_radar_yaml(
     path: str | Path, radar: RadarConfig, wall: WallConfig | None = None, floor: FloorConfig | None = None
 ) -> None:
     """Write a file from which :func:`load_scene_yaml` reads the same scene."""
-    import yaml
-
     document = to_document(radar)
     for name, part in (("wall", wall), ("floor", floor)):
         if part is not None:
             document[name] = to_document(part)
-    Path(path).write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+    Path(path).write_text(dump_limited_yaml(document), encoding="utf-8")

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tensorsim.config.limited_yaml import load_limited_yaml
+from tensorsim.config.limited_yaml import dump_limited_yaml, load_limited_yaml
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import load_scene_yaml
 
@@ -33,6 +33,30 @@ def test_values_are_those_of_python(text: str, value: Any) -> None:
     assert type(load_limited_yaml(text, "file")["a"]) is type(value)
 
 
+@pytest.mark.parametrize(
+    "value",
+    [
+        "1e5",
+        "1e+3",
+        "7",
+        "-.5",
+        "1_000",
+        "0x10",
+        "1:30",
+        "2001-01-01",
+        "on",
+        "null",
+        "=",
+        "/" + 300 * "a",
+        7e10,
+        1e-12,
+    ],
+)
+def test_what_is_written_is_read(value: Any) -> None:
+    assert load_limited_yaml(dump_limited_yaml({"a": value}), "file") == {"a": value}
+    assert type(load_limited_yaml(dump_limited_yaml({"a": value}), "file")["a"]) is type(value)
+
+
 ALIASES = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
 
 
@@ -44,7 +68,7 @@ ALIASES = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" f
         ("a: !!python/object:os.system x", "a tag"),
         ("a: !!timestamp 2001-01-01", "a tag"),
         ("a: " + "[" * 3000 + "]" * 3000, "line 1 is nested deeper than 20"),
-        ("a: " + "9" * 400, "a value of 400 characters"),
+        ("a: " + "9" * 5000, "a value of 5000 characters"),
         ("a: 1\nb: 2\na: 3", "twice the key a"),
         ("a: [1", "not valid YAML"),
         ("a: b\n" * 30_000, "150000 characters, expected at most"),

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from tensorsim.config import ACTIVITIES, ProcessingConfig, SceneConfig, SimulationConfig
 from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
 from tensorsim.config.documents import from_document, to_document
+from tensorsim.config.limited_yaml import dump_limited_yaml
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.data.sets.outputs import OutputConfig
 from tensorsim.data.sets.variations import VariationConfig
@@ -318,7 +319,5 @@ class DatasetRecipe:
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
         """Write a file from which :meth:`from_yaml` reads the same."""
-        import yaml
-
         with complete_file(Path(path)) as scratch:
-            scratch.write_text(yaml.safe_dump(self.to_document(), sort_keys=False), encoding="utf-8")
+            scratch.write_text(dump_limited_yaml(self.to_document()), encoding="utf-8")
