@@ -42,8 +42,9 @@ def oscillator(radar: RadarConfig, level_dbc_hz: float, seed: int) -> PhaseNoise
 class FrontEnd(nn.Module):
     """From the IF that arrives to the samples that are recorded.
 
-    In the order of a receiver: interference, phase noise, thermal noise, unequal I and Q, constant offset, one channel
-    in place of two, converters. Offset and full scale of the converters are relative to the mean powers of the whole
+    In the order of a receiver: phase noise, interference, thermal noise, unequal I and Q, constant offset, one channel
+    in place of two, converters. Phase noise of the echo cancels in part, as it comes from the own oscillator; that of
+    the interference does not. Offset and full scale of the converters are relative to the mean powers of the whole
     clip. Phase noise and interference depend on the number of the pulse, so that pieces of a clip give what the whole
     gives; all antennas and all clips of a batch have the same.
 
@@ -63,14 +64,16 @@ class FrontEnd(nn.Module):
         super().__init__()
         receiver = scene.receiver
         self.noise = noise
+        self.phase_noise: PhaseNoise | None = None
+        if receiver.phase_noise_dbc_hz is not None:
+            self.phase_noise = oscillator(scene.radar, receiver.phase_noise_dbc_hz, seed)
         self.interference: nn.Module | None = None
         if scene.interference is not None:
             heard = scene.interference
             other = interfering_radar(scene.radar, heard)
-            self.interference = Interference(scene.radar, other, heard.delay_s, heard.power_ratio_db)
-        self.phase_noise: nn.Module | None = None
-        if receiver.phase_noise_dbc_hz is not None:
-            self.phase_noise = oscillator(scene.radar, receiver.phase_noise_dbc_hz, seed)
+            self.interference = Interference(
+                scene.radar, other, heard.delay_s, heard.power_ratio_db, self.phase_noise
+            )
         self.imbalance: nn.Module | None = None
         if receiver.iq_imbalance_db != 0 or receiver.iq_phase_rad != 0:
             self.imbalance = QuadratureImbalance(receiver.iq_imbalance_db, receiver.iq_phase_rad)
@@ -87,9 +90,9 @@ class FrontEnd(nn.Module):
 
     def forward(self, samples: Tensor, levels: Levels, start: int) -> tuple[Tensor, Tensor]:
         """See the class."""
-        samples = self.arriving(samples, start)
         if self.phase_noise is not None:
             samples = self.phase_noise(samples, start)
+        samples = self.arriving(samples, start)
         signal = torch.where(levels.signal > 0, levels.signal, self.noise.empty_power)
         thermal = self.noise.noise_power(levels.signal)
         drawn = torch.zeros_like(levels.signal)

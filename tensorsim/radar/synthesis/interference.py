@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
 from tensorsim.errors import TensorsimError, check_complex_map, check_size
+from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 
 
 class Interference(nn.Module):
@@ -24,6 +25,7 @@ class Interference(nn.Module):
         other: the other radar, where it stands; its PRF and sweep need not be those of ``radar``.
         delay_s: time at which its sweep number 0 begins, plus the way to the receiver.
         power_ratio_db: its transmit power over that of ``radar``.
+        phase_noise: of the oscillator of ``radar``; that of the other is as noisy and independent. None: of neither.
 
     Shapes: IF (..., M, N) complex, number of its first pulse -> IF likewise. Differentiable.
 
@@ -38,8 +40,10 @@ class Interference(nn.Module):
         other: RadarConfig,
         delay_s: float = 0.0,
         power_ratio_db: float = 0.0,
+        phase_noise: PhaseNoise | None = None,
     ) -> None:
         super().__init__()
+        self.phase_noise: PhaseNoise | None = phase_noise
         if radar.has_array or other.has_array:
             raise TensorsimError(
                 "radar, other: got several antennas, expected one transmitter and one receiver each"
@@ -89,5 +93,7 @@ class Interference(nn.Module):
             - self.other_slope * theirs.square() / 2
         )
         angle = 2 * math.pi * (turns - turns.floor())
+        if self.phase_noise is not None:
+            angle = angle + self.phase_noise.of_two_oscillators(start, angle.shape[0])
         wave = torch.polar(self.amplitude * heard.to(angle.dtype), angle)
         return intermediate + wave.to(intermediate.dtype)

@@ -54,6 +54,7 @@ class PhaseNoise(nn.Module):
     """
 
     deviation: Tensor
+    amplitude: Tensor
     delay_s: Tensor
 
     def __init__(
@@ -74,6 +75,7 @@ class PhaseNoise(nn.Module):
                 f"level_dbc_hz: got {level_dbc_hz}, expected {len(offsets_hz)} finite numbers, one per offset"
             )
         self.samples, self.seed = radar.samples_per_chirp, seed
+        self.other_seed = seed + 2**32  # those of configurations are smaller
         self.line_delay_s = radar.sample_rate_hz / radar.slope_hz_per_s / (2 * math.pi)
         spacing = radar.sample_rate_hz / self.samples
         offsets = torch.tensor(tuple(offsets_hz), dtype=torch.float64)
@@ -83,9 +85,12 @@ class PhaseNoise(nn.Module):
         variance = 10 ** (interpolated_level(frequency, offsets, levels) / 10) * spacing
         angular = 2 * math.pi * frequency
         # First and third derivative of phi, as spectra; those at 0 Hz vanish.
-        deviation = torch.stack((angular, -(angular**3) / 24)) * variance.sqrt()
+        amplitude = variance.sqrt()
+        deviation = torch.stack((angular, -(angular**3) / 24)) * amplitude
+        amplitude[0] = 0.0
         beat = torch.fft.fftfreq(self.samples, 1 / radar.sample_rate_hz, dtype=torch.float64)
         self.register_buffer("deviation", deviation, persistent=False)
+        self.register_buffer("amplitude", amplitude, persistent=False)
         self.register_buffer("delay_s", beat / radar.slope_hz_per_s, persistent=False)
 
     def forward(self, intermediate: Tensor, start: int = 0) -> Tensor:
@@ -93,19 +98,31 @@ class PhaseNoise(nn.Module):
         layout = f"(..., pulses, {self.samples} samples)"
         check_complex_map(intermediate, "IF", layout)
         check_size(intermediate, -1, self.samples, "IF", layout)
-        pulses = intermediate.shape[-2]
-        half = self.samples // 2 + 1
-        pulse = start + torch.arange(pulses, device=intermediate.device)
-        drawn = normal(self.seed, pulse, 2 * half).unflatten(-1, [2, half]) * math.sqrt(0.5)
-        spectrum = torch.complex(drawn[:, 0], drawn[:, 1]) * 1j
+        spectrum = self._drawn(self.seed, start, intermediate.shape[-2]) * 1j
         spectra = spectrum * self.deviation.double().unsqueeze(1)  # (2, M, half)
         rates = torch.fft.irfft(spectra, self.samples, norm="forward").to(torch.real(intermediate).dtype)
 
         # A pulse does not end where it began; the transform would see a jump, so a straight line is taken out first.
         end = 2 * intermediate[..., -1:] - intermediate[..., -2:-1]
         slope = (end - intermediate[..., :1]) / self.samples
-        line = slope * torch.arange(self.samples, device=pulse.device)
+        line = slope * torch.arange(self.samples, device=intermediate.device)
         beats = torch.fft.fft(intermediate - line)
         delay = self.delay_s.to(rates.dtype)
         delayed = torch.fft.ifft(beats * delay) - 1j * slope * self.line_delay_s
         return intermediate + 1j * (rates[0] * delayed + rates[1] * torch.fft.ifft(beats * delay**3))
+
+    @torch.jit.export
+    def of_two_oscillators(self, start: int, pulses: int) -> Tensor:
+        """Phase (M, N) float64, in radians, of the IF of a wave from another oscillator, as noisy and independent.
+
+        Nothing cancels: its spectrum is twice that of one oscillator.
+        """
+        spectrum = self._drawn(self.other_seed, start, pulses) * (math.sqrt(2) * self.amplitude.double())
+        return torch.fft.irfft(spectrum, self.samples, norm="forward")
+
+    def _drawn(self, seed: int, start: int, pulses: int) -> Tensor:
+        """Independent complex normal numbers (M, N // 2 + 1) of variance 1."""
+        half = self.samples // 2 + 1
+        pulse = start + torch.arange(pulses, device=self.delay_s.device)
+        drawn = normal(seed, pulse, 2 * half).unflatten(-1, [2, half]) * math.sqrt(0.5)
+        return torch.complex(drawn[:, 0], drawn[:, 1])

@@ -22,7 +22,7 @@ from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.processing.range_profile import RangeProfile
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
-from tensorsim.radar.synthesis.front_end import interfering_radar
+from tensorsim.radar.synthesis.front_end import interfering_radar, oscillator
 from tensorsim.radar.synthesis.interference import Interference
 from tests.radar.scenes import SMALL, SceneCase, swinging, tensors
 from tests.radar.test_simulator import TestRadarSimulator as SimulatorCase
@@ -163,6 +163,19 @@ def test_phase_noise_pedestal(level_dbc_hz: float) -> None:
     expected = echo * density * radar.sample_rate_hz * (WINDOW**2).sum()
     found = maps.range_time[bins].square().mean(1).numpy()
     assert 10 * np.log10(found.sum() / expected.sum()) == pytest.approx(0, abs=0.5)
+
+
+def test_phase_noise_of_interference_does_not_cancel() -> None:
+    """The echo has the noise of range correlation, the interference that of two oscillators."""
+    p, rcs = tensors(swinging(80, 3, 256.0), np.ones(3))
+    other = InterferenceConfig((1.0, 5.0, 1.0), 1.4, 0.0, 1e-6)
+    scene = SceneConfig(
+        SMALL, interference=other, receiver=ReceiverConfig(phase_noise_dbc_hz=-80.0), snr_db=None
+    )
+    noise = oscillator(SMALL, -80.0, 0)
+    heard = Interference(SMALL, interfering_radar(SMALL, other), 1e-6, 0.0, noise)
+    samples = heard(noise(EchoSynthesizer(SMALL)(p, rcs)))
+    assert_same(RadarSimulator(scene)(p, rcs).range_time, RangeProfile(SMALL)(samples).abs().T, atol=1e-5)
 
 
 def test_room_is_seen_and_leaves_a_residue() -> None:

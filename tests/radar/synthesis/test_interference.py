@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.synthesis.interference import Interference
+from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 from tests.stage import StageTester
 
 RADAR = RadarConfig(tx_m=(0.0, 0.0, 1.0), rx_m=(0.0, 0.0, 1.0))
@@ -27,7 +28,9 @@ def silence(pulses: int) -> Tensor:
 
 class TestInterference(StageTester):
     def make(self) -> nn.Module:
-        return Interference(RADAR, replace(OTHER, chirp_s=50e-6, prf_hz=7000.0))
+        return Interference(
+            RADAR, replace(OTHER, chirp_s=50e-6, prf_hz=7000.0), phase_noise=PhaseNoise(RADAR)
+        )
 
     def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
         generator = torch.Generator().manual_seed(3)
@@ -104,6 +107,19 @@ def test_an_hour_later_the_samples_of_a_pulse_are_as_exact() -> None:
     common = np.exp(1j * np.angle((expected * found.conj()).sum(1, keepdims=True)))
     assert abs(found * common - expected).max() < 2e-3 * module.amplitude
     assert abs(np.angle(common)).max() < 0.5
+
+
+def test_phase_noise_is_that_of_two_oscillators() -> None:
+    """Beside the tone of equal sweeps both add up, 2 L(f), however short the delay; pieces are those of the whole."""
+    noise = PhaseNoise(RADAR, (1e4, 1e7), (-100.0, -100.0))
+    clean = Interference(RADAR, OTHER, delay_s=10e-9)(silence(500))[1:]
+    module = Interference(RADAR, OTHER, delay_s=10e-9, phase_noise=noise)
+    heard = module(silence(500))[1:]
+    window = torch.hann_window(400, dtype=torch.float64)
+    power = torch.fft.fft((heard - clean) * window).abs().square().mean(0) / window.square().sum()
+    density = power / RADAR.sample_rate_hz / clean.abs().square().mean()
+    assert 10 * math.log10(float(density[50:350].mean())) == pytest.approx(-97.0, abs=0.1)
+    torch.testing.assert_close(module(silence(40), 100), heard[99:139])
 
 
 def test_power_and_pieces() -> None:
