@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import InterferenceConfig, RadarConfig, SceneConfig
+from tensorsim.ops import safe_sqrt
 from tensorsim.radar.synthesis.interference import Interference
 from tensorsim.radar.synthesis.noise import ReceiverNoise, energy
 from tensorsim.radar.synthesis.phase_noise import LEVELS_DBC_HZ, OFFSETS_HZ, PhaseNoise
@@ -110,7 +111,7 @@ class FrontEnd(nn.Module):
         if self.real is not None:
             samples = self.real(samples)
         if self.bits > 0:
-            full_scale = ((levels.arriving + thermal + offset) * self.headroom).sqrt()
+            full_scale = safe_sqrt((levels.arriving + thermal + offset) * self.headroom)
             samples = quantise(samples, broadcast(full_scale, samples), self.bits)
         return samples, drawn
 

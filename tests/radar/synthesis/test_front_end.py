@@ -223,6 +223,11 @@ def test_an_empty_room_with_a_converter_stays_empty() -> None:
     quiet = RadarSimulator(SceneConfig(SMALL, snr_db=None, receiver=ReceiverConfig(adc_bits=8)))
     maps = quiet(torch.zeros(50, 0, 3), torch.zeros(0))
     assert float(maps.range_time.abs().max()) == 0
+    p, _ = tensors(swinging(50, 3, 256.0), np.ones(3))
+    p.requires_grad_(True)
+    quiet(p, torch.zeros(3)).range_time.sum().backward()
+    assert p.grad is not None
+    assert float(p.grad.abs().max()) == 0
 
 
 def test_effects_need_the_engine_that_makes_samples() -> None:
