@@ -28,9 +28,10 @@ class Points(NamedTuple):
 
 
 def local_maxima(power: Tensor) -> Tensor:
-    """Cells (..., H, W) that are not below any of their eight neighbours, bool."""
+    """Cells (..., range, Doppler) that are not below any of their eight neighbours, bool; Doppler is periodic."""
     flat = flatten_batch(power, 2).unsqueeze(1)
-    return (flat >= F.max_pool2d(flat, 3, 1, 1)).reshape(power.shape)
+    around = F.pad(flat, [1, 1, 0, 0], mode="circular")
+    return (flat >= F.max_pool2d(around, 3, 1, [1, 0])).reshape(power.shape)
 
 
 def beam_sines(signals: Tensor, spacing_wavelengths: float, beams: int) -> Tensor:
