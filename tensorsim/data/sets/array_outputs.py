@@ -14,17 +14,15 @@ from tensorsim.errors import TensorsimError
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.radar.options import echo_of
 from tensorsim.radar.processing.array import align_transmitters, steering_vectors, virtual_elements
-from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.radar.processing.point_cloud import PointCloud
+from tensorsim.radar.processing.range_doppler import point_cfar
 from tensorsim.radar.processing.range_profile import RangeProfile
 from tensorsim.radar.recorder import Recorder
 from tensorsim.radar.synthesis.front_end import Levels
 from tensorsim.recognition.map_image import area_weights
 
-#: Detection of points: guard and training cells in range and Doppler, and the share of false alarms.
-_GUARD, _TRAINING, _FALSE_ALARM = (2, 2), (6, 6), 1e-5
 #: Pulses in the estimate of the powers that noise and converters refer to.
 _POWER_PULSES = 256
 
@@ -119,7 +117,7 @@ def _points(
     steps = virtual_elements(radar).diff(dim=0)
     if not torch.allclose(steps, steps[:1] * torch.tensor([1.0, 0, 0]).double(), atol=1e-6):
         raise TensorsimError("point_cloud: got other antennas, expected an even line along x")
-    cfar = CfarDetector(_GUARD, _TRAINING, _FALSE_ALARM, edges=("reflect", "circular"), looks=cubes.shape[1])
+    cfar = point_cfar(radar, frames)
     cloud = PointCloud(
         radar.range_resolution_m,
         radar.prf_hz / frames.bins * radar.doppler_wavelength_m / 2,

@@ -100,6 +100,25 @@ class RangeDopplerAngle(nn.Module):
         return torch.view_as_real(torch.matmul(cube, weights.transpose(0, 1))).square().sum(-1)
 
 
+def point_cfar(radar: RadarConfig, frames: DopplerFrames) -> CfarDetector:
+    """Cell averaging over (range, Doppler) of the mean power of all channels, with a false alarm rate of 1e-5.
+
+    Along Doppler the main lobe of a target, of the Hann window over L pulses, reaches ``2 F / L`` of F bins to each
+    side; reference cells begin beyond it. They are along Doppler alone where the radar has hardly any range, as one of
+    continuous wave.
+    """
+    lobe, most = 2 * math.ceil(frames.bins / frames.length), frames.bins // 4 - 1
+    guard, training = min(max(4, lobe), most), min(max(8, lobe), most)
+    has_range = radar.samples_per_chirp // 2 > 10
+    return CfarDetector(
+        guard=(2 if has_range else 0, guard),
+        training=(8, training) if has_range else (0, max(16, training)),
+        false_alarm=1e-5,
+        edges=("reflect", "circular"),
+        looks=len(radar.tx_positions_m) * len(radar.rx_positions_m),
+    )
+
+
 class PointDetector(nn.Module):
     """Profiles of an antenna array to detected points: range-Doppler cube, CFAR over range and Doppler, angles.
 
@@ -109,10 +128,8 @@ class PointDetector(nn.Module):
         window_s, overlap: frames, see :class:`RangeDopplerCube`.
         points: the most points of a frame.
         nearest_m: range of the first bin of the profiles.
-        cfar: detector over (range, Doppler) of the mean power of the V channels; None is cell averaging of V looks
-            with a false alarm rate of 1e-5, along Doppler alone where the radar has hardly any range, as one of
-            continuous wave. Side lobes that stand out of the noise are detected too: profiles of strong echoes want
-            ``range_window="hann"``.
+        cfar: detector over (range, Doppler) of the mean power of the V channels; None is :func:`point_cfar`. Side
+            lobes that stand out of the noise are detected too: profiles of strong echoes want ``range_window="hann"``.
 
     Shapes: profiles (..., V, M, R) complex, after a moving target indicator where what stands still is not wanted ->
     :class:`Points` (..., K, points). Differentiable as :class:`PointCloud`.
@@ -150,13 +167,7 @@ class PointDetector(nn.Module):
                 "expected an even row along x, from left to right"
             )
         step_m = float(spacing[0, 0]) if len(elements) > 1 else radar.doppler_wavelength_m / 2
-        if cfar is None:
-            ranges = radar.samples_per_chirp // 2 > 10
-            guard, training = ((2, 4), (8, 8)) if ranges else ((0, 4), (0, 16))
-            cfar = CfarDetector(
-                guard, training, 1e-5, edges=("reflect", "circular"), looks=self.cube.channels
-            )
-        self.cfar = cfar
+        self.cfar = point_cfar(radar, self.cube) if cfar is None else cfar
         speed_step = self.cube.prf_hz / self.cube.bins * radar.doppler_wavelength_m / 2
         self.cloud = PointCloud(
             radar.range_resolution_m, speed_step, points, step_m / radar.doppler_wavelength_m

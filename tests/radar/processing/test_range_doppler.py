@@ -188,6 +188,18 @@ def test_the_detector_knows_that_cells_are_means_over_antennas() -> None:
     assert cfar.factor == cell_averaging_factor(1e-5, cfar.cells, 8)
 
 
+def test_a_target_does_not_mask_itself() -> None:
+    """Zero padding from 13 pulses to 256 makes it 80 bins wide; none of them is a reference cell."""
+    radar = RadarConfig.through_wall()
+    p = moving(0.0, 1.5, 40, radar)
+    profiles = RadarSimulator(radar, snr_db=None).profiles(p, torch.ones(1))
+    detector = PointDetector(radar)
+    power = detector.cube(profiles[None]).abs().square().mean(-3)
+    above = (power / detector.cfar.threshold(power)).flatten(-2)
+    at_peak = above.gather(-1, power.flatten(-2).argmax(-1, keepdim=True))
+    assert float(at_peak.min()) > 50.0
+
+
 def test_points_of_a_radar_without_range() -> None:
     """Continuous wave: one bin, speeds alone."""
     radar = PRESETS["cw-24ghz"].radar
