@@ -40,7 +40,7 @@ RANGES: dict[str, Range] = {
     "pulse repetition frequency": Range(1.0, 1e6, "Hz"),
     "sample rate": Range(1e3, 1e10, "Hz"),
     "samples per chirp": Range(2, 65_536, "samples"),
-    "antennas": Range(1, 64, "antennas"),
+    "antennas": Range(1, 256, "antennas"),
     "gain": Range(-100.0, 100.0, "dB"),
     "bits of a converter": Range(1, 24, "bits"),
     "ratio of powers": Range(-200.0, 300.0, "dB"),

@@ -54,6 +54,14 @@ def require_vector(owner: str, **values: Vector) -> None:
             )
 
 
+def require_position(owner: str, **values: Vector) -> None:
+    """Refuse values that are not three plausible coordinates."""
+    require_vector(owner, **values)
+    for name, value in values.items():
+        for coordinate in value:
+            check_range(coordinate, "position", f"{owner}.{name}")
+
+
 def require_choices(config: Any, **choices: Any) -> None:
     """Refuse fields of a configuration that are not one of the values of their ``Literal`` type."""
     for name, literal in choices.items():

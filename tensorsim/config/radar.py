@@ -2,7 +2,14 @@
 
 from dataclasses import dataclass, replace
 
-from tensorsim.config.checks import Vector, as_positions, is_finite, listed, require_positive, require_vector
+from tensorsim.config.checks import (
+    Vector,
+    as_positions,
+    is_finite,
+    listed,
+    require_position,
+    require_positive,
+)
 from tensorsim.errors import TensorsimError
 from tensorsim.limits import check_range
 
@@ -21,8 +28,8 @@ class RadarConfig:
     Transmitters fire in turn (time division): number k at ``k / (K PRF)`` after the start of a pulse interval.
 
     Raises:
-        TensorsimError: a frequency or duration that is not positive, a position without three finite numbers,
-            or K chirps that do not fit a pulse interval.
+        TensorsimError: a frequency or duration that is not positive, a position without three finite numbers, values
+            beyond the plausible (:mod:`tensorsim.limits`), or K chirps that do not fit a pulse interval.
     """
 
     carrier_hz: float = 77e9
@@ -55,21 +62,18 @@ class RadarConfig:
         for name in ("tx_m", "rx_m"):
             object.__setattr__(self, name, as_positions(getattr(self, name)))
         for tx in self.tx_positions_m:
-            require_vector("RadarConfig", tx_m=tx)
+            require_position("RadarConfig", tx_m=tx)
         for rx in self.rx_positions_m:
-            require_vector("RadarConfig", rx_m=rx)
+            require_position("RadarConfig", rx_m=rx)
         for name in ("antenna_gain_dbi", "isolation_db"):
             if not is_finite(getattr(self, name)):
                 raise TensorsimError(
                     f"RadarConfig.{name}: got {getattr(self, name)!r}, expected a finite number of dB"
                 )
             check_range(getattr(self, name), "gain", f"RadarConfig.{name}")
-        if self.samples_per_chirp < 2:
-            raise TensorsimError(
-                f"RadarConfig: {self.sample_rate_hz} Hz over a chirp of {self.chirp_s} s gives "
-                f"{self.samples_per_chirp} samples, expected at least 2"
-            )
+        check_range(self.samples_per_chirp, "samples per chirp", "RadarConfig: sample_rate_hz times chirp_s")
         turns = len(self.tx_positions_m)
+        check_range(turns * len(self.rx_positions_m), "antennas", "RadarConfig: tx_m times rx_m")
         if self.chirp_s * self.prf_hz * turns > 1.0:
             chirps = (
                 f"a chirp of {self.chirp_s} s does"

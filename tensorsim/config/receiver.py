@@ -8,8 +8,8 @@ from tensorsim.config.checks import (
     as_positions,
     is_finite,
     require_counts,
+    require_position,
     require_positive,
-    require_vector,
 )
 from tensorsim.errors import TensorsimError
 from tensorsim.limits import check_range
@@ -134,7 +134,7 @@ class InterferenceConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position_m", as_positions(self.position_m))
-        require_vector("InterferenceConfig", position_m=self.position_m)
+        require_position("InterferenceConfig", position_m=self.position_m)
         require_positive("InterferenceConfig", chirp_ratio=self.chirp_ratio)
         for name in ("power_ratio_db", "delay_s"):
             if not is_finite(getattr(self, name)):

@@ -2,7 +2,14 @@
 
 from dataclasses import dataclass
 
-from tensorsim.config.checks import Vector, as_positions, is_finite, require_dielectric, require_vector
+from tensorsim.config.checks import (
+    Vector,
+    as_positions,
+    is_finite,
+    require_dielectric,
+    require_position,
+    require_vector,
+)
 from tensorsim.errors import TensorsimError
 from tensorsim.limits import check_range
 
@@ -26,14 +33,14 @@ class WallConfig:
     def __post_init__(self) -> None:
         for name in ("center_m", "size_m"):
             object.__setattr__(self, name, as_positions(getattr(self, name)))
-        require_vector("WallConfig", center_m=self.center_m, size_m=self.size_m)
+        require_position("WallConfig", center_m=self.center_m)
+        require_vector("WallConfig", size_m=self.size_m)
         if self.size_m[0] <= 0 or self.size_m[1] < 0 or self.size_m[2] <= 0:
             raise TensorsimError(
                 f"WallConfig.size_m: got {self.size_m}, expected positive width and height and thickness >= 0"
             )
-        for name, quantity in (("center_m", "position"), ("size_m", "length")):
-            for value in getattr(self, name):
-                check_range(value, quantity, f"WallConfig.{name}")
+        for value in self.size_m:
+            check_range(value, "length", "WallConfig.size_m")
         require_dielectric("WallConfig", self.relative_permittivity, self.loss_tangent)
 
     @property

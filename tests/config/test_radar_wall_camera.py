@@ -57,6 +57,19 @@ def test_names() -> None:
         (lambda: ts.RadarConfig(chirp_s=math.nan), "chirp_s: got nan"),
         (lambda: ts.RadarConfig(prf_hz=math.inf), "prf_hz"),
         (lambda: ts.RadarConfig(sample_rate_hz=1e3), "samples"),
+        (
+            lambda: ts.RadarConfig(sample_rate_hz=1e10),
+            "chirp_s: got 400000, expected samples per chirp from 2 to 65536",
+        ),
+        (
+            lambda: ts.RadarConfig(rx_m=[(k / 100, 0.0, 1.0) for k in range(300)]),  # type: ignore[arg-type]
+            "tx_m times rx_m: got 300, expected antennas from 1 to 256",
+        ),
+        (
+            lambda: ts.RadarConfig(tx_m=(1e9, 0.0, 0.0)),
+            r"tx_m: got 1e\+09, expected position from -1000 to 1000 m",
+        ),
+        (lambda: ts.InterferenceConfig(position_m=(0.0, 1e9, 0.0)), "position_m: got .* expected position"),
         (lambda: ts.RadarConfig(prf_hz=1e6), "does not fit the pulse interval"),
         (lambda: ts.RadarConfig(tx_m=(0.0, 0.0)), "tx_m"),  # type: ignore[arg-type]
         (lambda: ts.RadarConfig(rx_m=(0.0, math.nan, 0.0)), "rx_m"),
