@@ -28,7 +28,7 @@ class SceneConfig:
         multipath: propagation paths by way of the wall; None: on where there is a wall.
         direct: the path straight to the scatterer and back.
         leakage: direct signal from transmitter to receiver (panel: isolation).
-        wall_echo: static specular reflection of the wall.
+        wall_echo: static specular reflection of the wall, if there is one.
         wall_paths: bounces inside the wall, complete to first order (``"series"``) or as in the paper.
         wall_attenuation: False lets echoes through the wall keep their power; their delay stays.
         incidence: ``"normal"``, ``"oblique"`` (refraction, Fresnel) or ``"airy"`` (closed slab per frequency).

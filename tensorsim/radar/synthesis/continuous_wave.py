@@ -32,7 +32,8 @@ class ContinuousWaveEcho(nn.Module):
     """What a continuous-wave radar receives of a scene, mixed to baseband, free of noise.
 
     Equals the first sample of each pulse of :class:`~tensorsim.radar.EchoSynthesizer` with the same carrier and
-    antennas in free space. Instants are those of the positions and need not be evenly spaced.
+    antennas in free space, but for the residual video phase of a sweep, ``mu tau^2 / 2`` cycles. Instants are those of
+    the positions and need not be evenly spaced.
 
     Args:
         carrier_hz: transmitted frequency.
