@@ -78,7 +78,7 @@ def _convert(where: str, value: Any, hint: Any) -> Any:
         return from_document(where, typing.cast(type, hint), value)
     if origin is tuple:
         if not isinstance(value, list):
-            raise TensorsimError(f"{where}: got {value!r}, expected a list of numbers")
+            raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
         # The configuration checks the length.
         return tuple(_convert(where, item, arguments[0]) for item in value)
     if origin is typing.Literal:
@@ -86,17 +86,11 @@ def _convert(where: str, value: Any, hint: Any) -> Any:
     if hint in (bool, str):
         if isinstance(value, hint):
             return value
-        raise TensorsimError(
-            f"{where}: got {value!r}, expected {'true or false' if hint is bool else 'text'}"
-        )
+        raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
     number = _number(value)
-    if number is None:
-        raise TensorsimError(f"{where}: got {value!r}, expected a number")
-    if hint is int:
-        if not number.is_integer():
-            raise TensorsimError(f"{where}: got {value!r}, expected a whole number")
-        return int(number)
-    return number
+    if number is None or (hint is int and not number.is_integer()):
+        raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
+    return int(number) if hint is int else number
 
 
 def _convert_union(where: str, value: Any, kinds: tuple[Any, ...]) -> Any:
@@ -112,9 +106,18 @@ def _convert_union(where: str, value: Any, kinds: tuple[Any, ...]) -> Any:
         and (typing.get_origin((*typing.get_args(kind), None)[0]) is tuple) == nested
     ]
     if not fitting:
-        lists = all(typing.get_origin(kind) is tuple for kind in kinds)
-        raise TensorsimError(f"{where}: got {value!r}, expected a {'list of numbers' if lists else 'number'}")
+        expected = dict.fromkeys(_kind(kind) for kind in kinds if kind is not type(None))
+        raise TensorsimError(f"{where}: got {value!r}, expected {' or '.join(expected)}")
     return _convert(where, value, fitting[0])
+
+
+def _kind(hint: Any) -> str:
+    """What a document has for this type, in words."""
+    if typing.get_origin(hint) is tuple:
+        return f"a list of {'names' if typing.get_args(hint)[0] is str else 'numbers'}"
+    if dataclasses.is_dataclass(hint):
+        return "keys with values"
+    return {bool: "true or false", str: "text", int: "a whole number"}.get(hint, "a number")
 
 
 def _number(value: Any) -> float | None:
