@@ -98,7 +98,7 @@ class RadarSimulator(nn.Module):
         min_pulses: the shortest clip that has a Doppler frame.
 
     Raises:
-        TensorsimError: see the stages; a clip shorter than ``min_pulses``; motion that the PRF cannot follow
+        TensorsimError: see the stages; maps of a clip shorter than ``min_pulses``; motion that the PRF cannot follow
             (eager only, like the warnings of targets beyond the range axis or a fixed gate; see
             :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
     """
@@ -167,6 +167,7 @@ class RadarSimulator(nn.Module):
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
         pulses = positions.shape[1]
+        self._check_pulses(pulses)
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         noise = torch.zeros_like(levels.signal)
         pending = self._nothing_pending(positions)
@@ -202,6 +203,7 @@ class RadarSimulator(nn.Module):
         """Only the Doppler-time map (..., F, K) of :meth:`forward`; with one seed the same."""
         lead = list(positions.shape)[:-3]
         positions, rcs = self._scene(positions, rcs)
+        self._check_pulses(positions.shape[1])
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         pending = self._nothing_pending(positions)
         parts: list[Tensor] = []
@@ -239,7 +241,6 @@ class RadarSimulator(nn.Module):
     def _scene(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (B, M, S, 3) and RCS (B, M, S) of a scene, checked."""
         rcs = check_scene(positions, rcs)
-        self._check_pulses(positions.shape[-3])
         if not torch.jit.is_scripting() and not is_exporting():
             check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m, self.one_channel)
         return flatten_batch(positions, 3), flatten_batch(rcs, 2)

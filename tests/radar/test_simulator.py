@@ -230,6 +230,20 @@ def test_every_moving_target_indicator_by_name(method):
     assert_same(RadarSimulator(SMALL, snr_db=None, mti=method)(p, rcs), ready(p, rcs))
 
 
+@pytest.mark.parametrize("transmitters", [1, 2])
+def test_profiles_need_no_doppler_window(transmitters):
+    radar = replace(SMALL, tx_m=tuple((0.1 * k, 0.0, 1.5) for k in range(transmitters)))
+    p, rcs = tensors(swinging(60, 3, 256.0), np.ones(3))
+    simulator = RadarSimulator(radar, snr_db=None)
+    expected = simulator.profiles(p, rcs)
+    for pulses in (1, 5):
+        found = simulator.profiles(p[:pulses], rcs)
+        assert found.shape == (*expected.shape[:-2], pulses, expected.shape[-1])
+        assert_same(found[..., : pulses - 1, :], expected[..., : pulses - 1, :], atol=1e-6)
+    with pytest.raises(TensorsimError, match="got 5 pulses, expected at least 27"):
+        simulator.doppler_time(p[:5], rcs)
+
+
 def test_ready_stages_take_the_place_of_their_settings():
     echo = EchoSynthesizer(SMALL, leakage=True)
     doppler, ridges = DopplerTimeMap(SMALL, overlap=0.5, integration="paper"), RidgeExtractor(1)
