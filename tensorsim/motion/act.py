@@ -42,7 +42,7 @@ class Act(NamedTuple):
         progress: (B, T, 2) towards that one, as a share of the way; None for feet that do not walk.
         lift: (B, T, 2) body heights by which a foot on its way to another place is raised at the floor, less
             higher up.
-        level: (B, T) 1 where feet that are held stand on the floor, 0 where the body lies.
+        level: (B, T, 2) 1 where a foot that is held stands on the floor, 0 where the body lies or the foot kicks.
     """
 
     pose: BodyPose
@@ -133,8 +133,52 @@ def on_the_spot(time: Tensor, pose: BodyPose) -> Act:
         other=torch.zeros_like(pair, dtype=torch.int64),
         progress=None,
         lift=0 * pair,
-        level=zero + 1,
+        level=pair,
     )
+
+
+def upright_for(act: Act, share: Tensor) -> Act:
+    """A movement whose feet carry only as far as ``share`` (B, T) is 1: the rest of the time the body lies."""
+    feet = share[..., None]
+    return act._replace(hold=act.hold * feet, lift=act.lift * feet, level=act.level * feet)
+
+
+def tip_over(pose: BodyPose, tilt: Tensor, way: Tensor) -> BodyPose:
+    """A pose tilted as a whole about its feet, without a turn about its own long axis.
+
+    Args:
+        pose: of a body that is upright and faces +y.
+        tilt: (B, T) degrees from the vertical.
+        way: direction of the tilt in radians, broadcastable to it: 0 ahead, a quarter turn to the right.
+    """
+    tilt = torch.deg2rad(tilt)
+    right, ahead = torch.sin(way), torch.cos(way)
+    # Rodrigues' rotation about the horizontal axis at right angles to the way, as heading, roll and lean.
+    back = 1 - torch.cos(tilt)
+    return pose._replace(
+        heading=torch.atan2(-back * right * ahead, 1 - back * right.square()),
+        roll=torch.asin(right * torch.sin(tilt)),
+        lean=torch.atan2(ahead * torch.sin(tilt), torch.cos(tilt)),
+    )
+
+
+def arms_on_floor(
+    way: Tensor, spread: Tensor, overhead: Tensor | bool = False
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Flexion and abduction in degrees of arms in the plane of the floor, of a body tipped over by a right angle.
+
+    Args:
+        way: as of :func:`tip_over`.
+        spread: degrees between an arm and the long axis of the body.
+        overhead: bool, whether the arms are stretched out over the head, and not beside the body.
+    """
+    spread = torch.deg2rad(spread) * torch.where(torch.cos(way) < 0, -1.0, 1.0)
+    across = torch.atan2(torch.sin(way) * torch.sin(spread), torch.cos(spread))
+    flexion = [
+        torch.rad2deg(torch.where(torch.as_tensor(overhead), math.pi - x, x)) for x in (-across, across)
+    ]
+    abduction = torch.rad2deg(torch.asin(torch.cos(way) * torch.sin(spread)))
+    return (flexion[0], flexion[1]), (abduction, abduction)
 
 
 def _reach_ahead(who: People, gait: Gait) -> Tensor:

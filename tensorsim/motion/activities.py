@@ -108,7 +108,7 @@ def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) 
     for side, ankle in ((0, RIGHT_LEG + 2), (1, LEFT_LEG + 2)):
         then = script(act.moment[..., side], who)
         spots = _carried(then, who)[..., ankle, :]
-        ground = torch.lerp(spots[..., 2], floor[:, :1].expand_as(then.level), then.level)
+        ground = torch.lerp(spots[..., 2], floor[:, :1].expand_as(spots[..., 2]), then.level[..., side])
         spots = torch.cat([spots[..., :2], ground[..., None]], dim=-1)
         held = _of_step(spots, act.step[..., side])
         swung = joints[..., ankle, :]
@@ -117,7 +117,7 @@ def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) 
         if act.progress is not None:
             other = _of_step(spots, act.other[..., side])
             way = torch.lerp(held, other, act.progress[..., side, None])[..., :2]
-            place = torch.lerp(place, way, act.level[..., None])
+            place = torch.lerp(place, way, act.level[..., side, None])
             steps_out = 1 - torch.exp(-(((other - held)[..., :2] / 0.1).square().sum(dim=-1)))
             near_floor = torch.exp((floor - swung[..., 2]) / (0.04 * height))
             lift = act.lift[..., side] * height * steps_out * near_floor

@@ -8,129 +8,150 @@ import math
 import torch
 from torch import Tensor
 
-from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, share_of, with_gait
+from tensorsim.motion.act import (
+    REST_HIP,
+    REST_KNEE,
+    Act,
+    Vary,
+    arms_on_floor,
+    make_pose,
+    on_the_spot,
+    share_of,
+    tip_over,
+    upright_for,
+    with_gait,
+)
 from tensorsim.motion.people import People
-from tensorsim.motion.scripts import toppling
-from tensorsim.motion.timing import bell, minimum_jerk, segment, travel
+from tensorsim.motion.scripts import fall_tempo, toppling
+from tensorsim.motion.timing import GRAVITY, bell, landing, minimum_jerk, segment, travel
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
     """Gives way and topples like a rod about the feet in any direction; stays down.
 
-    Some sink first, with the knees far bent, and some fall stiff; some catch themselves with their arms.
+    Some sink first, with the knees far bent, and some fall stiff; some stretch their arms out, and some keep them at
+    their sides.
     """
     v = Vary(who)
-    tempo = who.tempo[:, None]
-    down = toppling(tempo * time, who.height_m) / 88
+    tempo = fall_tempo(who)
+    tilt = toppling(tempo * time, who.height_m)
+    down = tilt / 88
     way = 2 * math.pi * share_of(who, 7.0)
     sinking = share_of(who, 13.0)
     give = bell(time, 0.0 * v(1.0), v(1.3) / tempo)
-    arms = v(100.0) * share_of(who, 29.0)
-    bent = 100 * sinking * give + v(30.0) * down
-    hip = REST_HIP * (1 - down) + 0.55 * bent
+    overhead = (share_of(who, 29.0) < 0.6) & (torch.cos(way) > 0)
+    flexion, abduction = arms_on_floor(way, v(30.0), overhead)
+    # Who lies on the back has the knees up and the arms folded.
+    supine = 0.5 * (1 - torch.cos(way))
+    fold = v(50.0) * supine.square()
+    bent = v(35.0) * supine * down
+    knee = REST_KNEE * (1 - down) + 100 * sinking * give + 1.8 * bent
+    hip = REST_HIP * (1 - down) + 55 * sinking * give + bent
     pose = make_pose(
         time,
         who,
-        lean=88 * torch.cos(way) * down,
         pitch=v(25.0) * sinking * give,
-        nod=-20 * torch.cos(way) * down,
+        nod=-30 * torch.cos(way) * down,
         hip=(hip, v(0.9) * hip),
-        knee=(REST_KNEE * (1 - down) + bent, REST_KNEE * (1 - down) + v(0.9) * bent),
-        flexion=(2 + arms * down, 2 + v(0.8) * arms * down),
-        abduction=(8 + v(30.0) * down, 8 + v(25.0) * down),
-        elbow=(12 + v(40.0) * down, 12 + v(40.0) * down),
+        knee=(knee, v(0.9) * knee),
+        flexion=(2 + (flexion[0] - 2) * down, 2 + (flexion[1] - 2) * down),
+        abduction=(8 + (abduction[0] - 8) * down, 8 + (abduction[1] - 8) * down),
+        elbow=(12 + (fold - 12) * down, 12 + (0.8 * fold - 12) * down),
     )
-    pose = pose._replace(roll=pose.roll + math.radians(88.0) * torch.sin(way) * down)
-    upright = 1 - segment(time, 0.0 * v(1.0) + 0.3, 0.9 / tempo)
-    act = on_the_spot(time, pose)
-    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+    act = on_the_spot(time, tip_over(pose, tilt, way))
+    return upright_for(act, 1 - segment(time, 0.0 * tempo + 0.3, 0.9 / tempo))
 
 
 def fall_on_knees(time: Tensor, who: People) -> Act:
     """Drops onto the knees, then forward onto the hands or the chest; stays down."""
     v = Vary(who)
-    tempo = who.tempo[:, None]
+    tempo = fall_tempo(who)
     drop, wait, over = v(0.55) / tempo, v(0.25), v(0.7) / tempo
-    kneel = ((time / drop).clamp(0.0, 1.0)) ** 2
-    prone = minimum_jerk(((time - drop - wait) / over).clamp(0.0, 1.0))
-    far = 0.55 + 0.45 * (share_of(who, 13.0) > 0.3)
-    arms = 2 + v(25.0) * kneel + v(110.0) * prone
+    kneel = landing(time / drop)
+    prone = minimum_jerk(((time - 1.2 * drop - wait) / over).clamp(0.0, 1.0))
+    # As who crawls, or flat.
+    on_hands = share_of(who, 13.0) < 0.3
+    lean, bent, knees, arms, elbows = (
+        torch.where(on_hands, one, other)
+        for one, other in ((75.0, 88.0), (75.0, 3.0), (90.0, 6.0), (70.0, 168.0), (30.0, 10.0))
+    )
+    hip = REST_HIP + v(12.0) * kneel
+    knee = REST_KNEE + (v(100.0) - REST_KNEE) * kneel
+    arm, elbow = 2 + v(25.0) * kneel, 12 + v(30.0) * kneel
+    arm, elbow = arm + (arms - arm) * prone, elbow + (elbows - elbow) * prone
+    spread = 8 + v(20.0) * prone * torch.where(on_hands, 0.0, 1.0)
     pose = make_pose(
         time,
         who,
-        lean=88 * far * prone,
+        lean=lean * prone,
         pitch=v(20.0) * kneel * (1 - prone),
         nod=-30 * prone,
-        hip=(REST_HIP + v(10.0) * kneel * (1 - prone), REST_HIP + v(14.0) * kneel * (1 - prone)),
-        knee=(
-            REST_KNEE + (v(100.0) - REST_KNEE) * kneel * (1 - 0.8 * prone),
-            REST_KNEE + (v(100.0) - REST_KNEE) * kneel * (1 - 0.8 * prone),
-        ),
-        flexion=(arms, arms),
-        elbow=(12 + v(30.0) * kneel, 12 + v(30.0) * kneel),
+        hip=(hip + (bent - hip) * prone, v(1.1) * hip + (bent - v(1.1) * hip) * prone),
+        knee=(knee + (knees - knee) * prone, knee + (knees - knee) * prone),
+        flexion=(arm, arm),
+        abduction=(spread, spread),
+        elbow=(elbow, elbow),
     )
-    act = on_the_spot(time, pose)
-    upright = 1 - segment(time, 0.0 * drop, drop)
-    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+    return upright_for(on_the_spot(time, pose), 1 - segment(time, 0.0 * drop, drop))
 
 
 def fall_onto_seat(time: Tensor, who: People) -> Act:
-    """The knees give way, the person lands on the seat and rolls onto the back or a side; stays down.
+    """The knees give way, the person lands on the seat and rolls onto the back, some to a side; stays down.
 
     So people fall who know the mat behind them.
     """
     v = Vary(who)
-    tempo = who.tempo[:, None]
+    tempo = fall_tempo(who)
     drop, over = v(0.75) / tempo, v(0.6) / tempo
-    seated = ((time / drop).clamp(0.0, 1.0)) ** 2
+    seated = landing(time / drop)
     lying = minimum_jerk(((time - 0.9 * drop) / over).clamp(0.0, 1.0))
-    aside = 2 * share_of(who, 7.0) - 1
-    hip = REST_HIP + (v(100.0) - REST_HIP) * seated - v(60.0) * lying
-    knee = REST_KNEE + (v(95.0) - REST_KNEE) * seated - v(45.0) * lying
-    back, spread = v(30.0) * seated * (1 - lying), v(20.0) * seated + v(40.0) * lying
+    way = math.pi + math.radians(60.0) * (2 * share_of(who, 7.0) - 1) ** 3 * lying
+    flexion, abduction = arms_on_floor(way, v(40.0))
+    raised = v(25.0)
+    hip = torch.lerp(REST_HIP + (v(100.0) - REST_HIP) * seated, raised.expand_as(seated), lying)
+    knee = torch.lerp(REST_KNEE + (v(95.0) - REST_KNEE) * seated, 1.8 * raised.expand_as(seated), lying)
+    back, spread = v(30.0) * seated, 8 + v(20.0) * seated
+    fold = 12 + v(30.0) * seated
     pose = make_pose(
         time,
         who,
-        lean=-(28 * seated + 60 * lying) * (1 - 0.3 * aside.square()),
         pitch=v(30.0) * seated * (1 - lying),
         nod=v(15.0) * seated,
         hip=(hip, v(0.95) * hip),
         knee=(knee, v(0.95) * knee),
-        flexion=(2 - back, 2 - v(0.9) * back),
-        abduction=(8 + spread, 8 + v(0.8) * spread),
-        elbow=(12 + v(30.0) * seated, 12 + v(30.0) * seated),
+        flexion=(torch.lerp(2 - back, flexion[0], lying), torch.lerp(2 - v(0.9) * back, flexion[1], lying)),
+        abduction=(torch.lerp(spread, abduction[0], lying), torch.lerp(spread, abduction[1], lying)),
+        elbow=(fold, fold),
     )
-    pose = pose._replace(roll=pose.roll + math.radians(70.0) * aside**3 * lying)
-    upright = 1 - segment(time, 0.3 * drop, drop)
-    act = on_the_spot(time, pose)
-    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+    act = on_the_spot(time, tip_over(pose, 28 * seated + 60 * lying, way))
+    return upright_for(act, 1 - segment(time, 0.3 * drop, drop))
 
 
 def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
     """Walks up, loses hold at time 0 and falls forward or to a side; stays down."""
     v = Vary(who)
-    tempo = who.tempo[:, None]
-    down = toppling(tempo * time, who.height_m) / 88
+    tempo = fall_tempo(who)
+    tilt = toppling(tempo * time, who.height_m)
+    down = tilt / 88
     way = math.pi * (share_of(who, 7.0) - 0.5)
     give = bell(time, 0.0 * v(1.0), v(1.2) / tempo)
     bent = v(60.0) * share_of(who, 13.0) * give
-    rest = 1 - 0.4 * down
-    arms = 2 + v(110.0) * minimum_jerk(down)
+    rest = 1 - 0.8 * down
+    reach = minimum_jerk(down)
+    flexion, abduction = arms_on_floor(way, v(20.0), overhead=True)
     base = make_pose(
         time,
         who,
-        lean=88 * torch.cos(way) * down,
-        nod=-30 * down,
+        nod=-30 * torch.cos(way) * down,
         hip=(rest * REST_HIP + 0.6 * bent, rest * REST_HIP + 0.5 * bent),
         knee=(rest * REST_KNEE + bent, rest * REST_KNEE + 0.9 * bent),
-        flexion=(arms, arms),
+        flexion=(2 + (flexion[0] - 2) * reach, 2 + (flexion[1] - 2) * reach),
+        abduction=(8 + (abduction[0] - 8) * reach, 8 + (abduction[1] - 8) * reach),
     )
-    base = base._replace(roll=base.roll + math.radians(88.0) * torch.sin(way) * down)
     pace = 1 - segment(time, -0.45 + 0.0 * tempo, 0.25 + 0.0 * tempo)
     path = who.speed_m_s[:, None] * (time - travel(time, -0.45 + 0.0 * tempo, 0.25 + 0.0 * tempo))
-    act = with_gait(time, who, base, pace, path)
-    upright = 1 - segment(time, 0.4 / tempo, 0.9 / tempo)
-    return act._replace(hold=act.hold * upright[..., None], lift=act.lift * upright[..., None], level=upright)
+    act = with_gait(time, who, tip_over(base, tilt, way), pace, path)
+    return upright_for(act, 1 - segment(time, 0.4 / tempo, 0.9 / tempo))
 
 
 def walk_and_slip(time: Tensor, who: People) -> Act:
@@ -139,37 +160,40 @@ def walk_and_slip(time: Tensor, who: People) -> Act:
     The arms are flung up; whoever falls keeps a part of the speed of the walk for a moment.
     """
     v = Vary(who)
-    tempo = who.tempo[:, None]
-    drop, over = v(0.55) / tempo, v(0.5) / tempo
-    seated = ((time / drop).clamp(0.0, 1.0)) ** 2
-    lying = minimum_jerk(((time - 0.8 * drop) / over).clamp(0.0, 1.0))
+    tempo = fall_tempo(who)
+    free_fall = (2 * 0.45 * who.height_m[:, None] / GRAVITY).sqrt()
+    drop, over = torch.maximum(v(0.6) / tempo, 1.35 * free_fall), v(0.5) / tempo
+    seated = landing(time / drop)
+    lying = minimum_jerk(((time - drop) / over).clamp(0.0, 1.0))
     flung = bell(time, 0.0 * v(1.0), v(1.6) / tempo)
     one, other = v(65.0) * flung, v(40.0) * flung
     rest = 1 - seated
     bent = v(30.0) * lying * share_of(who, 13.0)
+    way = math.pi + math.radians(50.0) * (2 * share_of(who, 7.0) - 1) ** 3 * lying
+    flexion, abduction = arms_on_floor(way, v(35.0))
+    spread, fold = 8 + v(40.0) * flung, 12 + v(30.0) * flung
     base = make_pose(
         time,
         who,
-        lean=-(45 * seated + 43 * lying),
         pitch=v(25.0) * flung,
         nod=v(20.0) * seated,
         hip=(REST_HIP * rest + one + 0.6 * bent, REST_HIP * rest + other + 0.5 * bent),
         knee=(REST_KNEE * rest + 0.4 * one + bent, REST_KNEE * rest + 0.5 * other + 0.9 * bent),
-        flexion=(2 + v(100.0) * flung, 2 + v(90.0) * flung),
-        abduction=(8 + v(40.0) * flung + v(30.0) * lying, 8 + v(40.0) * flung + v(25.0) * lying),
-        elbow=(12 + v(30.0) * flung, 12 + v(30.0) * flung),
+        flexion=(
+            2 + (flexion[0] - 2) * lying + v(100.0) * flung,
+            2 + (flexion[1] - 2) * lying + v(90.0) * flung,
+        ),
+        abduction=(torch.lerp(spread, abduction[0], lying), torch.lerp(spread, abduction[1], lying)),
+        elbow=(fold, fold),
     )
-    base = base._replace(roll=base.roll + math.radians(50.0) * (2 * share_of(who, 7.0) - 1) ** 3 * lying)
     start = -0.25 + 0.0 * tempo
     pace = 1 - segment(time, start, 0.3 + 0.0 * tempo)
     path = who.speed_m_s[:, None] * (time - travel(time, start, 0.7 + 0.0 * tempo))
-    act = with_gait(time, who, base, pace, path)
+    act = with_gait(time, who, tip_over(base, 45 * seated + 43 * lying, way), pace, path)
     # The hips come down about where they were: the feet, about which the body leans, slide ahead.
     slide = (0.35 + 0.25 * share_of(who, 29.0)) * who.height_m[:, None] * seated
-    offset = act.offset + torch.nn.functional.pad(slide[..., None], (1, 1))
-    upright = 1 - segment(time, 0.0 * tempo, 0.25 + 0.0 * tempo)
-    hold, lift = act.hold * upright[..., None], act.lift * upright[..., None]
-    return act._replace(offset=offset, hold=hold, lift=lift, level=upright)
+    act = act._replace(offset=act.offset + torch.nn.functional.pad(slide[..., None], (1, 1)))
+    return upright_for(act, 1 - segment(time, 0.0 * tempo, 0.25 + 0.0 * tempo))
 
 
 def walk_and_stop(time: Tensor, who: People) -> Act:
@@ -227,4 +251,4 @@ def kick_ball(time: Tensor, who: People) -> Act:
     free = torch.stack([1 - aloft, torch.ones_like(aloft)], dim=-1)
     # The standing leg carries the body, not the one that kicks.
     support = torch.stack([0 * time, 0 * time + 1], dim=-1)
-    return act._replace(hold=act.hold * free, lift=act.lift * free, support=support, level=1 - aloft)
+    return act._replace(hold=act.hold * free, lift=act.lift * free, support=support, level=free)

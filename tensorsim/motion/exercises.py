@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.proportions import THIGH
-from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot
+from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, upright_for
 from tensorsim.motion.people import People
-from tensorsim.motion.scripts import over_the_knees, toppling
-from tensorsim.motion.timing import bell, segment
+from tensorsim.motion.scripts import fall_tempo, over_the_knees, toppling
+from tensorsim.motion.timing import GRAVITY, bell, minimum_jerk, segment
 
-#: Gravity in m/s^2.
-_GRAVITY = 9.81
 #: Softness of the change from one carrying leg to the other, 1/m.
 _LEG_SHARPNESS = 60.0
 
@@ -77,9 +75,10 @@ def drink(time: Tensor, who: People) -> Act:
 def fall_down(time: Tensor, who: People) -> Act:
     """Gives way at the knees and topples forward like a rod about the feet, from standing; stays down."""
     v = Vary(who)
-    down = toppling(time, who.height_m) / 88
-    give = bell(time, 0.0 * v(1.0), v(1.1))
-    arms = 2 + v(110.0) * down
+    tempo = fall_tempo(who)
+    down = toppling(tempo * time, who.height_m) / 88
+    give = bell(time, 0.0 * v(1.0), v(1.1) / tempo)
+    arms = 2 + 170 * minimum_jerk(down)
     rest = 1 - 0.4 * down
     pose = make_pose(
         time,
@@ -90,9 +89,8 @@ def fall_down(time: Tensor, who: People) -> Act:
         hip=(rest * REST_HIP + v(25.0) * give, rest * REST_HIP + v(22.0) * give),
         knee=(rest * REST_KNEE + v(45.0) * give, rest * REST_KNEE + v(40.0) * give),
         flexion=(arms, arms),
-        elbow=(12 + v(40.0) * down, 12 + v(40.0) * down),
     )
-    return _lying(on_the_spot(time, pose), segment(time, 0.0 * v(1.0) + 0.3, v(0.9)))
+    return upright_for(on_the_spot(time, pose), 1 - segment(time, 0.0 * tempo + 0.3, v(0.9) / tempo))
 
 
 def bend(time: Tensor, who: People) -> Act:
@@ -109,7 +107,7 @@ def lie_down(time: Tensor, who: People) -> Act:
     v = Vary(who)
     end = v(2.4)
     pose = over_the_knees(time, who, v, segment(time, 0 * end, end), bell(time, 0 * end, end))
-    return _lying(on_the_spot(time, pose), segment(time, 0 * end, 0 * end + 0.35))
+    return upright_for(on_the_spot(time, pose), 1 - segment(time, 0 * end, 0 * end + 0.35))
 
 
 def get_up(time: Tensor, who: People) -> Act:
@@ -117,13 +115,8 @@ def get_up(time: Tensor, who: People) -> Act:
     v = Vary(who)
     end = v(2.0)
     pose = over_the_knees(time, who, v, 1 - segment(time, 0 * end, end), bell(time, 0 * end, end))
-    act = _lying(on_the_spot(time, pose), 1 - segment(time, end - 0.35, end))
+    act = upright_for(on_the_spot(time, pose), segment(time, end - 0.35, end))
     return act._replace(moment=end[..., None].expand_as(act.moment))  # feet are held where they stand then
-
-
-def _lying(act: Act, share: Tensor) -> Act:
-    """A movement whose feet do not carry where ``share`` (B, T) is 1."""
-    return act._replace(hold=(1 - share)[..., None].expand_as(act.hold), level=1 - share)
 
 
 def squat(time: Tensor, who: People) -> Act:
@@ -146,7 +139,7 @@ def jump(time: Tensor, who: People) -> Act:
     """Jumps on the spot, one after the other: bends the knees, takes off, lands."""
     v = Vary(who)
     height = v(0.1)
-    flight = 2 * (2 * height / _GRAVITY).sqrt()
+    flight = 2 * (2 * height / GRAVITY).sqrt()
     period = v(0.95)
     since = period * _cycle_share(time, period, who) - 0.5 * period
     aloft = (1 - (2 * since / flight).square()).clamp(min=0.0)
@@ -182,7 +175,7 @@ def _in_the_air(act: Act, height_m: Tensor) -> Act:
     """Raise a body by ``height_m`` (B, T); nothing holds its feet."""
     zero = torch.zeros_like(height_m)
     return act._replace(
-        offset=torch.stack([zero, zero, height_m], dim=-1), hold=torch.zeros_like(act.hold), level=zero
+        offset=torch.stack([zero, zero, height_m], dim=-1), hold=0 * act.hold, level=0 * act.level
     )
 
 
@@ -345,7 +338,7 @@ def crawl(time: Tensor, who: People) -> Act:
         elbow=(elbow, elbow),
     )
     act = on_the_spot(time, pose)
-    return _lying(act, torch.ones_like(time))._replace(path=who.speed_m_s[:, None] * time)
+    return upright_for(act, torch.zeros_like(time))._replace(path=who.speed_m_s[:, None] * time)
 
 
 #: The movements of this file by name.

@@ -7,7 +7,17 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import BodyPose
-from tensorsim.motion.act import REST_HIP, REST_KNEE, SWING_LIFT, Act, Vary, make_pose, on_the_spot, with_gait
+from tensorsim.motion.act import (
+    REST_HIP,
+    REST_KNEE,
+    SWING_LIFT,
+    Act,
+    Vary,
+    make_pose,
+    on_the_spot,
+    upright_for,
+    with_gait,
+)
 from tensorsim.motion.feet import tread
 from tensorsim.motion.people import People
 from tensorsim.motion.timing import bell, minimum_jerk, segment, toppling_angles, travel
@@ -236,9 +246,7 @@ def fall_to_walk(time: Tensor, who: People) -> Act:
     act = with_gait(
         time, who, base, segment(time, go, go + 1.0), who.speed_m_s[:, None] * travel(time, go, go + 1.0)
     )
-    upright = segment(time, end - 0.35, end)
-    held = upright[..., None]
-    return act._replace(hold=act.hold * held, lift=act.lift * held, level=upright)
+    return upright_for(act, segment(time, end - 0.35, end))
 
 
 _TOPPLING_STEP_S = 0.00025
@@ -253,10 +261,15 @@ def toppling(since: Tensor, height_m: Tensor) -> Tensor:
     return torch.lerp(_TOPPLING[before], _TOPPLING[before + 1], at - before)
 
 
+def fall_tempo(who: People) -> Tensor:
+    """Tempo (B, 1) of falls: none is faster than one without resistance."""
+    return who.tempo[:, None].clamp(max=1.0)
+
+
 def walk_to_fall(time: Tensor, who: People) -> Act:
     """Walks, stumbles, topples forward like a rod about the feet, and stays down."""
     v = Vary(who)
-    trip, tempo = v(1.55), who.tempo[:, None]
+    trip, tempo = v(1.55), fall_tempo(who)
     down = toppling(tempo * (time - trip), who.height_m) / 88
     give = bell(time, trip, trip + 1.1 / tempo)
     arms = 2 + 170 * minimum_jerk(down)
@@ -273,9 +286,7 @@ def walk_to_fall(time: Tensor, who: People) -> Act:
     pace = 1 - segment(time, trip - 0.45, trip + 0.25)
     path = who.speed_m_s[:, None] * (time - travel(time, trip - 0.45, trip + 0.25))
     act = with_gait(time, who, base, pace, path)
-    upright = 1 - segment(time, trip + 0.4 / tempo, trip + 0.9 / tempo)
-    held = upright[..., None]
-    return act._replace(hold=act.hold * held, lift=act.lift * held, level=upright)
+    return upright_for(act, 1 - segment(time, trip + 0.4 / tempo, trip + 0.9 / tempo))
 
 
 #: The scripts in the order of ``tensorsim.ACTIVITIES``.

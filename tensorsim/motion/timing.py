@@ -5,6 +5,9 @@ import math
 import torch
 from torch import Tensor
 
+#: m/s^2.
+GRAVITY = 9.81
+
 
 def minimum_jerk(share: Tensor) -> Tensor:
     """``10 s^3 - 15 s^4 + 6 s^5``: from 0 to 1 with the least jerk (Flash and Hogan 1985)."""
@@ -29,6 +32,22 @@ def travel(time: Tensor, start: Tensor, end: Tensor) -> Tensor:
     return span * share**4 * (2.5 + share * (share - 3)) + (time - end).clamp(min=0.0)
 
 
+def landing(share: Tensor, brake: float = 0.2) -> Tensor:
+    """``s^2``, a fall from rest, braked: 0 until ``s`` is 0, 1 from ``1 + brake`` on, without a step in speed.
+
+    It is the square stopped at 1, smoothed by a triangle of that length, in closed form: the second difference of the
+    square's second integral.
+    """
+    half = brake / 2
+
+    def twice_integrated(s: Tensor) -> Tensor:
+        s = s.clamp(min=0.0)
+        return torch.where(s < 1, s**4 / 12, 1 / 12 + (s - 1) / 3 + (s - 1).square() / 2)
+
+    before, now, after = (twice_integrated(share - i * half) for i in (2, 1, 0))
+    return (after - 2 * now + before) / half**2
+
+
 def toppling_angles(step_s: float, smooth_s: float) -> Tensor:
     """Fall of a rod of 1.75 m about its foot: angles from the vertical in degrees, every ``step_s`` seconds.
 
@@ -38,7 +57,7 @@ def toppling_angles(step_s: float, smooth_s: float) -> Tensor:
     Returns:
         (L,) angles, the first 0, the last 88. Bodies of height H take ``sqrt(H / 1.75)`` times as long.
     """
-    pull = 1.5 * 9.81 / (0.95 * 1.75)
+    pull = 1.5 * GRAVITY / (0.95 * 1.75)
     angle, speed = math.radians(4.0), 0.6
     angles = []
     while angle < math.radians(88.0):

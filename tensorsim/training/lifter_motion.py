@@ -21,14 +21,14 @@ from tensorsim.data.motion_files import load_motion, motion_keys
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.motion import everyday, martial_arts
-from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot
+from tensorsim.motion.act import Act
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import EXERCISES
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.pose_sampler import FAMILIES, sample_angles
 from tensorsim.motion.resample import PoseResampler
-from tensorsim.motion.scripts import SCRIPTS, toppling
-from tensorsim.motion.timing import bell, minimum_jerk, segment
+from tensorsim.motion.scripts import SCRIPTS
+from tensorsim.motion.timing import minimum_jerk
 
 #: Frames per second and frames of a motion.
 RATE_HZ, FRAMES = 60.0, 256
@@ -74,40 +74,9 @@ _EVERYDAY = (
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
-    """Gives way and topples like a rod about the feet, in any direction; some slowly, as those who lie down."""
-    v = Vary(who)
-    slow = (who.gait_phase < 0.3)[:, None]
-    rate = torch.where(slow, 0.45, 1.0) * who.tempo[:, None]
-    down = toppling(rate * time, who.height_m) / 88
-    way = 2 * math.pi * torch.remainder(who.gait_phase * 7.0, 1.0)[:, None]
-    lean, roll = 88 * torch.cos(way), 88 * torch.sin(way)
-    give = bell(time, 0.0 * v(1.0), v(1.1) / rate)
-    # Arms lie on the floor, beside the body or over the head; nothing bends into the floor.
-    overhead = (torch.remainder(who.gait_phase * 29.0, 1.0) < 0.3)[:, None]
-    arms = torch.where(overhead, v(165.0), v(60.0) - 60)
-    spread, fold = (3 * v(45.0) - 90) * torch.cos(way).square(), (v(60.0) - 40) * torch.cos(way).square()
-    supine = 0.5 * (1 - torch.cos(way))
-    legs = supine.square() * (3 * v(35.0) - 70)
-    knees = 1.6 * legs + (1 - supine) * (v(60.0) - 48)
-    rest = 1 - 0.6 * down
-    bend = v(55.0) - 10
-    pose = make_pose(
-        time,
-        who,
-        lean=lean * down,
-        pitch=(v(40.0) - 40) * down + v(12.0) * give,
-        twist=(v(40.0) - 40) * down,
-        nod=(v(60.0) - 60) * down,
-        hip=(rest * REST_HIP + legs * down + (bend + 10) * give, rest * REST_HIP + 0.8 * legs * down + bend * give),
-        knee=(rest * REST_KNEE + knees * down + 1.2 * bend * give, rest * REST_KNEE + 0.8 * knees * down + bend * give),
-        flexion=(2 + arms * down, 2 + 0.9 * arms * down),
-        abduction=(8 + spread * down, 8 + 0.7 * spread * down),
-        elbow=(12 + fold * down, 12 + 0.8 * fold * down),
-    )  # fmt: skip
-    pose = pose._replace(roll=pose.roll + torch.deg2rad(roll * down))
-    act = on_the_spot(time, pose)
-    upright = 1 - segment(time, 0.0 * v(1.0) + 0.3, 0.9 / rate)
-    return act._replace(hold=upright[..., None].expand_as(act.hold), level=upright)
+    """Falls as :func:`.everyday.fall_any_way`; some slowly, as those who lie down."""
+    slow = torch.where(who.gait_phase < 0.3, 0.45, 1.0)
+    return everyday.fall_any_way(time, who._replace(tempo=slow * who.tempo))
 
 
 def _performed(

@@ -3,10 +3,14 @@
 import pytest
 import torch
 
+from tensorsim.body.kinematics import forward_kinematics
 from tensorsim.config import JOINTS
 from tensorsim.motion import everyday, martial_arts
+from tensorsim.motion.act import arms_on_floor, make_pose, tip_over
 from tensorsim.motion.activities import perform
-from tensorsim.motion.people import PeopleConfig, draw_people
+from tensorsim.motion.exercises import fall_down
+from tensorsim.motion.people import PeopleConfig, draw_people, nominal_people
+from tensorsim.training import lifter_motion
 
 RATE = 120.0
 FALLS = ("fall_any_way", "fall_on_knees", "fall_onto_seat", "walk_and_fall_any_way", "walk_and_slip")
@@ -80,6 +84,61 @@ def test_still_arms_do_not_swing_and_differ_between_people(moved):
     assert float(legs.std(dim=1).amax(-1).min()) > 0.1
     height = (joint(joints, "left_wrist") - joint(joints, "left_shoulder"))[..., 2].mean(1)
     assert float(height.std()) > 0.08
+
+
+@pytest.mark.parametrize(
+    "script", [*(getattr(everyday, name) for name in FALLS), fall_down, lifter_motion.fall_any_way]
+)
+def test_who_has_fallen_lies_on_the_floor_from_head_to_foot(script):
+    people = draw_people(80, PeopleConfig(tempo=(0.6, 1.0)), torch.Generator().manual_seed(9))
+    time = torch.full((80, 1), 8.0, dtype=torch.float64)
+    height = perform(script, time, people)[:, 0, :, 2] / people.height_m[:, None]
+    lowest_of = {part: height[:, [i for i, name in enumerate(JOINTS) if part in name]].amin(1)
+                 for part in ("hip", "knee", "ankle")}  # fmt: skip
+    assert float(torch.stack(list(lowest_of.values())).amin(0).max()) < 0.1
+    assert float(lowest_of["ankle"].max()) < 0.11
+    # Some are on hands and knees.
+    on_hands = height[:, JOINTS.index("neck")] > 0.18
+    assert bool((lowest_of["hip"][~on_hands] < 0.11).all())
+    assert bool((lowest_of["knee"][on_hands] < 0.06).all())
+    wrists = torch.maximum(height[:, JOINTS.index("right_wrist")], height[:, JOINTS.index("left_wrist")])
+    assert bool((wrists[on_hands] < 0.1).all())
+    assert bool(on_hands.any()) == (script is everyday.fall_on_knees)
+
+
+@pytest.mark.parametrize(
+    "script", [*(getattr(everyday, name) for name in FALLS), fall_down, lifter_motion.fall_any_way]
+)
+def test_who_falls_lands_without_a_step_in_speed_and_no_faster_than_gravity_lets(script):
+    people = draw_people(12, PeopleConfig(tempo=(0.6, 1.5)), torch.Generator().manual_seed(9))
+    rate = 1000.0
+    time = torch.arange(2000, dtype=torch.float64) / rate
+    hips = perform(script, time.expand(12, -1), people)[:, :, (8, 11)].mean(2)
+    # A step in speed would be an acceleration of thousands of m/s^2.
+    acceleration = hips.diff(n=2, dim=1) * rate**2
+    assert float(acceleration.norm(dim=-1).max()) < 400
+    height = hips[:, ::20, 2]
+    sinking = height.diff(n=2, dim=1) * 50.0**2
+    in_the_air = height[:, 1:-1] > 0.2 * people.height_m[:, None]
+    assert float(sinking[in_the_air].min()) > -1.5 * 9.81
+
+
+def test_bodies_tip_over_by_an_angle_in_any_direction_without_turning_about_their_length():
+    way = torch.linspace(-3.1, 3.1, 32, dtype=torch.float64)[:, None]
+    people = nominal_people(32)
+    tilt = torch.full_like(way, 88.0)
+    flexion, abduction = arms_on_floor(way, torch.full_like(way, 30.0))
+    pose = make_pose(0 * way, people, flexion=flexion, abduction=abduction, hip=(0.0, 0.0), knee=(0.0, 0.0))
+    joints = forward_kinematics(tip_over(pose, tilt, way))
+    up = joint(joints, "neck") / joint(joints, "neck").norm(dim=-1, keepdim=True)
+    ahead = torch.sin(torch.deg2rad(tilt))[..., None] * torch.stack([torch.sin(way), torch.cos(way)], dim=-1)
+    torch.testing.assert_close(up[..., :2], ahead)
+    torch.testing.assert_close(up[..., 2], torch.cos(torch.deg2rad(tilt)))
+    across = joint(joints, "right_hip") - joint(joints, "left_hip")
+    torch.testing.assert_close(across[..., 2] / 0.12, -torch.sin(way) * torch.sin(torch.deg2rad(tilt)))
+    for side in ("right", "left"):
+        arm = joint(joints, f"{side}_elbow") - joint(joints, f"{side}_shoulder")
+        assert float(arm[..., 2].abs().max()) < 0.01
 
 
 def test_people_fall_to_all_sides():
