@@ -17,11 +17,13 @@ from tensorsim.motion.people import People
 _DEGREE = math.pi / 180
 Pair = tuple[Tensor | float, Tensor | float]
 
-#: Slightly bent legs of quiet standing, and how far walking lowers the hips (leg lengths) so that both legs reach.
+#: Slightly bent legs of quiet standing.
 REST_HIP, REST_KNEE = 7.0, 14.0
-_WALKING_DROP = 0.018
+#: How far walking lowers the hips so that both legs reach, in leg lengths, and how much more for every leg length a
+#: second beyond a speed.
+_WALKING_DROP, _FAST_DROP, _FAST = 0.018, 0.08, 2.2
 #: Phase at which the body is over the standing foot.
-_STANDING = 0.24
+STANDING = 0.24
 #: Body heights that a swinging foot is kept clear of the floor.
 SWING_LIFT = 0.03
 
@@ -211,12 +213,13 @@ def with_gait(time: Tensor, who: People, base: BodyPose, pace: Tensor, path: Ten
         head=base.head - share * torch.stack([0 * phase, gait.trunk[..., 2]], dim=-1),
     )
     act = on_the_spot(time, base)
-    drop = torch.tensor([0.0, 0.0, _WALKING_DROP], dtype=time.dtype)
+    further = _FAST_DROP * (relative_speed - _FAST).clamp(min=0.0)[:, None, None]
+    drop = (_WALKING_DROP + further) * torch.tensor([0.0, 0.0, 1.0], dtype=time.dtype)
     # A foot is flat on the floor from 0.09 to 0.39 of its cycle; then the heel rises.
-    steps = tread(time, cycle[:, 0], who.gait_phase, _STANDING, 0.30, 0.17)
+    steps = tread(time, cycle[:, 0], who.gait_phase, STANDING, 0.30, 0.17)
     # Between two steps it goes on as in steady walking: with the hips, and ahead of or behind them.
     ahead = _reach_ahead(who, gait)
-    still = boulic_gait(relative_speed, torch.full_like(time[:, :1], _STANDING))
+    still = boulic_gait(relative_speed, torch.full_like(time[:, :1], STANDING))
     ahead_still = _reach_ahead(who, still)[:, :, :1]
     stride = who.speed_m_s[:, None, None] * cycle[..., None]
     progress = steps.since + (ahead - ahead_still) * leg[:, None, None] / stride
@@ -230,5 +233,5 @@ def with_gait(time: Tensor, who: People, base: BodyPose, pace: Tensor, path: Ten
         step=steps.step,
         other=steps.other,
         progress=torch.where(steps.since < 0, -progress, progress),
-        lift=SWING_LIFT * (1 - steps.hold) ** 2,
+        lift=(SWING_LIFT + (leg / who.height_m)[:, None, None] * further) * (1 - steps.hold) ** 2,
     )

@@ -24,6 +24,8 @@ _KNOT_HZ = 240.0
 _MARGIN = 12
 #: Softness of the contact with the floor, 1/m: bodies sink or float by less than a centimetre.
 _FLOOR_SHARPNESS = 150.0
+#: Feet that swing sink into it by no more than this.
+_SINK_M = 0.003
 
 
 class GeneratedMotion(NamedTuple):
@@ -121,7 +123,9 @@ def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) 
             steps_out = 1 - torch.exp(-(((other - held)[..., :2] / 0.1).square().sum(dim=-1)))
             near_floor = torch.exp((floor - swung[..., 2]) / (0.04 * height))
             lift = act.lift[..., side] * height * steps_out * near_floor
-        swung = torch.cat([place, (swung[..., 2] + lift)[..., None]], dim=-1)
+        # Nor does a foot that swings go through the floor.
+        above = floor + torch.nn.functional.celu(swung[..., 2] + lift - floor, alpha=_SINK_M)
+        swung = torch.cat([place, above[..., None]], dim=-1)
         places.append(torch.lerp(swung, held, act.hold[..., side, None]))
     forward = (rotation(2, act.pose.heading) @ rotation(0, -act.pose.lean))[..., 1]
     thigh = torch.as_tensor(who.proportions.thigh)[:, None] * height

@@ -8,9 +8,11 @@ import math
 import torch
 from torch import Tensor
 
+from tensorsim.body.gait import cycle_s
 from tensorsim.motion.act import (
     REST_HIP,
     REST_KNEE,
+    STANDING,
     Act,
     Vary,
     arms_on_floor,
@@ -218,37 +220,50 @@ def kick_ball(time: Tensor, who: People) -> Act:
     """Walks or runs up to a ball, kicks it at time 0 with a straight swing of the leg, and stops or runs on a little.
 
     In captured kicks of a ball people run up for one to two seconds, the hips at 2 to 3.5 m/s at the kick, the
-    foot at 10 m/s, and come to rest within a second.
+    foot at 10 m/s, and come to rest within a second. At a lower ``tempo`` the leg swings less far in the same time.
     """
     v = Vary(who)
-    tempo = who.tempo[:, None]
-    back, through, down = v(0.30) / tempo, v(0.22) / tempo, v(0.5) / tempo
-    drawn = segment(time, -back - 0.1, 0 * back - 0.1) - segment(time, 0 * back - 0.1, through - 0.1)
-    shot = segment(time, 0 * back - 0.1, through) - segment(time, through, through + down)
-    poised = bell(time, -back - 0.1, through + down)
-    swing = v(20.0) * (shot - drawn)
+    far = who.tempo[:, None].clamp(max=1.0)
+    leg_m = (who.proportions.thigh + who.proportions.shank) * who.height_m
+    # The gait is known up to 3 leg lengths a second.
+    quick = torch.minimum(who.speed_m_s * (1.1 + share_of(who, 29.0)[:, 0]), 2.9 * leg_m)
+    cycle = cycle_s(quick / leg_m)[:, None]
+    # The left foot is planted beside the ball; half a cycle before it the right one stood.
+    planted = 0.06
+    runner = who._replace(speed_m_s=quick, gait_phase=STANDING - 0.5 - planted / cycle[:, 0])
+    lifted, back, through = planted - 0.35 * cycle, -v(0.08), v(0.22)
+    landed = through + v(0.32)
+    drawn = segment(time, lifted, back) - segment(time, back, through - 0.1)
+    shot = segment(time, back, through) - segment(time, through, landed)
+    # The knee bends first, and stays bent until the thigh is past the vertical.
+    folded = segment(time, lifted - 0.08, back - 0.04) - segment(time, back + 0.04, through)
+    poised = bell(time, lifted, landed)
+    swing = v(6.0) * (shot - drawn)
     base = make_pose(
         time,
         who,
-        pitch=v(12.0) * poised - v(15.0) * shot,
-        twist=v(15.0) * (drawn - shot),
-        hip=(REST_HIP - v(28.0) * drawn + v(55.0) * shot, REST_HIP + 5 * poised),
-        knee=(REST_KNEE + v(75.0) * drawn, REST_KNEE + v(12.0) * poised),
+        pitch=v(12.0) * poised - v(15.0) * far * shot,
+        twist=v(10.0) * (drawn - shot),
+        hip=(REST_HIP - v(15.0) * far * drawn + v(45.0) * far * shot, REST_HIP + 5 * poised),
+        knee=(REST_KNEE + v(45.0) * far * folded, REST_KNEE + v(12.0) * poised),
         flexion=(2 - swing, 2 + swing),
-        abduction=(8 + v(15.0) * poised, 8 + v(25.0) * poised),
+        abduction=(8 + v(10.0) * poised, 8 + v(15.0) * poised),
         elbow=(12 + 20 * poised, 12 + 20 * poised),
     )
-    leg_m = (who.proportions.thigh + who.proportions.shank) * who.height_m
-    quick = who.speed_m_s * (1 + share_of(who, 29.0)[:, 0])
-    # The gait is known up to 3 leg lengths a second.
-    runner = who._replace(speed_m_s=torch.minimum(quick, 2.9 * leg_m))
-    start = -1.2 - 1.5 * share_of(who, 7.0) + 0.0 * back
-    stop, still = -back - 0.2, 0.1 + 0.9 * share_of(who, 13.0) + 0.0 * back
+    start = -1.2 - 1.5 * share_of(who, 7.0)
+    stop, still = -0.2 + 0 * back, 0.4 + 0.4 * share_of(who, 13.0)
     pace = segment(time, start, start + 0.5) - segment(time, stop, still)
     gone_s = travel(time, start, start + 0.5) - travel(time, stop, still)
-    act = with_gait(time, runner, base, pace, runner.speed_m_s[:, None] * gone_s)
-    aloft = segment(time, -back - 0.15, -back) - segment(time, through + 0.6 * down, through + down)
+    act = with_gait(time, runner, base, pace, quick[:, None] * gone_s)
+    aloft = segment(time, lifted, lifted + 0.1) - segment(time, landed - 0.1, landed)
     free = torch.stack([1 - aloft, torch.ones_like(aloft)], dim=-1)
-    # The standing leg carries the body, not the one that kicks.
-    support = torch.stack([0 * time, 0 * time + 1], dim=-1)
-    return act._replace(hold=act.hold * free, lift=act.lift * free, support=support, level=free)
+    # The foot that kicks steps where it comes down.
+    kicks = (act.moment > planted) & (act.moment < landed[..., None]) & torch.tensor([True, False])
+    return act._replace(
+        hold=act.hold * free,
+        lift=act.lift * free,
+        level=free,
+        moment=torch.where(kicks, landed[..., None], act.moment),
+        # The standing leg carries the body, not the one that kicks.
+        support=torch.tensor([0.0, 1.0], dtype=time.dtype).expand_as(act.support),
+    )

@@ -105,7 +105,7 @@ def kick_round(time: Tensor, who: People) -> Act:
     up = segment(since, 0 * t1, t1) - segment(since, t3, t4)
     shot = segment(since, t1 - 0.05, t2) - segment(since, t2, t3)
     poised = segment(since, 0 * t1, t1) - segment(since, t3, t4 + 0.1)
-    high, fold = v(50.0), v(110.0)
+    high, fold = v(58.0), v(110.0)
     pose = make_pose(
         time,
         who,
@@ -120,9 +120,10 @@ def kick_round(time: Tensor, who: People) -> Act:
     )
     side = torch.stack([v(45.0) * up, 0 * up], dim=-1) * (math.pi / 180)
     away = math.pi / 180 * v(22.0) * poised
-    # The trunk leans away from the leg.
+    # The trunk leans away from the leg, over the foot that stands.
     pose = pose._replace(
-        hip=torch.stack([pose.hip[..., 0], pose.hip[..., 1] + side], dim=-1), roll=pose.roll - away
+        hip=torch.stack([pose.hip[..., 0], pose.hip[..., 1] + side], dim=-1),
+        trunk=pose.trunk - torch.stack([0 * away, away, 0 * away], dim=-1),
     )
     act = on_the_spot(time, pose)
     aloft = segment(since, 0.0 * t1, 0.5 * t1) - segment(since, t4 - 0.5 * (t4 - t3), t4)

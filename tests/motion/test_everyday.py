@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tensorsim.body.kinematics import forward_kinematics
+from tensorsim.body.proportions import ANKLE_HEIGHT
 from tensorsim.config import JOINTS
 from tensorsim.motion import everyday, martial_arts
 from tensorsim.motion.act import arms_on_floor, make_pose, tip_over
@@ -160,12 +161,47 @@ def test_a_ball_is_kicked_after_walking_up():
     hips = (joint(joints, "right_hip") + joint(joints, "left_hip")) / 2
     assert 1.0 < float((hips.diff(dim=1).norm(dim=-1) * RATE).amax(1).median()) < 3.5
     wrist = joint(joints, "left_wrist").diff(dim=1).norm(dim=-1) * RATE
-    assert float(wrist.max()) < 6.0
+    assert float(wrist.median()) < 3.0
+    assert float(wrist.max()) < 8.0
     foot = joint(joints, "right_ankle").diff(dim=1).norm(dim=-1) * RATE
     kick = foot[:, round(1.8 * RATE) : round(2.4 * RATE)].amax(1)
     assert bool((kick > 3.0).all())
     resting = joint(joints, "neck").diff(dim=1).norm(dim=-1)[:, -12:] * RATE
     assert float(resting.max()) < 0.3
+
+
+def test_a_ball_is_kicked_from_a_foot_that_stands_beside_it():
+    people = draw_people(40, PeopleConfig(tempo=(0.6, 1.0)), torch.Generator().manual_seed(7))
+    time = (torch.arange(round(4.5 * RATE), dtype=torch.float64) / RATE - 3.0).expand(40, -1)
+    joints, act = perform(everyday.kick_ball, time, people), everyday.kick_ball(time, people)
+    ankles = torch.stack([joint(joints, "right_ankle"), joint(joints, "left_ankle")], dim=-2)
+    height = ankles[..., 2] / people.height_m[:, None, None]
+    assert float(height.min()) > ANKLE_HEIGHT - 0.0022
+    held = (act.hold > 0.9999)[:, 1:] & (act.hold > 0.9999)[:, :-1]
+    assert float((ankles.diff(dim=1).norm(dim=-1) * RATE)[held].max()) < 0.35
+    at = (time[0] > -0.05) & (time[0] < 0.12)
+    # The left foot stands from before the kick until after it, at most half a leg length from below the hips.
+    assert float(height[:, at, 1].max()) < ANKLE_HEIGHT + 0.006
+    hips = (joint(joints, "right_hip") + joint(joints, "left_hip")) / 2
+    assert float((hips - ankles[..., 1, :])[:, at, 1].abs().max()) < 0.55
+    now = round(3.0 * RATE)
+    speed = hips.diff(dim=1).norm(dim=-1)[:, now] * RATE
+    assert 1.4 < float(speed.median()) < 3.5
+    foot = (ankles[..., 0, :].diff(dim=1).norm(dim=-1) * RATE).amax(1)
+    assert 7.0 < float(foot.median()) < 10.5
+    assert float(foot.max()) < 13.0
+
+
+def test_the_trunk_of_who_kicks_round_leans_over_the_standing_foot():
+    people = draw_people(12, PeopleConfig(), torch.Generator().manual_seed(7))
+    time = torch.arange(round(1.5 * RATE), dtype=torch.float64) / RATE
+    joints = perform(martial_arts.kick_round, time.expand(12, -1), people)
+    hips = (joint(joints, "right_hip") + joint(joints, "left_hip")) / 2
+    leg = hips - joint(joints, "left_ankle")
+    assert float((leg[..., :2].norm(dim=-1) / leg[..., 2]).max()) < 0.15
+    trunk = joint(joints, "neck") - hips
+    assert float((trunk[..., :2].norm(dim=-1) / trunk[..., 2]).amax(1).min()) > 0.25
+    assert float(joint(joints, "head").diff(dim=1).norm(dim=-1).max() * RATE) < 3.0
 
 
 def test_a_fist_is_swung_out_and_back():
