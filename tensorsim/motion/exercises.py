@@ -36,9 +36,10 @@ def pick_up(time: Tensor, who: People) -> Act:
     v = Vary(who)
     down = _there_and_back(time, v(1.1), v(0.3), v(1.2))
     squat = (0.5 + (v(1.0) - 1) / 0.25).clamp(0.0, 1.0)
-    knee = REST_KNEE + (v(30.0) + 80 * squat - REST_KNEE) * down
-    hip = REST_HIP + (8 + 70 * squat - REST_HIP) * down
-    bow = v(80.0) - 35 * squat
+    knee = REST_KNEE + (v(50.0) + 75 * squat - REST_KNEE) * down
+    # The hips go back as the trunk bows, so that the body stays over the feet.
+    hip = 0.5 * knee + (12 + 8 * squat) * down
+    bow = v(100.0) - 38 * squat
     pose = make_pose(
         time,
         who,
@@ -46,8 +47,8 @@ def pick_up(time: Tensor, who: People) -> Act:
         nod=-0.3 * bow * down,
         hip=(hip, hip),
         knee=(knee, knee),
-        flexion=(2 + v(70.0) * down, 2 + v(30.0) * down),
-        elbow=(12 + 5 * down, 12 + v(20.0) * down),
+        flexion=(2 + v(20.0) * down, 2 + v(10.0) * down),
+        elbow=(12 - 7 * down, 12 + v(20.0) * down),
     )
     return on_the_spot(time, pose)
 
@@ -98,7 +99,9 @@ def bend(time: Tensor, who: People) -> Act:
     v = Vary(who)
     down = _there_and_back(time, v(1.0), v(0.4), v(1.0))
     arms = 2 + v(10.0) * down
-    pose = make_pose(time, who, pitch=v(82.0) * down, nod=-20 * down, flexion=(arms, arms))
+    # The hips go back, so that the body stays over the feet.
+    hip = REST_HIP + 10 * down
+    pose = make_pose(time, who, pitch=v(82.0) * down, nod=-20 * down, hip=(hip, hip), flexion=(arms, arms))
     return on_the_spot(time, pose)
 
 

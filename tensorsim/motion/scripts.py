@@ -117,7 +117,7 @@ def grab(time: Tensor, who: People) -> Act:
         pitch=bow * out,
         nod=-0.4 * bow * out,
         twist=10 * out,
-        hip=(knee / 2, knee / 2),
+        hip=(knee / 2 + 4 * out, knee / 2 + 4 * out),
         knee=(knee, knee),
         flexion=(2 + (arm - 2) * out, 2 + 0.85 * (arm - 2) * out),
         elbow=(elbow, elbow),

@@ -8,6 +8,7 @@ from tensorsim.config import JOINTS
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import EXERCISES
 from tensorsim.motion.people import PeopleConfig, draw_people
+from tensorsim.motion.scripts import grab
 
 RATE = 200.0
 SPEEDS = {"running": (2.0, 3.4), "striding": (1.3, 2.0), "creeping": (0.4, 1.1), "crawling": (0.3, 0.7)}
@@ -125,3 +126,22 @@ def test_hands_of_who_bends_come_to_the_shins():
     wrist, knee = joint(joints, "right_wrist")[..., 2], joint(joints, "right_knee")[..., 2]
     assert bool((wrist.amin(1) < knee.amin(1)).all())
     assert bool((wrist[:, -1] > knee[:, -1] + 0.2).all())
+
+
+@pytest.mark.parametrize("name", ["bending", "picking up", "grabbing"])
+def test_who_bows_moves_the_hips_back_and_stays_over_the_feet(name):
+    people = draw_people(24, PeopleConfig(), torch.Generator().manual_seed(11))
+    time = (torch.arange(80, dtype=torch.float64) / 20).expand(24, -1)
+    joints = (
+        perform({**EXERCISES, "grabbing": grab}[name], time, people) / people.height_m[:, None, None, None]
+    )
+    hips, neck = (joint(joints, "right_hip") + joint(joints, "left_hip")) / 2, joint(joints, "neck")
+    feet = (joint(joints, "right_ankle") + joint(joints, "left_ankle")) / 2
+    assert float((hips - hips[:, :1])[..., 1].amin(1).max()) < -0.025
+    # Of the trunk; toes are 0.12 body heights ahead of the ankles.
+    assert float(((neck + hips) / 2 - feet)[..., 1].max()) < 0.12
+    wrist = torch.minimum(joint(joints, "right_wrist"), joint(joints, "left_wrist"))[..., 2].amin(1)
+    if name == "picking up":
+        # The hand is a tenth of the height below.
+        assert float(wrist.max()) < 0.22
+        assert float(wrist.min()) > 0.04
