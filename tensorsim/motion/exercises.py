@@ -10,14 +10,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from tensorsim.body.kinematics import BodyPose
 from tensorsim.body.proportions import THIGH
 from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, upright_for
+from tensorsim.motion.feet import soft_reach
 from tensorsim.motion.people import People
 from tensorsim.motion.scripts import fall_tempo, over_the_knees, toppling
 from tensorsim.motion.timing import GRAVITY, bell, minimum_jerk, segment
 
-#: Softness of the change from one carrying leg to the other, 1/m.
-_LEG_SHARPNESS = 60.0
+#: Metres around take-off and landing over which the heels leave the floor.
+_HEEL_M = 0.015
 
 
 def _there_and_back(time: Tensor, out: Tensor, hold: Tensor, back: Tensor) -> Tensor:
@@ -138,48 +140,75 @@ def squat(time: Tensor, who: People) -> Act:
     return on_the_spot(time, pose)
 
 
+def _leg_angles(ahead: Tensor, down: Tensor, thigh: Tensor, shank: Tensor) -> tuple[Tensor, Tensor]:
+    """Flexion of hip and knee in degrees of a leg whose ankle is ``ahead`` of and ``down`` from the hip, in m."""
+    apart = soft_reach((ahead.square() + down.square()).sqrt(), thigh + shank).square()
+    knee = torch.acos(((apart - thigh.square() - shank.square()) / (2 * thigh * shank)).clamp(-1.0, 1.0))
+    hip = torch.atan2(ahead, down) + torch.atan2(shank * torch.sin(knee), thigh + shank * torch.cos(knee))
+    return torch.rad2deg(hip), torch.rad2deg(knee)
+
+
+def _hopped(since: Tensor, period: Tensor, flight: Tensor) -> Tensor:
+    """Metres of the hips over where they take off: a parabola, and on the floor a dip after landing and one before it.
+
+    Args:
+        since: (B, T) s since take-off, within the period.
+        period, flight: (B, 1) s from one take-off to the next, and in the air.
+    """
+    speed = GRAVITY * flight / 2
+    half = (period - flight) / 2
+    on_floor = (since - flight).minimum(period - since).clamp(min=0.0)
+    dip = speed * on_floor * (1 - on_floor / half).square()
+    return torch.where(since < flight, (speed - GRAVITY / 2 * since) * since, -dip)
+
+
+def _hop(time: Tensor, who: People, height_m: Tensor, pose: BodyPose, widest: Tensor) -> Act:
+    """A pose whose hips rise and sink by ``height_m`` (B, T): the knees bend, the heels rise as the floor is left.
+
+    The hips are as high as legs reach that are ``widest`` (B, 1) radians abducted.
+    """
+    thigh, shank = (torch.as_tensor(x)[:, None] * who.height_m[:, None] for x in who.proportions[1::-1])
+    standing = (thigh + shank) * math.cos(math.radians(REST_KNEE / 2)) * torch.cos(widest)
+    lift = torch.nn.functional.softplus(height_m / _HEEL_M) * _HEEL_M
+    length = (standing + height_m - lift) / torch.cos(pose.hip[..., 0, 1])
+    hip, knee = _leg_angles(torch.zeros_like(time), length, thigh, shank)
+    bent = torch.stack([torch.deg2rad(hip), torch.deg2rad(hip)], dim=-1)
+    pose = pose._replace(
+        hip=torch.stack([bent, pose.hip[..., 1]], dim=-1),
+        knee=torch.deg2rad(torch.stack([knee, knee], dim=-1)),
+    )
+    zero = torch.zeros_like(time)
+    act = upright_for(on_the_spot(time, pose), zero)
+    return act._replace(offset=torch.stack([zero, zero, lift], dim=-1))
+
+
 def jump(time: Tensor, who: People) -> Act:
     """Jumps on the spot, one after the other: bends the knees, takes off, lands."""
     v = Vary(who)
-    height = v(0.1)
-    flight = 2 * (2 * height / GRAVITY).sqrt()
+    flight = (8 * v(0.1) / GRAVITY).sqrt()
     period = v(0.95)
-    since = period * _cycle_share(time, period, who) - 0.5 * period
-    aloft = (1 - (2 * since / flight).square()).clamp(min=0.0)
-    dip = bell(since, -0.5 * period, -0.5 * flight + 0.04) + bell(since, 0.5 * flight - 0.04, 0.5 * period)
-    knee, hip = REST_KNEE + v(24.0) * dip, REST_HIP + v(12.0) * dip
+    rise = _hopped(period * _cycle_share(time, period, who), period, flight)
+    swing = v(60.0) * rise
     pose = make_pose(
-        time,
-        who,
-        pitch=v(5.0) * dip,
-        hip=(hip, hip),
-        knee=(knee, knee),
-        flexion=(2 + v(12.0) * dip, 2 + v(12.0) * dip),
-        elbow=(35.0, 35.0),
+        time, who, pitch=v(4.0) - v(30.0) * rise, flexion=(2 + swing, 2 + swing), elbow=(35.0, 35.0)
     )
-    return _in_the_air(on_the_spot(time, pose), height * aloft)
+    return _hop(time, who, rise, pose, 0 * period)
 
 
 def jumping_jack(time: Tensor, who: People) -> Act:
     """Jumps with arms and legs apart and together, the arms meeting over the head."""
     v = Vary(who)
-    period, height = v(1.05), v(0.04)
-    share = _cycle_share(time, period, who)
-    apart = torch.sin(math.pi * share).square()
-    arms = 8 + v(140.0) * apart
-    spread = math.radians(1.0) * v(19.0) * apart
+    period = v(1.05)
+    flight = (8 * v(0.04) / GRAVITY).sqrt()
+    since = period * _cycle_share(time, period, who)
+    arms = 8 + v(140.0) * torch.sin(math.pi * since / period).square()
+    # The legs change their place in the air.
+    apart = segment(since, 0 * flight, flight) - segment(since, period / 2, period / 2 + flight)
+    widest = torch.deg2rad(v(19.0))
     pose = make_pose(time, who, abduction=(arms, arms), inward=(0.0, 0.0), elbow=(18.0, 18.0))
-    legs = torch.stack([spread, spread], dim=-1)
+    legs = torch.stack([widest * apart, widest * apart], dim=-1)
     pose = pose._replace(hip=torch.stack([pose.hip[..., 0], legs], dim=-1))
-    return _in_the_air(on_the_spot(time, pose), height * torch.sin(2 * math.pi * share).square())
-
-
-def _in_the_air(act: Act, height_m: Tensor) -> Act:
-    """Raise a body by ``height_m`` (B, T); nothing holds its feet."""
-    zero = torch.zeros_like(height_m)
-    return act._replace(
-        offset=torch.stack([zero, zero, height_m], dim=-1), hold=0 * act.hold, level=0 * act.level
-    )
+    return _hop(time, who, _hopped(torch.remainder(since, period / 2), period / 2, flight), pose, widest)
 
 
 def box(time: Tensor, who: People) -> Act:
@@ -215,46 +244,66 @@ def box(time: Tensor, who: People) -> Act:
     return on_the_spot(time, pose)._replace(offset=torch.stack([zero, sway, zero], dim=-1))
 
 
+def _stepped(at: Tensor, stance: float) -> Tensor:
+    """How far a foot is ahead, from 1 to -1 half steps, at places of its cycle from 0, where it comes down.
+
+    It goes evenly back while it stands; in the rest of the cycle it comes forward on the cubic that goes on with that
+    speed at both ends.
+    """
+    swung = ((at - stance) / (1 - stance)).clamp(min=0.0)
+    slope = -2 * (1 - stance) / stance
+    forward = -1 + slope * swung + (6 - 3 * slope) * swung**2 + (2 * slope - 4) * swung**3
+    return torch.where(at < stance, 1 - 2 * at / stance, forward)
+
+
 def _step_out(
     time: Tensor,
     who: People,
     cycle_s: Tensor,
     *,
-    fold: Tensor,
+    lift: Tensor,
     bent: Tensor,
     arms: Tensor,
     elbow: Tensor,
     pitch: Tensor,
     stance: float,
-    flight_m: Tensor | float = 0.0,
 ) -> Act:
     """A gait along +y at the person's speed.
 
-    A foot that stands goes evenly back under the hips, at the speed of the body; in the rest of the cycle it comes
-    forward on the cubic that goes on with that speed at both ends. The lower foot is on the floor.
+    A foot that stands stays where it is. The hips are highest over it, except in a gait with flights, where they fly on
+    a parabola and dip as a half sine that meets it with the same speed. The legs reach from the hips to the feet.
 
     Args:
         time: (B, T) s.
         who: B people.
-        cycle_s: (B, 1) length of a cycle, two steps.
-        fold: (B, 1) degrees by which the knee of the swinging leg bends further.
-        bent: (B, 1) degrees of the bent knees that carry the body.
+        cycle_s: (B, 1) length of a cycle, two steps; less where legs do not reach so far.
+        lift: (B, 1) body heights by which the swinging foot is raised.
+        bent: (B, 1) degrees of the knees as a foot comes down.
         arms: (B, 1) degrees to which the upper arms swing to either side.
         elbow, pitch: (B, 1) degrees.
-        stance: the part of a cycle that a foot stands.
-        flight_m: (B, 1) height of the flight between two steps, of a gait with ``stance`` below one half.
+        stance: the part of a cycle that a foot stands; below one half there are flights.
     """
+    height, speed = who.height_m[:, None], who.speed_m_s[:, None]
+    thigh, shank = (torch.as_tensor(x)[:, None] * height for x in who.proportions[1::-1])
+    leg = thigh + shank
+    cycle_s = torch.minimum(cycle_s, 1.24 * leg / (stance * speed))
     phase = torch.stack([time / cycle_s, time / cycle_s + 0.5], dim=-1) + who.gait_phase[:, None, None]
     at = torch.remainder(phase, 1.0)
-    thigh, shank = (torch.as_tensor(x)[:, None] * who.height_m[:, None] for x in who.proportions[1::-1])
-    half = 0.5 * stance * who.speed_m_s[:, None] * cycle_s / (thigh + shank)  # half of a step, in leg lengths
-    half = half.clamp(max=0.62)[..., None]
+    half = 0.5 * stance * speed * cycle_s
+    length = (leg.square() - 2 * thigh * shank * (1 - torch.cos(torch.deg2rad(bent)))).sqrt()
+    low = (length.square() - half.square()).sqrt()
+    step = torch.remainder(at[..., 0], 0.5)
+    if stance < 0.5:
+        flown = (step - stance) * cycle_s
+        start = GRAVITY / 2 * (0.5 - stance) * cycle_s
+        dip = start * stance * cycle_s / math.pi * torch.sin(math.pi * step / stance)
+        rise = torch.where(flown < 0, -dip, (start - GRAVITY / 2 * flown) * flown)
+    else:
+        rise = 0.3 * (length - low) * torch.cos(2 * math.pi * (step - stance / 2)).square()
+    ahead = half[..., None] * _stepped(at, stance)
     swung = ((at - stance) / (1 - stance)).clamp(min=0.0)
-    slope = -2 * (1 - stance) / stance
-    forward = -1 + slope * swung + (6 - 3 * slope) * swung**2 + (2 * slope - 4) * swung**3
-    ahead = half * torch.where(at < stance, 1 - 2 * at / stance, forward)
-    knee = bent[..., None] + fold[..., None] * torch.sin(math.pi * swung) ** 2
-    hip = torch.rad2deg(torch.asin(ahead.clamp(-0.9, 0.9))) + 0.45 * knee
+    down = (low + rise)[..., None] - (lift * height)[..., None] * (1 - (2 * swung - 1) ** 4).square()
+    hip, knee = _leg_angles(ahead, down, thigh[..., None], shank[..., None])
     back = arms[..., None] * torch.cos(2 * math.pi * phase)
     twist = 0.2 * arms * torch.cos(2 * math.pi * phase[..., 0])
     pose = make_pose(
@@ -268,39 +317,21 @@ def _step_out(
         flexion=(5 - back[..., 0], 5 - back[..., 1]),
         elbow=(elbow, elbow),
     )
-    carried = make_pose(time, who, hip=(0.5 * bent, 0.5 * bent), knee=(bent, bent))
-
-    def reach(hip: Tensor, knee: Tensor) -> Tensor:
-        """How far down an ankle is from the hips."""
-        hip, knee = torch.deg2rad(hip), torch.deg2rad(knee)
-        return thigh[..., None] * torch.cos(hip) + shank[..., None] * torch.cos(hip - knee)
-
-    lowest = torch.logsumexp(_LEG_SHARPNESS * reach(hip, knee), dim=-1) / _LEG_SHARPNESS
-    rise = lowest - reach(0.5 * bent[..., None], bent[..., None])[..., 0]
-    if stance < 0.5:
-        rise = rise + flight_m * torch.sin(math.pi * _flight_share(at[..., 0], stance)).square()
     zero = torch.zeros_like(time)
-    act = on_the_spot(time, pose)
-    return act._replace(
-        stance=carried,
-        offset=torch.stack([zero, zero, rise], dim=-1),
-        path=who.speed_m_s[:, None] * time,
-        hold=torch.zeros_like(act.hold),
+    return on_the_spot(time, pose)._replace(
+        stance=make_pose(time, who, hip=(0.0, 0.0), knee=(0.0, 0.0)),
+        offset=torch.stack([zero, zero, low + rise - leg], dim=-1),
+        path=speed * time,
+        hold=torch.zeros_like(at),
     )
-
-
-def _flight_share(at: Tensor, stance: float) -> Tensor:
-    """Share of the flight gone, 0 while a foot stands, at places of the cycle of the right leg."""
-    return ((torch.remainder(at, 0.5) - stance) / (0.5 - stance)).clamp(0.0, 1.0)
 
 
 def run(time: Tensor, who: People) -> Act:
     """Runs: short contact with the floor, folded swinging legs, bent elbows."""
     v = Vary(who)
     return _step_out(
-        time, who, v(0.72), fold=v(62.0), bent=v(28.0), arms=v(30.0), elbow=v(85.0), pitch=v(9.0), stance=0.36,
-        flight_m=v(0.05),
-    )  # fmt: skip
+        time, who, v(0.72), lift=v(0.16), bent=v(24.0), arms=v(30.0), elbow=v(85.0), pitch=v(9.0), stance=0.36
+    )
 
 
 def stride(time: Tensor, who: People) -> Act:
@@ -308,7 +339,7 @@ def stride(time: Tensor, who: People) -> Act:
     v = Vary(who)
     cycle = v(1.1) * (1.7 / who.speed_m_s[:, None]).clamp(0.7, 1.3)
     return _step_out(
-        time, who, cycle, fold=v(45.0), bent=v(14.0), arms=v(36.0), elbow=v(22.0), pitch=v(4.0), stance=0.58
+        time, who, cycle, lift=v(0.09), bent=v(14.0), arms=v(36.0), elbow=v(22.0), pitch=v(4.0), stance=0.58
     )
 
 
@@ -317,7 +348,7 @@ def creep(time: Tensor, who: People) -> Act:
     v = Vary(who)
     cycle = v(1.15) * (0.75 / who.speed_m_s[:, None]).clamp(0.7, 1.4)
     return _step_out(
-        time, who, cycle, fold=v(34.0), bent=v(30.0), arms=v(5.0), elbow=v(45.0), pitch=v(18.0), stance=0.62
+        time, who, cycle, lift=v(0.07), bent=v(30.0), arms=v(5.0), elbow=v(45.0), pitch=v(18.0), stance=0.62
     )
 
 

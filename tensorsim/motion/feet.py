@@ -15,6 +15,13 @@ RIGHT_LEG, LEFT_LEG = JOINTS.index("right_hip"), JOINTS.index("left_hip")
 _EXACT_REACH, _LAST_STRETCH = 0.985, 0.0125
 
 
+def soft_reach(wanted: Tensor, length: Tensor) -> Tensor:
+    """Distance in m from the hip to the ankle of a leg of this length whose ankle is wanted at a distance."""
+    excess = (wanted / length - _EXACT_REACH).clamp(min=0.0)
+    stretch = _LAST_STRETCH * torch.tanh(excess / _LAST_STRETCH)
+    return torch.minimum(wanted, _EXACT_REACH * length) + length * stretch
+
+
 def two_bone_leg(hip: Tensor, ankle: Tensor, towards: Tensor, thigh: Tensor, shank: Tensor) -> Tensor:
     """A leg from the hip to an ankle (two circles meet: the law of cosines).
 
@@ -26,13 +33,10 @@ def two_bone_leg(hip: Tensor, ankle: Tensor, towards: Tensor, thigh: Tensor, sha
     Returns:
         (..., 3, 3) hip, knee and ankle.
     """
-    length = thigh + shank
     line = ankle - hip
     wanted = line.norm(dim=-1)
     line = line / wanted[..., None]
-    excess = (wanted / length - _EXACT_REACH).clamp(min=0.0)
-    stretch = _LAST_STRETCH * torch.tanh(excess / _LAST_STRETCH)
-    reach = torch.minimum(wanted, _EXACT_REACH * length) + length * stretch
+    reach = soft_reach(wanted, thigh + shank)
     along = (thigh**2 - shank**2 + reach**2) / (2 * reach)
     beside = (thigh**2 - along**2).clamp(min=0.0).sqrt()
     bend = towards - (towards * line).sum(dim=-1, keepdim=True) * line

@@ -145,3 +145,39 @@ def test_who_bows_moves_the_hips_back_and_stays_over_the_feet(name):
         # The hand is a tenth of the height below.
         assert float(wrist.max()) < 0.22
         assert float(wrist.min()) > 0.04
+
+
+@pytest.mark.parametrize("name", ["running", "jumping", "jumping jacks"])
+def test_who_is_in_the_air_falls_freely_and_takes_off_without_a_step_in_speed(name):
+    rate = 1000.0
+    people = draw_people(6, PeopleConfig(), torch.Generator().manual_seed(3))
+    people = people._replace(speed_m_s=torch.linspace(2.0, 3.4, 6, dtype=torch.float64))
+    time = (torch.arange(1600, dtype=torch.float64) / rate).expand(6, -1)
+    joints = perform(EXERCISES[name], time, people)
+    hips = (joint(joints, "right_hip") + joint(joints, "left_hip"))[..., 2] / 2
+    acceleration = hips.diff(n=2, dim=1) * rate**2
+    ankles = torch.minimum(joint(joints, "right_ankle")[..., 2], joint(joints, "left_ankle")[..., 2])
+    aloft = (ankles - ANKLE_HEIGHT * people.height_m[:, None])[:, 1:-1] > 0.03
+    assert bool(aloft.any(1).all())
+    # The hips of who spreads the legs in the air, or breathes, are not quite the centre of mass.
+    torch.testing.assert_close(
+        acceleration[aloft], torch.full_like(acceleration[aloft], -9.81), rtol=0, atol=2.5
+    )
+    # A step in speed would be an acceleration of hundreds of m/s^2.
+    assert float(acceleration.abs().max()) < 30
+
+
+@pytest.mark.parametrize("name", ["running", "striding", "creeping"])
+def test_feet_that_carry_stand_still_at_any_speed(name):
+    people = draw_people(12, PeopleConfig(), torch.Generator().manual_seed(3))
+    low, high = SPEEDS[name]
+    people = people._replace(speed_m_s=torch.linspace(low, high, 12, dtype=torch.float64))
+    time = (torch.arange(800, dtype=torch.float64) / RATE).expand(12, -1)
+    joints = perform(EXERCISES[name], time, people)
+    ankles = torch.stack([joint(joints, "right_ankle"), joint(joints, "left_ankle")], dim=-2)
+    on_floor = ankles[..., 2] < (ANKLE_HEIGHT * people.height_m)[:, None, None] + 0.002
+    on_floor = on_floor[:, 1:] & on_floor[:, :-1]
+    speed = ankles.diff(dim=1).norm(dim=-1) * RATE
+    assert float(on_floor.double().mean()) > 0.3
+    assert float(speed[on_floor].mean()) < 0.05
+    assert float(speed[on_floor].median()) < 0.01
