@@ -176,6 +176,7 @@ def boulic_gait(relative_speed: Tensor, phase: Tensor) -> Gait:
         )
     if not bool(((relative_speed > 0) & (relative_speed <= 3)).all()):
         raise TensorsimError("relative_speed: expected above 0 and at most 3 leg lengths per second")
+    relative_speed = relative_speed.to(phase.dtype)
     curves = control_points(relative_speed)
     rv = relative_speed.unsqueeze(-1)
 
@@ -187,8 +188,9 @@ def boulic_gait(relative_speed: Tensor, phase: Tensor) -> Gait:
         return torch.sin(2 * math.pi * cycles)
 
     quick = rv > 0.5
-    sway = torch.where(quick, -0.032, -0.128 * rv**2 + 0.128 * rv)
-    surge = torch.where(quick, -0.021, -0.084 * rv**2 + 0.084 * rv)
+    # The printed signs of slow sway and surge are the opposite: at 0.5 the body would jump by twice their size.
+    sway = torch.where(quick, -0.032, 0.128 * rv**2 - 0.128 * rv)
+    surge = torch.where(quick, -0.021, 0.084 * rv**2 - 0.084 * rv)
     bow = torch.where(quick, 2.0, -8 * rv**2 + 8 * rv)
     rise = 0.015 * rv
     translation = torch.stack(

@@ -91,9 +91,9 @@ def test_translations_are_the_published_ones() -> None:
     t = np.linspace(0, 1, 50)
     for speed in (0.3, 1.0):
         quick = speed > 0.5
-        lateral = 0.032 if quick else 0.128 * speed**2 - 0.128 * speed
-        forward = -0.021 if quick else -0.084 * speed**2 + 0.084 * speed
-        lateral = abs(lateral) if quick else lateral
+        # Slow walkers sway to the same side as quick ones, against the printed sign.
+        lateral = 0.032 if quick else 0.128 * speed - 0.128 * speed**2
+        forward = -0.021 if quick else 0.084 * speed**2 - 0.084 * speed
         share = 0.752 - 0.143 * math.sqrt(speed) / 1.346
         actual = gait(speed, list(t))["translation"].numpy()
         tau = 2 * math.pi
@@ -154,7 +154,8 @@ def test_ranges_of_speed_join(border: float) -> None:
     phases = [float(p) for p in np.linspace(0, 1, 41)]
     below, above = gait(border - 1e-4, phases), gait(border + 1e-4, phases)
     for field in ("knee", "ankle", "translation", "pelvis", "shoulder", "elbow"):
-        torch.testing.assert_close(below[field], above[field], rtol=0, atol=0.15, msg=field)
+        tolerance = 1e-3 if field == "translation" else 0.15  # leg lengths, degrees
+        torch.testing.assert_close(below[field], above[field], rtol=0, atol=tolerance, msg=field)
     # The hip's one peak becomes two points at 1.3, and the slope at the second is no longer zero.
     torch.testing.assert_close(below["hip"], above["hip"], rtol=0, atol=0.7)
 
@@ -169,6 +170,8 @@ def test_batch_equals_loop_and_float32_is_near() -> None:
     for a, b in zip(whole, boulic_gait(speed.float(), phase.float()), strict=True):
         assert b.dtype == torch.float32
         torch.testing.assert_close(a.float(), b, rtol=0, atol=1e-4)
+    for b in boulic_gait(speed, phase.float()):
+        assert b.dtype == torch.float32
 
 
 def test_gradients_against_finite_differences() -> None:
