@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import BodyPose
-from tensorsim.body.proportions import THIGH
 from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, upright_for
 from tensorsim.motion.feet import soft_reach
 from tensorsim.motion.people import People
@@ -355,24 +354,37 @@ def creep(time: Tensor, who: People) -> Act:
 def crawl(time: Tensor, who: People) -> Act:
     """Goes on hands and knees, a hand with the knee of the other side."""
     v = Vary(who)
-    swing = v(18.0)
-    # The knee that carries stays where it is while the hips pass over it.
-    thigh_m = THIGH * who.height_m[:, None]
-    cycle = 4 * thigh_m * torch.sin(torch.deg2rad(swing)) / who.speed_m_s[:, None]
-    ahead = swing * torch.sin(2 * math.pi * _cycle_share(time, cycle, who))
+    swing, stance = v(18.0), 0.6
+    # The knee that carries stays where it is while the hips pass over it; the other one is lifted to the side.
+    reach_m = (
+        torch.as_tensor(who.proportions.thigh)[:, None]
+        * who.height_m[:, None]
+        * torch.sin(torch.deg2rad(swing))
+    )
+    cycle = 2 * reach_m / (stance * who.speed_m_s[:, None])
+    at = torch.remainder(_cycle_share(time, cycle, who)[..., None] + torch.tensor([0.0, 0.5]), 1.0)
+    knee = _stepped(at, stance)
+    ahead = torch.rad2deg(torch.asin(torch.sin(torch.deg2rad(swing))[..., None] * knee))
+    lifted = torch.sin(math.pi * ((at - stance) / (1 - stance)).clamp(min=0.0)).square()
     lean, arms, elbow = 75.0, 70.0, v(35.0)
     pose = make_pose(
         time,
         who,
         lean=lean,
         nod=-v(30.0),
-        hip=(lean + ahead, lean - ahead),
-        knee=(90 + ahead, 90 - ahead),
-        flexion=(arms - ahead, arms + ahead),
-        elbow=(elbow, elbow),
+        hip=(lean + ahead[..., 0], lean + ahead[..., 1]),
+        knee=(90 + ahead[..., 0], 90 + ahead[..., 1]),
+        flexion=(arms + ahead[..., 1], arms + ahead[..., 0]),
+        elbow=(elbow + 25 * lifted[..., 1], elbow + 25 * lifted[..., 0]),
     )
-    act = on_the_spot(time, pose)
-    return upright_for(act, torch.zeros_like(time))._replace(path=who.speed_m_s[:, None] * time)
+    aside = torch.deg2rad(v(28.0))[..., None] * lifted
+    pose = pose._replace(hip=torch.stack([pose.hip[..., 0], aside], dim=-1))
+    zero = torch.zeros_like(time)
+    # The body is carried by the middle of the ankles, which do not go evenly.
+    return upright_for(on_the_spot(time, pose), zero)._replace(
+        path=who.speed_m_s[:, None] * time,
+        offset=torch.stack([zero, reach_m * knee.mean(dim=-1), zero], dim=-1),
+    )
 
 
 #: The movements of this file by name.

@@ -110,13 +110,17 @@ def test_hands_and_knees_carry_who_crawls():
     time = (torch.arange(800, dtype=torch.float64) / RATE).expand(4, -1)
     joints = perform(EXERCISES["crawling"], time, people)
     height = people.height_m[:, None]
-    for name in ("right_knee", "left_knee", "right_wrist", "left_wrist"):
-        assert float((joint(joints, name)[..., 2] / height).max()) < 0.1
+    for name, most in (("knee", 0.1), ("wrist", 0.14)):
+        up = torch.stack([joint(joints, f"right_{name}"), joint(joints, f"left_{name}")], dim=-1)[..., 2, :]
+        assert float((up / height[..., None]).max()) < most
+        # One carries and the other is lifted.
+        assert float((up / height[..., None]).amin(-1).max()) < 0.07
+        assert float((up / height[..., None]).amax(-1).max()) > 0.06
     fall = joint(joints, "neck")[..., 2] - joint(joints, "right_hip")[..., 2]
     assert float(fall.abs().max()) < 0.2
     knees = torch.stack([joint(joints, "right_knee"), joint(joints, "left_knee")], dim=-2)[..., 1]
     slower = (knees.diff(dim=1) * RATE).amin(-1)
-    assert float((slower.abs() / people.speed_m_s[:, None]).median()) < 0.5
+    assert float((slower.abs() / people.speed_m_s[:, None]).median()) < 0.15
 
 
 def test_hands_of_who_bends_come_to_the_shins():
