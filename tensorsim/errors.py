@@ -3,7 +3,9 @@
 The checks compile under TorchScript, so a scripted graph refuses the same inputs with the same words.
 """
 
+import math
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any
 
 import torch
@@ -214,6 +216,15 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
     if got == per_clip:
         rcs = rcs.unsqueeze(-2)
     return rcs.expand(per_pulse)
+
+
+def check_range(value: object, least: float, most: float, name: str) -> None:
+    """Refuse what is no pair of finite numbers, the first not above the second, from ``least`` to ``most``."""
+    pair = value if isinstance(value, tuple | list) and len(value) == 2 else ()
+    numbers = [float(x) for x in pair if isinstance(x, Real) and math.isfinite(x)]
+    if len(numbers) != 2 or not least <= numbers[0] <= numbers[1] <= most:
+        within = f"within {least} to {most}" if math.isfinite(most) else f"from {least} or more"
+        raise TensorsimError(f"{name}: got {value!r}, expected an ascending range {within}")
 
 
 def check_count(value: int, least: int, most: int, name: str) -> None:

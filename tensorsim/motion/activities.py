@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from numbers import Integral
 from typing import NamedTuple
 
 import torch
@@ -51,6 +52,8 @@ def activity_index(name: str) -> int:
     Raises:
         TensorsimError: no such class; the message lists them.
     """
+    if not isinstance(name, str):
+        raise TensorsimError(f"activity: got {name!r}, expected a name")
     wanted = name.strip().lower()
     for i, full in enumerate(ACTIVITIES):
         if wanted in (full.lower(), full.lower().split(" ", 1)[1], full.lower().split(" ", 1)[0]):
@@ -157,7 +160,7 @@ class ActivityGenerator:
     def generate(
         self,
         activity: str | int | Tensor,
-        batch: int = 1,
+        batch: int | None = None,
         seed: int | torch.Generator = 0,
         duration_s: float = 4.0,
         rate_hz: float = 30.0,
@@ -168,29 +171,30 @@ class ActivityGenerator:
         Args:
             activity: name ("S8 Walking", "walking", "S8") or index of a class for all, or one index per person,
                 an integer tensor (B,), which then is the batch.
-            batch: number of people if ``activity`` is not a tensor and ``people`` not given.
+            batch: number of people, 1 if neither ``activity`` is a tensor nor ``people`` given.
             seed: of the draw, or a generator to go on with.
             duration_s: length of the clip.
             rate_hz: frame k is at ``k / rate_hz``; there are ``round(duration_s * rate_hz)``.
             people: these instead of drawn ones.
 
         Raises:
-            TensorsimError: an unknown activity, a number that is not positive, a clip without a frame, people
-                and activities of different number, or a speed beyond 3 leg lengths per second.
+            TensorsimError: an unknown activity, a number that is not positive, a clip without a frame, people,
+                activities and ``batch`` of different number, or a speed beyond 3 leg lengths per second.
         """
         check_positive(duration_s, "duration_s")
         check_positive(rate_hz, "rate_hz")
         frames = round(duration_s * rate_hz)
         if frames < 1:
             raise TensorsimError(f"generate: got {duration_s} s at {rate_hz} Hz, expected at least one frame")
-        classes = self._classes(activity, batch if people is None else people.height_m.shape[0])
+        if people is not None:
+            people = people.double()
+            if batch not in (None, people.height_m.shape[0]):
+                raise TensorsimError(f"batch: got {batch} for {people.height_m.shape[0]} people")
+            batch = people.height_m.shape[0]
+        classes = self._classes(activity, batch)
         if people is None:
             generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
             people = draw_people(classes.shape[0], self.config, generator)
-        elif people.height_m.shape[0] != classes.shape[0]:
-            raise TensorsimError(
-                f"generate: got {people.height_m.shape[0]} people for {classes.shape[0]} activities"
-            )
         # Knots cover the clip to its end, so that the path in range does not depend on the rate.
         knots = round(duration_s * _KNOT_HZ) + 1 + 2 * _MARGIN
         time = (torch.arange(knots, dtype=torch.float64) - _MARGIN) / _KNOT_HZ
@@ -204,17 +208,26 @@ class ActivityGenerator:
         valid = (classes != 0)[:, None].expand(-1, frames).clone()
         return GeneratedMotion(joints, valid, classes, people)
 
-    def _classes(self, activity: str | int | Tensor, batch: int) -> Tensor:
+    def _classes(self, activity: str | int | Tensor, batch: int | None) -> Tensor:
         if isinstance(activity, str):
             activity = activity_index(activity)
         if not isinstance(activity, Tensor):
-            if batch < 1:
-                raise TensorsimError(f"batch: got {batch}, expected at least 1")
-            activity = torch.full((batch,), activity, dtype=torch.int64)
-        if activity.is_floating_point() or activity.dim() != 1 or activity.shape[0] == 0:
+            if not isinstance(activity, Integral) or isinstance(activity, bool):
+                raise TensorsimError(
+                    f"activity: got {activity!r}, expected a name, an index, or a tensor of indices"
+                )
+            count = 1 if batch is None else batch
+            if count < 1:
+                raise TensorsimError(f"batch: got {count}, expected at least 1")
+            activity = torch.full((count,), int(activity), dtype=torch.int64)
+        if activity.dtype not in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64) or (
+            activity.dim() != 1 or activity.shape[0] == 0
+        ):
             raise TensorsimError(
                 f"activity: got a tensor of {activity.dtype} and shape {list(activity.shape)}, expected (B,) integers"
             )
+        if batch not in (None, activity.shape[0]):
+            raise TensorsimError(f"generate: got {batch} people for {activity.shape[0]} activities")
         if not bool(((activity >= 0) & (activity < len(SCRIPTS))).all()):
             raise TensorsimError(
                 f"activity: got indices {activity.tolist()}, expected 0 to {len(SCRIPTS) - 1}"

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from tensorsim.body.proportions import ANKLE_HEIGHT, TRUNK
 from tensorsim.config import JOINTS, Vector
 from tensorsim.errors import TensorsimError, check_positive
-from tensorsim.motion.limb_scatterers import POINTS, SEGMENTS, TOES, bisector, unit
+from tensorsim.motion.limb_scatterers import POINTS, SEGMENTS, TOES, bisector, toes_of, unit
 from tensorsim.motion.rough_surface import cylinder_rcs, patch_rcs, skin_reflectivity
 from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
 
@@ -192,9 +192,7 @@ class BodyScatterers(nn.Module):
     def _limbs(self, positions: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Points (..., 10 n, 3) of the limbs and their cross sections (..., 10 n)."""
         ankle = self.ankles.to(positions.dtype) @ positions
-        shank = unit(ankle - self.knees.to(positions.dtype) @ positions)
-        forward = unit(torch.cross(right.expand_as(shank), shank, dim=-1))
-        toes = ankle + self.toes_m * forward + self.sole_m * shank
+        toes = toes_of(self.knees.to(positions.dtype) @ positions, ankle, right, self.toes_m, self.sole_m)
         body = torch.cat((positions, toes), -2)
         points = self.limb_points.to(positions.dtype) @ body
         axis = unit(self.limb_axes.to(positions.dtype) @ body)

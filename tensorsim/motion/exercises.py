@@ -213,7 +213,7 @@ def jumping_jack(time: Tensor, who: People) -> Act:
 def box(time: Tensor, who: People) -> Act:
     """Boxes: straight punches right and left in turn out of a low stance, the trunk turning and swaying along."""
     v = Vary(who)
-    every = v(0.55)
+    every = v(0.55) / who.tempo[:, None]
     beat = torch.remainder(time + 2 * every * who.gait_phase[:, None], 2 * every)
 
     def fist(start: Tensor | float) -> Tensor:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from tensorsim.body.proportions import ANKLE_HEIGHT, SHANK, THIGH, TRUNK, UPPER_ARM
 from tensorsim.config import JOINTS, Vector
-from tensorsim.errors import TensorsimError, check_positive
-from tensorsim.motion.scatterers import check_antenna, check_people, one_scene, weights
+from tensorsim.errors import TensorsimError, check_count, check_positive
+from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
 
 #: From the ankle forward to the toes (a foot is 0.152 long).
 TOES = 0.12
@@ -62,6 +62,13 @@ SEGMENTS = (
 def unit(x: Tensor) -> Tensor:
     """Vectors (..., 3) scaled to length 1; finite, with a finite gradient, where they are 0."""
     return x / x.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+
+
+def toes_of(knee: Tensor, ankle: Tensor, right: Tensor, toes_m: float, sole_m: float) -> Tensor:
+    """Toes (..., 2, 3) m of feet at right angles to the shanks and to ``right`` (..., 1, 3), the right of the body."""
+    shank = unit(ankle - knee)
+    forward = unit(torch.cross(right.expand_as(shank), shank, dim=-1))
+    return ankle + toes_m * forward + sole_m * shank
 
 
 def bisector(points: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
@@ -141,8 +148,7 @@ class LimbScatterers(nn.Module):
         check_antenna("tx_m", tx_m)
         check_antenna("rx_m", rx_m)
         check_positive(height_m, "height_m")
-        if per_segment < 1:
-            raise TensorsimError(f"per_segment: got {per_segment}, expected at least 1")
+        check_count(per_segment, 1, 1000, "per_segment")
         if not 0 < reflectivity <= 1:
             raise TensorsimError(f"reflectivity: got {reflectivity}, expected above 0, at most 1")
         self.toes_m = TOES * height_m
@@ -154,10 +160,9 @@ class LimbScatterers(nn.Module):
         along = (torch.arange(per_segment, dtype=torch.float64).reshape(-1, 1) + 0.5) / per_segment
         points = start.unsqueeze(1) + along * (end - start).unsqueeze(1)
         semi_axes = torch.tensor([s.semi_axes for s in SEGMENTS], dtype=torch.float64) * height_m
-        right = {"right_shoulder": 0.5, "right_hip": 0.5, "left_shoulder": -0.5, "left_hip": -0.5}
         knees = weights(JOINTS, {"right_knee": 1.0}, {"left_knee": 1.0})
         ankles = weights(JOINTS, {"right_ankle": 1.0}, {"left_ankle": 1.0})
-        self.register_buffer("right", weights(JOINTS, right), persistent=False)
+        self.register_buffer("right", weights(JOINTS, RIGHTWARD), persistent=False)
         self.register_buffer("knees", knees, persistent=False)
         self.register_buffer("ankles", ankles, persistent=False)
         self.register_buffer("tx", torch.tensor(tx_m, dtype=torch.float64), persistent=False)
@@ -179,7 +184,9 @@ class LimbScatterers(nn.Module):
         """
         check_people(positions, fade, 14)
         right = self.right.to(positions.dtype) @ positions
-        body = torch.cat((positions, self._toes(positions, right)), -2)
+        ankle = self.ankles.to(positions.dtype) @ positions
+        toes = toes_of(self.knees.to(positions.dtype) @ positions, ankle, right, self.toes_m, self.sole_m)
+        body = torch.cat((positions, toes), -2)
         points = self.points.to(positions.dtype) @ body
         along = unit(self.axes.to(positions.dtype) @ body)
         across = unit(right - (right * along).sum(-1, keepdim=True) * along)
@@ -191,10 +198,3 @@ class LimbScatterers(nn.Module):
         cosines = torch.stack((across2, 1 - across2 - along2, along2), -1)
         rcs = self.share * ellipsoid_rcs(self.semi_axes.to(positions.dtype).unsqueeze(-2), cosines)
         return one_scene(points, rcs.flatten(-2), fade)
-
-    def _toes(self, positions: Tensor, right: Tensor) -> Tensor:
-        """Toes (..., 2, 3) of joints (..., 14, 3); ``right`` (..., 1, 3) points to the right of the body."""
-        ankle = self.ankles.to(positions.dtype) @ positions
-        shank = unit(ankle - self.knees.to(positions.dtype) @ positions)
-        forward = unit(torch.cross(right.expand_as(shank), shank, dim=-1))
-        return ankle + self.toes_m * forward + self.sole_m * shank

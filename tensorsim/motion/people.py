@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.proportions import Proportions
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_positive, check_range
 
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
 VARIED_NUMBERS = 24
@@ -67,15 +67,13 @@ class PeopleConfig:
             ("start_range_m", 0.0, FARTHEST_M),
             ("keep_range_m", 0.0, FARTHEST_M),
         ):
-            low, high = getattr(self, name)
-            if not least <= low <= high <= most:
-                raise TensorsimError(
-                    f"PeopleConfig.{name}: got {(low, high)}, expected an ascending range within {least} to {most}"
-                )
-        mean, deviation = self.body_mass_index
-        if not 0 <= 3 * deviation < mean < math.inf:
+            check_range(getattr(self, name), least, most, f"PeopleConfig.{name}")
+        index = self.body_mass_index
+        pair = index if isinstance(index, tuple | list) and len(index) == 2 else ()
+        numbers = [x for x in pair if isinstance(x, int | float)]
+        if len(numbers) != 2 or not 0 <= 3 * numbers[1] < numbers[0] < math.inf:
             raise TensorsimError(
-                f"PeopleConfig.body_mass_index: got {self.body_mass_index}, expected a mean above 3 deviations"
+                f"PeopleConfig.body_mass_index: got {index!r}, expected a mean above 3 deviations"
             )
         for name, most in (
             ("female_share", 1.0),
@@ -86,9 +84,10 @@ class PeopleConfig:
             ("heading_rad", math.pi),
             ("start_side_m", FARTHEST_M),
         ):
-            if not 0 <= getattr(self, name) <= most:
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not 0 <= value <= most:
                 raise TensorsimError(
-                    f"PeopleConfig.{name}: got {getattr(self, name)}, expected a number from 0 to {most}"
+                    f"PeopleConfig.{name}: got {value!r}, expected a number from 0 to {most}"
                 )
 
 
@@ -125,9 +124,27 @@ class People(NamedTuple):
         fields["proportions"] = Proportions(*(torch.as_tensor(p)[index] for p in self.proportions))
         return People(**{k: v if k == "proportions" else v[index] for k, v in fields.items()})
 
+    def double(self) -> "People":
+        """The same people with float64 numbers."""
+        fields = {
+            k: v.double() if v.is_floating_point() else v
+            for k, v in self._asdict().items()
+            if k != "proportions"
+        }
+        sizes = Proportions(*(torch.as_tensor(p).double() for p in self.proportions))
+        return People(**fields, proportions=sizes)
+
 
 def nominal_people(count: int, height_m: float = 1.75, speed_m_s: float = 1.1) -> People:
-    """The mean body without individual deviations: facing the radar from 4 m, right-handed."""
+    """The mean body without individual deviations: facing the radar from 4 m, right-handed.
+
+    Raises:
+        TensorsimError: a count below 1, a height or a speed that is not positive.
+    """
+    if count < 1:
+        raise TensorsimError(f"nominal_people: got count {count}, expected at least 1")
+    check_positive(height_m, "height_m")
+    check_positive(speed_m_s, "speed_m_s")
 
     def full(value: float, *tail: int) -> Tensor:
         return torch.full((count, *tail), value, dtype=torch.float64)
@@ -166,7 +183,7 @@ def draw_people(count: int, config: PeopleConfig, generator: torch.Generator) ->
 
     height = uniform(*config.height_m)
     female = uniform(0, 1) < config.female_share
-    broad = torch.where(female, -0.04, 0.04).double()
+    broad = 0.04 - 0.08 * female.double()
     limbs = 1 + normal(config.limb_deviation, 2.0, len(Proportions._fields))
     sizes = [float(mean) * limbs[:, i] for i, mean in enumerate(Proportions())]
     proportions = Proportions(*sizes)

@@ -64,7 +64,7 @@ class RandomProcess(nn.Module):
 
     Raises:
         TensorsimError: a band that is not ascending and positive, an rms below 0, counts below 1, a time that is
-            not floating point.
+            not floating point, more copies than there are.
     """
 
     frequency_hz: Tensor
@@ -101,5 +101,7 @@ class RandomProcess(nn.Module):
     def forward(self, time_s: Tensor, copies: int | None = None) -> Tensor:
         """Seconds (...) to values (..., copies) of the first ``copies`` processes."""
         check_floating(time_s, "time_s")
+        if copies is not None and not 0 <= copies <= self.phase.shape[0]:
+            raise TensorsimError(f"copies: got {copies}, expected 0 to {self.phase.shape[0]}")
         frequency_hz, phase = self.frequency_hz.double()[:copies], self.phase.double()[:copies]
         return sinusoids(time_s, frequency_hz, self.amplitude.double(), phase)

@@ -17,7 +17,11 @@ def polynomial_basis(window: int, order: int) -> Tensor:
     window.
     """
     points = torch.linspace(-1, 1, window, dtype=torch.float64)
-    basis: Tensor = torch.linalg.qr(points.unsqueeze(-1) ** torch.arange(order + 1))[0]
+    # Legendre polynomials by their recurrence: powers of high order are nearly parallel.
+    legendre = [torch.ones_like(points), points]
+    for k in range(1, order):
+        legendre.append(((2 * k + 1) * points * legendre[k] - k * legendre[k - 1]) / (k + 1))
+    basis: Tensor = torch.linalg.qr(torch.stack(legendre[: order + 1], dim=-1))[0]
     return basis
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import JOINTS
-from tensorsim.errors import TensorsimError, check_floating, check_points, check_positive
+from tensorsim.errors import TensorsimError, check_floating, check_points, check_positive, check_range
 from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
@@ -60,15 +60,14 @@ class VitalSigns(nn.Module):
         super().__init__()
         check_positive(rate_hz, "rate_hz")
         ranges = {"breath_m": breath_m, "breath_hz": breath_hz, "heart_m": heart_m, "heart_hz": heart_hz}
-        for name, (low, high) in ranges.items():
-            if not 0 <= low <= high < math.inf:
-                raise TensorsimError(f"{name}: got {(low, high)}, expected an ascending range from 0 or more")
+        for name, bounds in ranges.items():
+            check_range(bounds, 0, math.inf, name)
         if people < 1:
             raise TensorsimError(f"people: got {people}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         draw = torch.rand(3, 2, people, generator=generator, dtype=torch.float64)
-        bounds = torch.tensor(((breath_m, heart_m), (breath_hz, heart_hz)), dtype=torch.float64)
-        drawn = torch.lerp(bounds[..., :1], bounds[..., 1:], draw[:2])
+        both = torch.tensor(((breath_m, heart_m), (breath_hz, heart_hz)), dtype=torch.float64)
+        drawn = torch.lerp(both[..., :1], both[..., 1:], draw[:2])
         self.rate_hz, self.people = float(rate_hz), people
         self.wander = RandomProcess(torch.ones_like, WANDER_HZ, WANDER_CYCLES, 2 * people, seed, 12)
         trunk = {"neck": 1.0, "right_hip": -0.5, "left_hip": -0.5}

@@ -334,7 +334,14 @@ def test_names_numbers_and_indices() -> None:
         ({"activity": torch.zeros(2)}, "got a tensor of torch.float32"),
         ({"activity": torch.zeros(0, dtype=torch.int64)}, r"shape \[0\]"),
         ({"activity": torch.tensor(3)}, r"shape \[\]"),
+        ({"activity": 3.7}, "activity: got 3.7, expected a name, an index, or a tensor of indices"),
+        ({"activity": True}, "activity: got True"),
+        ({"activity": [1, 2]}, r"activity: got \[1, 2\]"),
+        ({"activity": None}, "activity: got None"),
+        ({"activity": torch.tensor([True])}, "got a tensor of torch.bool"),
         ({"activity": 1, "batch": 0}, "batch: got 0"),
+        ({"activity": 1, "batch": 5, "people": nominal_people(3)}, "batch: got 5 for 3 people"),
+        ({"activity": torch.tensor([1, 2]), "batch": 5}, "got 5 people for 2 activities"),
         ({"activity": 1, "rate_hz": 0.0}, "rate_hz: got 0.0"),
         ({"activity": 1, "duration_s": -1.0}, "duration_s: got -1.0"),
         ({"activity": 1, "duration_s": 0.001}, "at least one frame"),
@@ -405,6 +412,11 @@ def test_paths_stay_in_sight() -> None:
         ({"female_share": 1.5}, "female_share: got 1.5, expected a number from 0 to 1"),
         ({"variation": 0.5}, "variation: got 0.5"),
         ({"limb_deviation": -0.1}, "limb_deviation"),
+        ({"height_m": 1.75}, "height_m: got 1.75, expected an ascending range within 0.5 to 2.5"),
+        ({"speed_m_s": (1.0,)}, r"speed_m_s: got \(1.0,\)"),
+        ({"tempo": (1, 2, 3)}, r"tempo: got \(1, 2, 3\)"),
+        ({"body_mass_index": 23}, "body_mass_index: got 23"),
+        ({"heading_rad": "x"}, "heading_rad: got 'x', expected a number from 0 to"),
     ],
 )
 def test_people_config_refuses(arguments: dict[str, Any], message: str) -> None:
@@ -433,6 +445,39 @@ def test_nobody_walks_faster_than_the_gait_is_known() -> None:
     dashing = nominal_people(1, height_m=0.8, speed_m_s=2.0)
     with pytest.raises(TensorsimError, match="at most 3 leg lengths per second"):
         ActivityGenerator().generate("walking", people=dashing)
+
+
+def test_people_of_other_dtypes_move_alike() -> None:
+    people = nominal_people(2)
+    alike = people._replace(height_m=people.height_m.float(), tempo=people.tempo.float())
+    one, other = (ActivityGenerator().generate("punching", people=who).joints for who in (people, alike))
+    assert other.dtype == torch.float64
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
+
+
+def test_people_do_not_depend_on_the_default_dtype() -> None:
+    drawn = [draw_people(4, PeopleConfig(), torch.Generator().manual_seed(0))]
+    torch.set_default_dtype(torch.float64)
+    try:
+        drawn.append(draw_people(4, PeopleConfig(), torch.Generator().manual_seed(0)))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    one, other = (torch.as_tensor(people.proportions.half_hips) for people in drawn)
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [((0,), "count 0"), ((1, -1.0), "height_m: got -1.0"), ((1, 1.7, 0.0), "speed_m_s: got 0.0")],
+)
+def test_nominal_people_refuses(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        nominal_people(*arguments)
+
+
+def test_only_names_have_an_index() -> None:
+    with pytest.raises(TensorsimError, match="activity: got 3, expected a name"):
+        activity_index(3)  # type: ignore[arg-type]
 
 
 def test_nobody_cannot_be_drawn() -> None:

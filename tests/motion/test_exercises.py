@@ -7,7 +7,7 @@ from tensorsim.body.proportions import ANKLE_HEIGHT
 from tensorsim.config import JOINTS
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import EXERCISES
-from tensorsim.motion.people import PeopleConfig, draw_people
+from tensorsim.motion.people import PeopleConfig, draw_people, nominal_people
 from tensorsim.motion.scripts import grab
 
 RATE = 200.0
@@ -185,3 +185,14 @@ def test_feet_that_carry_stand_still_at_any_speed(name):
     assert float(on_floor.double().mean()) > 0.3
     assert float(speed[on_floor].mean()) < 0.05
     assert float(speed[on_floor].median()) < 0.01
+
+
+@pytest.mark.parametrize("name", ["boxing", "falling"])
+def test_a_lower_tempo_is_slower(name):
+    time = (torch.arange(round(3 * RATE), dtype=torch.float64) / RATE)[None]
+    fastest = {}
+    for tempo in (0.5, 1.0):
+        people = nominal_people(1)._replace(tempo=torch.full((1,), tempo, dtype=torch.float64))
+        joints = perform(EXERCISES[name], time, people)
+        fastest[tempo] = float((joint(joints, "right_wrist").diff(dim=1).norm(dim=-1) * RATE).max())
+    assert fastest[0.5] < 0.7 * fastest[1.0]

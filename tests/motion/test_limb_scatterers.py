@@ -259,6 +259,7 @@ def test_no_people_are_no_scatterers() -> None:
         ({"tx_m": (0.0, 0.0)}, "tx_m: got .* three finite numbers"),
         ({"rx_m": ((0.0, 0.0, 0.0),) * 3}, "rx_m: got"),
         ({"per_segment": 0}, "per_segment: got 0"),
+        ({"per_segment": 1.5}, "per_segment: got 1.5"),
         ({"height_m": -1.0}, "height_m: got -1.0"),
         ({"reflectivity": 1.1}, "reflectivity: got 1.1"),
     ],

@@ -10,7 +10,7 @@ from scipy.signal import savgol_filter
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.motion.savgol import SavitzkyGolay, savitzky_golay
+from tensorsim.motion.savgol import SavitzkyGolay, polynomial_basis, savitzky_golay
 from tests.stage import StageTester, assert_same
 
 
@@ -133,6 +133,14 @@ def test_smooths_real_motion_as_scipy_does(shared_data: Any) -> None:
             np.testing.assert_allclose(
                 SavitzkyGolay(31, 3)(torch.from_numpy(x)).numpy(), expected, rtol=0, atol=1e-6
             )
+
+
+def test_polynomials_of_high_order_span_their_space() -> None:
+    """Against the projector by NumPy's Legendre polynomials, solved by least squares."""
+    legendre = np.polynomial.legendre.legvander(np.linspace(-1, 1, 101), 40)
+    expected = legendre @ np.linalg.pinv(legendre)
+    basis = polynomial_basis(101, 40).numpy()
+    np.testing.assert_allclose(basis @ basis.T, expected, atol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,13 @@ def test_spectrum_of_sway() -> None:
         assert level(hz) - level(0.075) == pytest.approx(expected, abs=1.5)
 
 
+def test_there_are_no_more_processes_than_copies() -> None:
+    process = RandomProcess(sway_spectrum, (0.03, 4.0), 0.005, 2, 0)
+    assert process(torch.zeros(3), 1).shape == (3, 1)
+    with pytest.raises(TensorsimError, match="copies: got 5, expected 0 to 2"):
+        process(torch.zeros(3), 5)
+
+
 def test_processes_are_independent() -> None:
     process = RandomProcess(sway_spectrum, (0.03, 4.0), 1.0, 4, 0)
     values = process(torch.arange(20000, dtype=torch.float64) / 4)

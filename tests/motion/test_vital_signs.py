@@ -91,6 +91,7 @@ def test_pieces_join_and_people_differ() -> None:
     [
         ({"rate_hz": -1.0}, "rate_hz: got -1.0"),
         ({"breath_m": (0.01, 0.005)}, "breath_m: got"),
+        ({"breath_m": 0.01}, "breath_m: got 0.01, expected an ascending range from 0 or more"),
         ({"heart_hz": (-1.0, 1.0)}, "heart_hz: got"),
         ({"people": 0}, "people: got 0"),
     ],
