@@ -38,7 +38,8 @@ class PeopleConfig:
         left_handed_share: probability of the mirrored movement.
         variation: largest relative deviation of each angle and moment of a movement.
         tempo: speed of punches, kicks and falls: 1 is that of trained strikes and of a fall without resistance,
-            whose ankles, fists and heads reach 8, 5 and 6 m/s; less for people who act them out in a room.
+            whose ankles, fists and heads reach 8, 5 and 6 m/s; less for people who act them out in a room. Nobody falls
+            faster than at 1.
 
     Raises:
         TensorsimError: a range that is not ascending and finite, a share outside of [0, 1], a number that is not

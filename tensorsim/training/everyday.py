@@ -34,6 +34,8 @@ PEOPLE = PeopleConfig(
 SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
 #: Shares of those who walk in curves and of those who walk round corners.
 _STROLLING, _CORNERING = 0.3, 0.25
+#: Slowest and fastest clock of falls: gravity does not let them go faster.
+_FALLING = (0.8, 1.05)
 #: Steps per second of those who step about while they do something.
 _STEPS_HZ = 1.0
 
@@ -90,12 +92,12 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (Variant(scripts.walk_to_sit, 0.8, 2.8, 1.0, (0.8, 1.15)),),
     (Variant(scripts.fall_to_walk, 0.25, 2.6, 1.0, (0.7, 1.2)),),
     (
-        Variant(scripts.walk_to_fall, 1.3, 1.8, 0.12, (0.8, 1.2)),
-        Variant(everyday.walk_and_fall_any_way, -0.2, 1.8, 0.21, (0.8, 1.2)),
-        Variant(everyday.walk_and_slip, -0.8, 2.2, 0.12, (0.8, 1.3)),
-        Variant(everyday.fall_any_way, 0.0, 1.8, 0.27, (0.75, 1.2)),
-        Variant(everyday.fall_onto_seat, 0.0, 1.4, 0.14, (0.8, 1.3)),
-        Variant(everyday.fall_on_knees, 0.0, 1.8, 0.14, (0.8, 1.3)),
+        Variant(scripts.walk_to_fall, 1.3, 1.8, 0.12, _FALLING),
+        Variant(everyday.walk_and_fall_any_way, -0.2, 1.8, 0.21, _FALLING),
+        Variant(everyday.walk_and_slip, -0.8, 2.2, 0.12, _FALLING),
+        Variant(everyday.fall_any_way, 0.0, 1.8, 0.27, _FALLING),
+        Variant(everyday.fall_onto_seat, 0.0, 1.4, 0.14, _FALLING),
+        Variant(everyday.fall_on_knees, 0.0, 1.8, 0.14, _FALLING),
     ),
 )
 

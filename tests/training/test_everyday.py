@@ -26,6 +26,16 @@ def test_every_activity_but_the_empty_one_has_variants():
         assert sum(variant.share for variant in variants) == pytest.approx(1.0)
 
 
+def test_no_clock_makes_falls_faster_than_gravity_does():
+    assert all(variant.rate[1] <= 1.05 for variant in everyday.VARIANTS[11])
+    joints, _ = motion(11, 40)
+    hips = joints[:, :, (8, 11), 2].mean(2)
+    lag = max(1, round(KNOT_HZ / 25))
+    sinking = hips[:, ::lag].diff(n=2, dim=1) * (KNOT_HZ / lag) ** 2
+    assert float(sinking.amin(1).median()) > -9.81
+    assert float(sinking.amin(1).min()) > -1.7 * 9.81
+
+
 def test_walks_have_all_headings_and_half_of_them_turn():
     joints, _ = motion(7, 60)
     hips = joints[:, :, (8, 11), :2].mean(2)
