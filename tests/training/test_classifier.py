@@ -218,3 +218,17 @@ def test_masks_are_bands_within_their_limits_drawn_anew_for_each_look(store: Map
     assert torch.equal(noted.sample(3)["picture"], noted.sample(3)["picture"])
     with pytest.raises(TensorsimError, match="masks: got"):
         recipe(store, masks=(0.0, 1.5))
+
+
+def test_masks_do_not_depend_on_the_ratio(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    ratios: list[float] = []
+
+    def blank(store: MapStore, clip: object, snr_db: float, size: int) -> Tensor:
+        ratios.append(snr_db)
+        return torch.ones(1, 100, 100)
+
+    noted = recipe(store, masks=(0.5, 0.5))
+    monkeypatch.setattr("tensorsim.training.classifier.picture", blank)
+    looks = torch.stack([noted.sample(index)["picture"][0] for index in range(200)])
+    rows, columns = ((looks == 0).all(dim).sum(-1).float() for dim in (-1, -2))
+    assert torch.corrcoef(torch.stack([torch.tensor(ratios), rows, columns]))[0, 1:].abs().max() < 0.25
