@@ -25,38 +25,44 @@ HALF_PRECISION = 0.01
 def measure(
     detector: RTMDet | AcfDetector, samples: Sequence[Sample], score: float = 0.5
 ) -> dict[str, float]:
-    """Figures of a detector on pictures in which everybody is labelled.
+    """Figures of a detector on pictures in which everybody is labelled or in a crowd that is.
+
+    Detections that lie in a crowd, by at least the overlap in question, count neither way.
 
     Returns:
         ``ap`` and ``ap50`` as COCO defines them (averaged over overlaps from 0.5 to 0.95, and at 0.5), and with
         detections of more than ``score``: ``recall`` and ``recall_large`` (share of the people, and of those
         taller than a fifth of their picture, that one detection overlaps by at least 0.5),
         ``false_per_picture`` (detections that overlap nobody by 0.5) and ``alarms_per_picture`` (detections per
-        picture without people; NaN if there is none).
+        picture without people or crowds; NaN if there is none).
 
     Raises:
         TensorsimError: no people, or the libraries for average precision are missing.
     """
     found = large = found_large = people = wrong = alarms = empty = 0
     truths: list[Tensor] = []
+    crowds: list[Tensor] = []
     found_boxes: list[Tensor] = []
     for sample in samples:
         boxes, scores = people_in(detector, sample)
-        truth = torch.from_numpy(sample.boxes)
+        truth, crowd = torch.from_numpy(sample.boxes), torch.from_numpy(sample.crowds)
         truths.append(truth)
+        crowds.append(crowd)
         found_boxes.append(torch.cat([boxes, scores[:, None]], dim=1))
-        hit = _matches(boxes[scores > score], truth)
+        sure = boxes[scores > score]
+        hit = _matches(sure, truth)
         tall = (truth[:, 3] - truth[:, 1]) > 0.2 * sample.image().shape[0]
         people += len(truth)
         found += int(hit.any(dim=0).sum())
         large += int(tall.sum())
         found_large += int((hit.any(dim=0) & tall).sum())
-        wrong += int((~hit.any(dim=1)).sum())
-        alarms += len(hit) if len(truth) == 0 else 0
-        empty += len(truth) == 0
+        wrong += int((~hit.any(dim=1) & ~_in_crowd(sure, crowd)).sum())
+        nobody = len(truth) + len(crowd) == 0
+        alarms += len(hit) if nobody else 0
+        empty += nobody
     if people == 0:
         raise TensorsimError(f"detector: got {len(samples)} pictures without people, expected some with")
-    ap, ap50 = average_precision(truths, found_boxes)
+    ap, ap50 = average_precision(truths, found_boxes, crowds)
     return {
         "ap": ap,
         "ap50": ap50,
@@ -68,12 +74,15 @@ def measure(
     }
 
 
-def average_precision(truths: Sequence[Tensor], found: Sequence[Tensor]) -> tuple[float, float]:
+def average_precision(
+    truths: Sequence[Tensor], found: Sequence[Tensor], crowds: Sequence[Tensor] = ()
+) -> tuple[float, float]:
     """COCO's average precision over overlaps from 0.5 to 0.95, and at 0.5, by its own evaluator.
 
     Args:
         truths: per picture (n, 4) ``xyxy``.
         found: per picture (m, 5) ``xyxy`` and score.
+        crowds: per picture (k, 4) ``xyxy``; what is found in them does not count.
     """
     try:
         from pycocotools.coco import COCO
@@ -81,30 +90,29 @@ def average_precision(truths: Sequence[Tensor], found: Sequence[Tensor]) -> tupl
     except ImportError as error:
         raise TensorsimError(f"average precision: {error}; install tensorsim[train]") from error
 
-    def rows(tables: Sequence[Tensor]) -> list[dict[str, Any]]:
+    def rows(people: Sequence[Tensor], crowds: Sequence[Tensor] = ()) -> list[dict[str, Any]]:
         result: list[dict[str, Any]] = []
-        for picture, table in enumerate(tables, start=1):
-            for left, top, right, bottom, *score in table.tolist():
-                size = (right - left, bottom - top)
-                row: dict[str, Any] = {
-                    "id": len(result) + 1,
-                    "image_id": picture,
-                    "category_id": 1,
-                    "iscrowd": 0,
-                }
-                row |= {
-                    "bbox": [left, top, *size],
-                    "area": size[0] * size[1],
-                    "score": score[0] if score else 1.0,
-                }
-                result.append(row)
+        for is_crowd, tables in enumerate((people, crowds)):
+            for picture, table in enumerate(tables, start=1):
+                for left, top, right, bottom, *score in table.tolist():
+                    size = (right - left, bottom - top)
+                    row: dict[str, Any] = {
+                        "id": len(result) + 1,
+                        "image_id": picture,
+                        "category_id": 1,
+                        "iscrowd": is_crowd,
+                        "bbox": [left, top, *size],
+                        "area": size[0] * size[1],
+                        "score": score[0] if score else 1.0,
+                    }
+                    result.append(row)
         return result
 
     with contextlib.redirect_stdout(io.StringIO()):  # it prints its progress
         labels = COCO()
         images = [{"id": picture} for picture in range(1, len(truths) + 1)]
         labels.dataset = {
-            "images": images, "categories": [{"id": 1, "name": "person"}], "annotations": rows(truths)
+            "images": images, "categories": [{"id": 1, "name": "person"}], "annotations": rows(truths, crowds)
         }  # fmt: skip
         labels.createIndex()
         answers = COCO()
@@ -163,6 +171,14 @@ def calibrate(detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: f
 def _matches(boxes: Tensor, truth: Tensor) -> Tensor:
     """(n, m) bool, which detections overlap whom by at least one half."""
     return box_iou(boxes[:, None], truth[None]) >= 0.5
+
+
+def _in_crowd(boxes: Tensor, crowds: Tensor) -> Tensor:
+    """(n,) bool, which detections (n, 4) lie by at least one half in one of the crowds (m, 4)."""
+    low = torch.maximum(boxes[:, None, :2], crowds[None, :, :2])
+    high = torch.minimum(boxes[:, None, 2:], crowds[None, :, 2:])
+    shared = (high - low).clamp_min(0).prod(-1)
+    return (shared >= 0.5 * (boxes[:, 2:] - boxes[:, :2]).prod(-1)[:, None]).any(1)
 
 
 class Followed(NamedTuple):

@@ -11,7 +11,7 @@ import json
 import os
 import tarfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ class Sample:
         path: the file with the picture: a jpg, or a tar.
         offset: of the picture in the file, in bytes.
         size: length in bytes; None is up to the end.
+        crowds: (m, 4) float32 ``xyxy`` pixels, regions in which people are not labelled one by one.
     """
 
     key: str
@@ -56,6 +57,7 @@ class Sample:
     path: Path
     offset: int = 0
     size: int | None = None
+    crowds: Floats = field(default_factory=lambda: np.zeros((0, 4), np.float32))
 
     def image(self) -> npt.NDArray[np.uint8]:
         """Decode the picture: (H, W, 3) uint8 RGB.
@@ -135,7 +137,7 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
         images: folder of the pictures.
 
     Returns:
-        Samples; ``all_labelled`` is False where a crowd is marked, which has no boxes.
+        Samples; ``all_labelled`` is False where a crowd is marked.
 
     Raises:
         TensorsimError: no such file, or not a COCO annotation file.
@@ -145,22 +147,21 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
         content = json.loads(path.read_text(encoding="utf-8"))
         people = {c["id"] for c in content["categories"] if c["name"] == "person"}
         persons: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in content["images"]}
-        crowded = set()
+        crowds: dict[int, list[dict[str, Any]]] = {key: [] for key in persons}
         for annotation in content["annotations"]:
             if annotation["category_id"] not in people:
                 continue
-            if annotation.get("iscrowd", 0):
-                crowded.add(annotation["image_id"])
-                continue
             points = annotation.get("keypoints")
             rows = None if points is None else np.reshape(points, (len(COCO_KEYPOINTS), 3)).tolist()
-            persons[annotation["image_id"]].append(annotation | {"keypoints": rows})
+            kind = crowds if annotation.get("iscrowd", 0) else persons
+            kind[annotation["image_id"]].append(annotation | {"keypoints": rows})
         return [
             Sample(
                 Path(image["file_name"]).stem,
                 *_labels(persons[image["id"]]),
-                image["id"] not in crowded,
+                not crowds[image["id"]],
                 folder / image["file_name"],
+                crowds=_labels(crowds[image["id"]])[0],
             )
             for image in content["images"]
         ]

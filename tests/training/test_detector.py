@@ -23,6 +23,7 @@ from tensorsim.training.detector_metrics import (
     people_in,
 )
 from tensorsim.training.loop import LoopConfig, fit
+from tensorsim.training.shards import read_coco_folder
 from tensorsim.types import Detections, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.detection.rtmdet_layers import RTMDET_SIZES, RTMDetSize
@@ -259,6 +260,44 @@ def test_figures_of_a_detector_that_is_told_the_answer(tmp_path: Path) -> None:
     assert figures["people"] == 1
     with pytest.raises(TensorsimError, match="without people"):
         measure(Told(), samples[1:])  # type: ignore[arg-type]
+
+
+def test_what_is_found_in_a_crowd_does_not_count(tmp_path: Path) -> None:
+    """As COCO's own evaluator has it, from a COCO file."""
+    (tmp_path / "images").mkdir()
+    person = {"category_id": 1, "image_id": 1, "bbox": [10, 10, 50, 80], "area": 2000, "keypoints": [0] * 51}
+    crowd = {"category_id": 1, "iscrowd": 1, "keypoints": [0] * 51}
+    annotations = [
+        person,
+        crowd | {"image_id": 1, "bbox": [100, 10, 90, 180], "area": 16200},
+        crowd | {"image_id": 2, "bbox": [0, 0, 160, 200], "area": 32000},
+    ]
+    images = [{"id": i, "file_name": f"{i}.png"} for i in (1, 2)]
+    for image in images:
+        path = tmp_path / "images" / str(image["file_name"])
+        path.write_bytes(encoded(np.zeros((200, 200, 3), np.uint8), ".png"))
+    categories = [{"id": 1, "name": "person"}]
+    content = {"images": images, "categories": categories, "annotations": annotations}
+    (tmp_path / "people.json").write_text(json.dumps(content))
+
+    class Told(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.register_buffer("mean", torch.zeros(1))
+
+        def forward(self, images: Tensor) -> Detections:
+            boxes = torch.tensor([[[10.0, 10, 60, 90], [110, 20, 150, 100], [155, 100, 165, 180]]])
+            scores = torch.tensor([[0.6, 0.9, 0.8]])
+            return Detections(boxes, scores, torch.zeros(1, 3, dtype=torch.int64), scores > 0)
+
+    samples = read_coco_folder(tmp_path)
+    figures = measure(Told(), samples[:1])  # type: ignore[arg-type]
+    assert (figures["ap"], figures["false_per_picture"]) == pytest.approx((1, 0))
+    # In the second picture the last one lies in the crowd by just a half.
+    figures = measure(Told(), samples)  # type: ignore[arg-type]
+    assert (figures["ap50"], figures["false_per_picture"]) == pytest.approx((1, 0))
+    assert figures["ap"] < 1
+    assert np.isnan(figures["alarms_per_picture"])
 
 
 def test_calibrated_scores_mean_the_same_number_of_alarms(tmp_path: Path, recipe: DetectorRecipe) -> None:

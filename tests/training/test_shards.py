@@ -119,6 +119,7 @@ def test_coco_file(tmp_path: Path) -> None:
     assert one.all_labelled
     assert not crowd.all_labelled
     assert len(crowd.boxes) == 0
+    np.testing.assert_array_equal(crowd.crowds, [[0, 0, 9, 9]])
     path.write_text("{}")
     with pytest.raises(TensorsimError, match="COCO"):
         read_coco(path, tmp_path)
