@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tensorsim.geometry.boxes import LETTERBOX_GREY
-from tensorsim.training.colours import Picture
+from tensorsim.training.colours import Picture, over, premultiplied
 from tensorsim.training.shards import Floats, Sample
 from tensorsim.training.views import Doubles, warp_boxes, warp_points
 
@@ -115,7 +115,7 @@ class Canvas:
         """Put a cut-out into a rectangle, at a random scale and place, partly outside at times.
 
         Args:
-            rgba: the cut-out.
+            rgba: the cut-out (h, w, 4), straight alpha.
             rect: left, top, right and bottom of the rectangle.
             rng: random numbers.
             beside: left, top, width and height of somebody whom it stands close to, as large and as low as that
@@ -135,7 +135,7 @@ class Canvas:
         if rng.random() < 0.5:
             rgba = np.ascontiguousarray(rgba[:, ::-1])
         how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        rgba = cv2.resize(rgba, size, interpolation=how).astype(np.uint8)
+        rgba = cv2.resize(premultiplied(rgba), size, interpolation=how).astype(np.uint8)
         x = left + round(rng.uniform(-0.3, 1.0) * (right - left) - 0.35 * size[0] * rng.random())
         y = top + round(rng.uniform(-0.1, 1.0) * max(bottom - top - 0.7 * size[1], 1))
         if beside is not None:
@@ -177,7 +177,7 @@ class Canvas:
             coarse[[0, -1]] *= 0.4
             coarse[:, [0, -1]] *= 0.4
             alpha = (cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC) > 0.35).astype(np.uint8) * 255
-        rgba = np.dstack([piece, cv2.blur(alpha, (2, 2)).astype(np.uint8)])
+        rgba = premultiplied(np.dstack([piece, cv2.blur(alpha, (2, 2)).astype(np.uint8)]))
         corner = (
             left + int(rng.uniform(-0.1, 1) * (right - left)),
             top + int(rng.uniform(-0.1, 1) * (bottom - top)),
@@ -187,16 +187,14 @@ class Canvas:
     def _put(
         self, rgba: Picture, corner: tuple[int, int], rect: tuple[int, int, int, int], owner: int
     ) -> None:
-        """Blend a cut-out in with its corner there, as far as it is within the rectangle."""
+        """Put a cut-out (:func:`premultiplied`) with its corner there, as far as it is within the rectangle."""
         (x, y), (left, top, right, bottom) = corner, rect
         height, width = rgba.shape[:2]
         x0, y0, x1, y1 = max(x, left), max(y, top), min(x + width, right), min(y + height, bottom)
         if x1 - x0 < 4 or y1 - y0 < 4:
             return
         part = rgba[y0 - y : y1 - y, x0 - x : x1 - x]
-        alpha = part[..., 3:].astype(np.float32) / 255
-        ground = self.image[y0:y1, x0:x1]
-        self.image[y0:y1, x0:x1] = (part[..., :3] * alpha + ground * (1 - alpha) + 0.5).astype(np.uint8)
+        self.image[y0:y1, x0:x1] = over(self.image[y0:y1, x0:x1], part)
         self.owner[y0:y1, x0:x1][part[..., 3] > 127] = owner
 
     def final_boxes(self) -> Floats:

@@ -1,4 +1,4 @@
-"""Changes of the light, the colours and the quality of pictures, as cameras and video files differ."""
+"""Changes of light, colours and quality of pictures, as cameras and video files differ; cut-outs in front of others."""
 
 from typing import Any
 
@@ -38,3 +38,15 @@ def compressed(image: Picture, quality: int) -> Picture:
     data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     decoded: Any = cv2.imdecode(data, cv2.IMREAD_COLOR)  # both take the channels in one order
     return decoded.astype(np.uint8, copy=False)
+
+
+def premultiplied(rgba: Picture) -> Picture:
+    """A cut-out (h, w, 4) of straight alpha with its colours multiplied by alpha, so that they can be interpolated."""
+    alpha = rgba[..., 3:].astype(np.uint16)
+    return np.concatenate([(rgba[..., :3] * alpha + 127) // 255, alpha], -1).astype(np.uint8)
+
+
+def over(image: Picture, cutout: Picture) -> Picture:
+    """A picture (h, w, 3) with a cut-out (h, w, 4), as :func:`premultiplied` gives it, in front of it."""
+    rest = 255 - cutout[..., 3:].astype(np.uint16)
+    return np.minimum(cutout[..., :3] + (image * rest + 127) // 255, 255).astype(np.uint8)

@@ -15,10 +15,10 @@ import numpy.typing as npt
 from tensorsim.body.skeleton import MIRRORED
 from tensorsim.config import COCO_KEYPOINTS
 from tensorsim.errors import TensorsimError
+from tensorsim.training.colours import Picture, over, premultiplied
 from tensorsim.training.cutouts import Cutouts
 from tensorsim.training.shards import Floats, Sample
 
-Picture = npt.NDArray[np.uint8]
 Doubles = npt.NDArray[np.float64]
 
 PADDING = 1.25  # of the boxes, as TopDownPose has it
@@ -345,19 +345,9 @@ class RenderedPeople:
         rgba, keypoints = np.pad(cutout.rgba, ((2, 2), (2, 2), (0, 0))), cutout.keypoints.copy()
         keypoints[:, :2] += 2
         # Multiplied with alpha, colours can be interpolated.
-        crop = crop_person(_premultiplied(rgba), box + 2, keypoints, size, augmentation, generator)
+        crop = crop_person(premultiplied(rgba), box + 2, keypoints, size, augmentation, generator)
         place = random_view(self.places[int(generator.integers(len(self.places)))].image(), size, generator)
-        return crop._replace(image=_over(place, crop.image))
-
-
-def _premultiplied(rgba: Picture) -> Picture:
-    alpha = rgba[..., 3:].astype(np.uint16)
-    return np.concatenate([(rgba[..., :3] * alpha + 127) // 255, alpha], -1).astype(np.uint8)
-
-
-def _over(image: Picture, premultiplied: Picture) -> Picture:
-    rest = 255 - premultiplied[..., 3:].astype(np.uint16)
-    return np.minimum(premultiplied[..., :3] + (image * rest + 127) // 255, 255).astype(np.uint8)
+        return crop._replace(image=over(place, crop.image))
 
 
 def random_view(image: Picture, size: tuple[int, int], generator: np.random.Generator) -> Picture:

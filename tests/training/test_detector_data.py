@@ -194,6 +194,18 @@ def test_boxes_of_cut_outs_are_of_what_is_seen(sources: Sources, seed: int) -> N
     assert (covered | doubtful)[green].mean() > 0.97
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_cut_outs_have_no_dark_rim(seed: int) -> None:
+    """Where they end, their colour and that of the ground mix, but not the black beyond the outline."""
+    alpha = cv2.ellipse(np.zeros((90, 40), np.uint8), (20, 45), (17, 42), 0, 0, 360, 255, -1)
+    white = np.dstack([np.where(alpha[..., None] > 0, np.uint8(255), np.uint8(0)).repeat(3, 2), alpha])
+    canvas = Canvas(160)
+    canvas.image[:] = 255
+    canvas.paste(white, (0, 0, 160, 160), np.random.default_rng(seed))
+    assert (canvas.owner == 1).any()
+    assert canvas.image.min() >= 253
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_somebody_beside_another_stands_close(sources: Sources, seed: int) -> None:
     canvas, rng = Canvas(400), np.random.default_rng(seed)
