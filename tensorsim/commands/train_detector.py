@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tensorsim.commands.training import PeopleOptions
+from tensorsim.commands.training import PeopleOptions, digest
 from tensorsim.exceptions import check_positive
 
 
@@ -55,6 +55,7 @@ class TrainDetector(PeopleOptions):
         sources, held_out = read_sources(self.data)
         sources = replace(sources, cutouts=self.rendered_people() or ())
         recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate, teacher=teacher)
+        recipe.settings["teacher"] = digest(self.teacher)
         detector = RTMDet.from_pretrained(self.train(recipe, loop))
         calibrate(detector, held_out)
         calibrated = self.out / "detector.safetensors"

@@ -1,5 +1,6 @@
 """Options that all training commands share, and the run that they describe."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -74,11 +75,19 @@ class TrainOptions:
         from tensorsim.device import rank_and_processes
         from tensorsim.training.loop import fit
 
+        recipe.settings["init"] = digest(self.init)
         figures = fit(recipe, loop)
         best = self.out / "best.safetensors"
         if rank_and_processes()[0] == 0:  # the others do not validate
             print(f"{best}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
         return best
+
+
+def digest(weights: Path | None) -> str | None:
+    """Of the content of a weight file: another file of the same path is another start."""
+    from tensorsim.registry import locate
+
+    return None if weights is None else hashlib.sha256(locate(weights).read_bytes()).hexdigest()[:16]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -165,7 +165,6 @@ class ClassifierRecipe(Recipe):
             "snr_db": list(snr_db),
             "seed": seed,
             "store_seed": store.settings.seed,
-            "init": None if init is None else str(init),
             "learning_rate": learning_rate,
             "masks": list(masks),
             "filmed": None if filmed is None else [filmed.settings.seed, filmed_people],

@@ -97,7 +97,6 @@ class DetectorRecipe(Recipe):
         teacher: RTMDet | None = None,
     ) -> None:
         settings = {
-            "recipe": "detector",
             "variant": net.variant,
             "seed": seed,
             "learning_rate": learning_rate,

@@ -148,7 +148,6 @@ class EverydayRecipe(Recipe):
             "seed": seed,
             "clips": len(aside),
             "store_seed": store.settings.seed,
-            "init": None if init is None else str(init),
             "learning_rate": learning_rate,
         }
         metadata = {

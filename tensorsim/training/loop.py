@@ -35,7 +35,7 @@ class Recipe:
 
     Attributes:
         net: the network to train.
-        settings: everything that must be equal for a run to go on from a checkpoint.
+        settings: everything that must be equal for a run to go on from a checkpoint; the name of the recipe is added.
         metadata: strings stored in the weight file, for those who load it.
     """
 
@@ -45,7 +45,7 @@ class Recipe:
 
     def __init__(self, net: nn.Module, settings: dict[str, Any], metadata: dict[str, str]) -> None:
         self.net = net
-        self.settings = settings
+        self.settings = {"recipe": type(self).__name__} | settings
         self.metadata = metadata
 
     def sample(self, index: int) -> dict[str, Any]:
@@ -160,7 +160,8 @@ class _Log:
         rows: list[list[str]] = []
         if self.path.is_file():
             with self.path.open(newline="", encoding="utf-8") as file:
-                rows = [row for row in list(csv.reader(file))[1:] if len(row) == 3 and int(row[0]) <= step]
+                rows = [row for row in csv.reader(file) if len(row) == 3 and row[0].isdecimal()]
+            rows = [row for row in rows if int(row[0]) <= step]
         with complete_file(self.path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([["step", "name", "value"], *rows])
 
@@ -195,10 +196,9 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
         The figures of the best weights, with their ``step``.
 
     Raises:
-        TensorsimError: the checkpoint is damaged or belongs to another run, a loss that is not finite, TensorBoard
-            missing.
+        TensorsimError: the checkpoint is damaged or belongs to another run, a loss or score that is not finite,
+            TensorBoard missing.
     """
-    # Long, for nearly every line needs the state of the run.
     rank, processes = rank_and_processes()
     device = _joined(config, processes)
     recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
@@ -254,6 +254,10 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
                 figures = _validate(recipe, averaged.module)
                 log.write(done, {f"validation/{name}": value for name, value in figures.items()})
                 bar.write(f"step {done}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+                if not math.isfinite(figures["score"]):
+                    raise TensorsimError(
+                        f"fit: the score of step {done} is {figures['score']}, expected a number"
+                    )
                 if figures["score"] > best["score"]:
                     best = figures | {"step": float(done)}
                     save_weights(averaged.module, config.out / "best.safetensors", recipe.metadata)
@@ -375,6 +379,10 @@ def _read(path: Path) -> dict[str, Any]:
     return state
 
 
+def _shapes(weights: dict[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in weights.items()}
+
+
 def _resume(
     path: Path,
     recipe: Recipe,
@@ -383,11 +391,15 @@ def _resume(
     optimiser: torch.optim.Optimizer,
 ) -> tuple[int, dict[str, float]]:
     state = _read(path)
-    for part, mine in (("loop", config.fingerprint()), ("recipe", recipe.settings)):
-        differ = [key for key in {**state[part], **mine} if state[part].get(key) != mine.get(key)]
+    for there, mine in (
+        (state["loop"], config.fingerprint()),
+        (state["recipe"], recipe.settings),
+        (_shapes(state["net"]), _shapes(recipe.net.state_dict())),
+    ):
+        differ = [key for key in {**there, **mine} if there.get(key) != mine.get(key)]
         if differ:
             reason = ", ".join(
-                f"{key}: {mine.get(key)!r} for {state[part].get(key)!r}" for key in sorted(differ)
+                f"{key}: {mine.get(key)!r} for {there.get(key)!r}" for key in sorted(differ)[:4]
             )
             raise TensorsimError(
                 f"{path}: it belongs to another run ({reason}); choose another folder, or the same settings"

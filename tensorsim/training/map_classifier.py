@@ -104,7 +104,7 @@ class MapRecipe(Recipe):
         self.learning_rate = learning_rate
         settings: dict[str, Any] = {
             "data": self.training.recipe.digest, "network": network, "labels": list(self.labels), "size": self.size,
-            "maps": list(self.training.names), "seed": seed, "init": None if init is None else str(init),
+            "maps": list(self.training.names), "seed": seed,
             "learning_rate": learning_rate, "masks": list(masks),
         }  # fmt: skip
         super().__init__(net, settings, self._metadata(kind.__name__))

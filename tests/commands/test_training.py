@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from tensorsim.commands.training import TrainOptions
 from tensorsim.training import loop
+from tensorsim.training.loop import Recipe
 
 
 def test_the_first_process_tells_the_figures(
@@ -16,8 +18,24 @@ def test_the_first_process_tells_the_figures(
     options = TrainOptions(out=tmp_path)
     for rank, printed in (("0", f"{tmp_path / 'best.safetensors'}: score 0.5, step 3\n"), ("1", "")):
         monkeypatch.setenv("RANK", rank)
-        assert options.train(None, None) == tmp_path / "best.safetensors"  # type: ignore[arg-type]
+        recipe = Recipe(nn.Identity(), {}, {})
+        assert options.train(recipe, None) == tmp_path / "best.safetensors"  # type: ignore[arg-type]
         assert capsys.readouterr().out == printed
+
+
+def test_a_run_from_other_weights_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where they took the place of the first ones."""
+    monkeypatch.setattr(loop, "fit", lambda *_: {"score": 0.5})
+    starts = set()
+    for content in (None, b"first", b"second", b"second"):
+        init = None if content is None else tmp_path / "w.safetensors"
+        if init is not None:
+            init.write_bytes(content or b"")
+        recipe = Recipe(nn.Identity(), {}, {})
+        TrainOptions(out=tmp_path, init=init).train(recipe, None)  # type: ignore[arg-type]
+        starts.add(recipe.settings["init"])
+    assert None in starts
+    assert len(starts) == 3
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The training loop: resume, best weights, logs, refusals."""
 
 import csv
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.training.loop import LoopConfig, Recipe, fit
+from tensorsim.training.loop import LoopConfig, Recipe, _Shares, fit
 from tensorsim.weights import load_state_dict, load_strict
 
 
@@ -65,18 +66,18 @@ def test_training_learns(tmp_path: Path) -> None:
 @pytest.mark.parametrize("workers", [0, 1])
 def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path: Path, workers: int) -> None:
     whole = fit(Line(), config(tmp_path / "whole", workers=workers))
+    recipe, steps = Line(), itertools.count()
 
-    class Interrupted(Line):
-        def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
-            if self.steps == 27:
-                raise KeyboardInterrupt
-            self.steps += 1
-            return super().loss(net, batch)
+    def interrupted(net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+        if next(steps) == 27:
+            raise KeyboardInterrupt
+        return Line.loss(recipe, net, batch)
 
-        steps = 0
-
+    recipe.loss = interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
-        fit(Interrupted(), config(tmp_path / "parts", workers=workers))
+        fit(recipe, config(tmp_path / "parts", workers=workers))
+    with (tmp_path / "parts" / "metrics.csv").open("a") as file:
+        file.write("28,loss,0.1\n,loss,0.1\n")  # of steps that are done again; cut short
     parts = fit(Line(), config(tmp_path / "parts", workers=workers))
     assert parts == whole
     for (name, a), b in zip(
@@ -130,6 +131,18 @@ def test_another_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match=r"seed: 1 for 0"):
         fit(Line(), config(tmp_path, steps=20, seed=1))
 
+    class Other(Line):
+        pass
+
+    with pytest.raises(TensorsimError, match=r"another run \(recipe: 'Other' for 'Line'\)"):
+        fit(Other(), config(tmp_path, steps=20))
+    wider = Line()
+    wider.net[3] = nn.Linear(8, 2)  # type: ignore[operator]
+    with pytest.raises(
+        TensorsimError, match=r"another run \(3.bias: \(2,\) for \(1,\), 3.weight: \(2, 8\) for"
+    ):
+        fit(wider, config(tmp_path, steps=20))
+
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "text", "changed", "other"])
 def test_a_damaged_checkpoint_is_told_in_one_line(tmp_path: Path, damage: str) -> None:
@@ -161,6 +174,24 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
         fit(Broken(), config(tmp_path))
 
 
+def test_a_score_that_is_not_a_number_stops_the_run(tmp_path: Path) -> None:
+    """No weights would be the best, and those of an earlier run be taken for them."""
+
+    class Unjudged(Line):
+        def validate(self, net: nn.Module) -> dict[str, float]:
+            return {"score": float("nan")}
+
+    with pytest.raises(TensorsimError, match="the score of step 20 is nan, expected a number"):
+        fit(Unjudged(), config(tmp_path))
+
+
+def test_processes_divide_each_batch_among_them(tmp_path: Path) -> None:
+    shares = [list(_Shares(2, config(tmp_path, steps=4), rank, 2)) for rank in range(2)]
+    for step, parts in enumerate(zip(*shares, strict=True), start=2):
+        assert [len(part) for part in parts] == [8, 8]
+        assert sorted(itertools.chain(*parts)) == list(range(16 * step, 16 * (step + 1)))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -176,11 +207,17 @@ def test_bad_settings_are_refused(tmp_path: Path, options: dict[str, Any], messa
 
 
 def test_the_average_of_weights_begins_short(tmp_path: Path) -> None:
-    """A weight that falls by 0.1 a step: its mean keeps min(decay, (1 + n) / (10 + n)) of itself at update n."""
+    """A weight that falls by 0.1 a step: its mean keeps min(decay, (1 + n) / (10 + n)) of itself at update n.
+
+    So does the mean of what batch norm has seen.
+    """
+    seen: list[Tensor] = []
 
     class Falling(Line):
         def loss(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
-            return {"loss": net(batch["x"]).mean() * 0 + net[3].bias.sum()}
+            found = net(batch["x"])
+            seen.append(net[1].running_mean.clone())  # type: ignore[index]
+            return {"loss": found.mean() * 0 + net[3].bias.sum()}
 
         def optimiser(self) -> torch.optim.Optimizer:
             return torch.optim.SGD(self.net.parameters(), lr=0.1)
@@ -190,11 +227,13 @@ def test_the_average_of_weights_begins_short(tmp_path: Path) -> None:
 
     first = float(Falling().net[3].bias.detach())
     fit(Falling(), config(tmp_path, steps=12, ema_decay=0.5))
-    mean = first - 0.1
+    mean, mean_seen = first - 0.1, seen[0]
     for count in range(1, 12):
         kept = min(0.5, (1 + count) / (10 + count))
         mean = kept * mean + (1 - kept) * (first - 0.1 * (count + 1))
+        mean_seen = kept * mean_seen + (1 - kept) * seen[count]
     assert float(weights(tmp_path)["module.3.bias"]) == pytest.approx(mean, abs=1e-6)
+    torch.testing.assert_close(weights(tmp_path)["module.1.running_mean"], mean_seen)
 
 
 def test_nets_learn_in_training_mode_and_are_judged_in_evaluation(tmp_path: Path) -> None:
