@@ -22,7 +22,7 @@ class TrainPose(PeopleOptions):
         network: HRNet, or CPM with three stages.
         size: height and width of the crops.
         first_size: height and width of smaller crops to begin with.
-        first_steps: steps with those.
+        first_steps: steps with those, fewer than ``steps``; half of them, at most 6000, if not given, none with init.
         width: channels of HRNet's branch of highest resolution (24 if not given), or of most layers of CPM (32).
         steps: optimiser steps.
         batch: crops per step.
@@ -32,14 +32,15 @@ class TrainPose(PeopleOptions):
         second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
             agree with the labels, they put them right and add the face.
         validate_every: steps between measurements on held-out people, which pick the best weights.
-        presence: train nothing but the head of the HRNet in --init that tells which keypoints are in the picture.
+        presence: train nothing but the head of the HRNet in --init that tells which keypoints are in the picture, on
+            crops of one size and without rendered people.
     """
 
     data: Path
     network: Literal["hrnet", "cpm"] = "hrnet"
     size: tuple[int, int] = (128, 96)
     first_size: tuple[int, int] = (96, 64)
-    first_steps: int = 6000
+    first_steps: int | None = None
     width: int | None = None
     steps: int = 12000
     batch: int = 32
@@ -69,7 +70,20 @@ class TrainPose(PeopleOptions):
         check_positive(self.learning_rate, "--learning-rate")
         if self.presence and (self.init is None or self.network != "hrnet"):
             raise TensorsimError("--presence: got no --init of an HRNet, whose keypoints it is about")
-        if self.first_steps > 0 and (min(self.first_size) < 32 or any(side % 32 for side in self.first_size)):
+        without = ("rendered", "cutouts", "augmentation", "first_size", "first_steps")
+        given = [name for name in without if getattr(self, name) != getattr(TrainPose, name)]
+        if self.presence and given:
+            raise TensorsimError(
+                f"--presence: got --{given[0].replace('_', '-')}, which the head is trained without"
+            )
+        first_steps = self.first_steps
+        if first_steps is None:
+            first_steps = min(6000, self.steps // 2) if self.init is None else 0
+        if not 0 <= first_steps < self.steps:
+            raise TensorsimError(
+                f"--first-steps: got {first_steps}, expected at least 0 and fewer than the {self.steps} of --steps"
+            )
+        if first_steps > 0 and (min(self.first_size) < 32 or any(side % 32 for side in self.first_size)):
             raise TensorsimError(f"--first-size: got {self.first_size}, expected (H, W), multiples of 32")
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=self.validate_every)
         torch.manual_seed(self.seed)
@@ -87,12 +101,17 @@ class TrainPose(PeopleOptions):
             width = 24 if self.width is None else self.width
             net = HRNet(HRNetConfig(width, blocks=2, modules=(1, 1, 1), bottlenecks=2, planes=32), self.size)
         persons = read_people(self.data, self.second_labels)
+        held_out = held_out_people(self.data)
+        for name in ("COCO, large", "LSPE, upright"):
+            if not held_out[name]:
+                raise TensorsimError(
+                    f"{self.data}: got nobody held out of {name}, expected some to measure on"
+                )
+        validation = {"coco": some(held_out["COCO, large"]), "lspet": some(held_out["LSPE, upright"])}
         cutouts = self.rendered_people()
         rendered = None
         if cutouts is not None:
             rendered = RenderedPeople(cutouts, Shards(find_shards(self.data, "backgrounds")))
-        held_out = held_out_people(self.data)
-        validation = {"coco": some(held_out["COCO, large"]), "lspet": some(held_out["LSPE, upright"])}
         if self.presence and isinstance(net, HRNet):
             net = with_presence_head(net)
             head = PresenceRecipe(net, persons, validation, self.seed, self.learning_rate)
@@ -107,7 +126,7 @@ class TrainPose(PeopleOptions):
             learning_rate=self.learning_rate,
             sigma=1.0 if self.network == "cpm" else 1.5,
             first_size=self.first_size,
-            first_samples=self.first_steps * self.batch,
+            first_samples=first_steps * self.batch,
             shares=SHARES if self.second_labels is None else SHARES_CONFIRMED,
             augmentation=Augmentation() if self.augmentation == "full" else MILD_AUGMENTATION,
         )
@@ -116,4 +135,4 @@ class TrainPose(PeopleOptions):
 
 def some(persons: "list[Person]", most: int = 240) -> "list[Person]":
     """At most so many of the people, evenly spread: shards of unlike pictures follow each other."""
-    return persons[:: math.ceil(len(persons) / most)] if persons else persons
+    return persons[:: math.ceil(len(persons) / most)]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tensorsim.commands.options import check_seed
+from tensorsim.exceptions import TensorsimError
 
 if TYPE_CHECKING:
     from torch import nn
@@ -104,6 +105,8 @@ class PeopleOptions(TrainOptions):
     def loop(self, **settings: Any) -> "LoopConfig":
         """As of all training commands."""
         check_seed(self.rendered_seed, "--rendered-seed")
+        if self.rendered < 0:
+            raise TensorsimError(f"--rendered: got {self.rendered}, expected at least 0")
         return super().loop(**settings)
 
     def rendered_people(self) -> "Cutouts | None":

@@ -9,8 +9,8 @@ import pytest
 from tensorsim.commands.evaluate_pose import EvaluatePose
 from tensorsim.commands.train_pose import TrainPose
 from tensorsim.errors import TensorsimError
-from tensorsim.training.pose import held_out_people, read_people
-from tensorsim.vision.pose2d.hrnet import HRNet
+from tensorsim.training.pose import PoseRecipe, held_out_people, read_people
+from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 from tests.training.tars import write_tar
 from tests.training.test_pose_data import BOX, standing, write_cutouts
 from tests.training.test_shards import jpg, label
@@ -121,7 +121,20 @@ def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> No
         ({"width": 0}, "HRNetConfig"),
         ({"presence": True}, "--presence: got no --init"),
         ({"second_labels": Path("none.json")}, "none.json: not a COCO file of keypoint results"),
-        ({"first_steps": 1, "first_size": (192, 144)}, r"--first-size: got \(192, 144\), expected"),
+        (
+            {"steps": 2, "first_steps": 1, "first_size": (192, 144)},
+            r"--first-size: got \(192, 144\), expected",
+        ),
+        ({"steps": 5, "first_steps": 5}, "--first-steps: got 5, expected at least 0 and fewer than the 5 of"),
+        ({"rendered": -5}, "--rendered: got -5, expected at least 0"),
+        (
+            {"presence": True, "init": Path("w")},
+            "--presence: got --rendered, which the head is trained without",
+        ),
+        (
+            {"presence": True, "init": Path("w"), "rendered": 0, "first_steps": 0},
+            "--presence: got --first-steps",
+        ),
     ],
 )
 def test_bad_options_are_refused_before_people_are_rendered(
@@ -129,8 +142,30 @@ def test_bad_options_are_refused_before_people_are_rendered(
 ) -> None:
     out = data / "out"
     with pytest.raises(TensorsimError, match=message):
-        TrainPose(data, out=out, rendered=13, steps=1, quiet=True, **options).run()  # type: ignore[arg-type]
+        TrainPose(data, out=out, quiet=True, **{"rendered": 13, "steps": 1} | options).run()  # type: ignore[arg-type]
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("steps", "options", "first"), [(7, {}, 3), (20_000, {}, 6000), (7, {"init": Path("w")}, 0)]
+)
+def test_most_steps_at_the_size_that_is_asked_for(
+    steps: int, options: dict[str, object], first: int, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(HRNet, "from_pretrained", lambda path, input_size: HRNet(HRNetConfig(4), input_size))
+    recipes: list[PoseRecipe] = []
+    monkeypatch.setattr(TrainPose, "train", lambda self, recipe, loop: recipes.append(recipe))
+    TrainPose(data, out=data / "out", steps=steps, batch=2, **options).run()  # type: ignore[arg-type]
+    assert recipes[0].first_samples == 2 * first
+
+
+def test_nobody_to_measure_on_is_told_before_training(data: Path) -> None:
+    write_tar(data / "lspet-00.tar", {"a.jpg": jpg(0, 80, 60)})
+    with pytest.raises(
+        TensorsimError, match="got nobody held out of LSPE, upright, expected some to measure on"
+    ):
+        TrainPose(data, out=data / "out", steps=1, quiet=True).run()
+    assert not (data / "out").exists()
 
 
 def test_missing_data_is_told(tmp_path: Path) -> None:
