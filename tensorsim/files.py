@@ -66,6 +66,23 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         scratch.unlink(missing_ok=True)
 
 
+def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
+    """Write what a folder of results is made with to its ``settings.json``, or compare it with what is there.
+
+    Raises:
+        TensorsimError: the folder holds results of other settings, or a damaged file.
+    """
+    path = folder / "settings.json"
+    if path.is_file():
+        with reading(path, "settings"):
+            there = json.loads(path.read_text(encoding="utf-8"))
+        if there != settings:
+            raise TensorsimError(f"{folder}: got maps of {there}, expected {settings}")
+    else:
+        with complete_file(path) as scratch:
+            scratch.write_text(json.dumps(settings, indent=2), encoding="utf-8")
+
+
 @contextmanager
 def complete_or_nothing(out: Path) -> Iterator[Path]:
     """A scratch folder whose files are moved to ``out`` when the block succeeds; otherwise ``out`` is unchanged.

@@ -14,7 +14,7 @@ class TrainDenoiser(TrainOptions):
 
     Attributes:
         maps: folder of patches of maps; those that are missing are made first.
-        clips: clips per scene, activity after activity; every tenth is held out.
+        clips: clips per scene, activity after activity; every eleventh is held out.
         depth: convolutions.
         steps: optimiser steps.
         batch: patches per step.
@@ -44,5 +44,5 @@ class TrainDenoiser(TrainOptions):
         net = untrained(self.depth, self.seed)
         self.begin(net)
         build_pairs(self.maps, self.clips, self.maps_seed, quiet=self.quiet)
-        recipe = DenoiserRecipe(net, self.maps, self.seed)
+        recipe = DenoiserRecipe(net, self.maps, self.clips, self.seed)
         self.train(recipe, loop)

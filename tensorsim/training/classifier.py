@@ -241,8 +241,7 @@ def logits_of(
             for k, clip in enumerate(clips[first : first + batch])
         ]
         x = torch.stack(pictures).to(parameter, memory_format=torch.channels_last)
-        with torch.autocast(parameter.device.type, torch.bfloat16):
-            found.append(net(x).float().cpu())
+        found.append(net(x).float().cpu())
     return torch.cat(found)
 
 

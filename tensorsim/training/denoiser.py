@@ -19,7 +19,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES
 from tensorsim.enhance.dncnn import DnCNN, map_floor
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, keep_settings
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers
@@ -108,10 +108,14 @@ def build_pairs(
     scenes: tuple[str, ...] = SCENES,
     quiet: bool = False,
 ) -> None:
-    """Fill a folder with patches of ``clips`` clips per scene, activity after activity; existing files are kept."""
+    """Fill a folder with patches of ``clips`` clips per scene, activity after activity; existing files are kept.
+
+    Raises:
+        TensorsimError: the folder holds patches of another seed, or another number of them per map.
+    """
     from safetensors.torch import save_file
 
-    folder.mkdir(parents=True, exist_ok=True)
+    keep_settings(folder, {"seed": seed, "per_map": per_map})
     jobs = [(clip, scene) for clip in range(clips) for scene in scenes]
     for clip, scene in tqdm(jobs, desc="maps", unit="clip", disable=quiet):
         path = folder / f"{scene}-{clip:05d}.safetensors"
@@ -142,20 +146,22 @@ class DenoiserRecipe(Recipe):
 
     Args:
         net: the network.
-        folder: made by :func:`build_pairs`; every tenth clip is held out.
+        folder: made by :func:`build_pairs`.
+        clips: how many per scene to take; every eleventh is held out, so that all activities come round.
         seed: of patches and flips.
 
     Raises:
-        TensorsimError: fewer than 10 clips in the folder.
+        TensorsimError: none of the first clips in the folder, or none to hold out.
     """
 
-    def __init__(self, net: DnCNN, folder: Path, seed: int = 0) -> None:
+    def __init__(self, net: DnCNN, folder: Path, clips: int, seed: int = 0) -> None:
         from safetensors.torch import load_file
 
-        files = sorted(folder.glob("*-?????.safetensors"))
+        files = {path: int(path.stem[-5:]) for path in sorted(folder.glob("*-?????.safetensors"))}
+        files = {path: clip for path, clip in files.items() if clip < clips}
         parts: dict[bool, list[dict[str, Tensor]]] = {True: [], False: []}
-        for path in files:
-            parts[int(path.stem[-5:]) % 10 == 9].append(load_file(path))
+        for path, clip in files.items():
+            parts[clip % 11 == 9].append(load_file(path))
         if not parts[True]:
             raise TensorsimError(
                 f"{folder}: got {len(files)} files of patches, expected at least 10 clips per scene"
@@ -205,8 +211,7 @@ class DenoiserRecipe(Recipe):
         images, noises = self.held_out["image"][::4], self.held_out["noise"][::4]
         for image, noise in zip(images.split(32), noises.split(32), strict=True):
             x, wanted = image.to(parameter).unsqueeze(1), noise.to(parameter).unsqueeze(1)
-            with torch.autocast(parameter.device.type, torch.bfloat16):
-                found = x - net(x.to(memory_format=torch.channels_last)).float()
+            found = x - net(x.to(memory_format=torch.channels_last))
             error += float((found - wanted).square().sum())
             before += float(wanted.square().sum())
         gain_db = 10 * math.log10(before / error)

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.motions import Draw
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, keep_settings
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
@@ -241,14 +241,7 @@ def build_everyday(
     from safetensors.torch import save_file
 
     settings = EverydaySettings() if settings is None else settings
-    described = folder / "settings.json"
-    if described.is_file():
-        there = json.loads(described.read_text(encoding="utf-8"))
-        if there != asdict(settings):
-            raise TensorsimError(f"{folder}: got maps of {there}, expected {asdict(settings)}")
-    else:
-        with complete_file(described) as scratch:
-            scratch.write_text(json.dumps(asdict(settings), indent=2), encoding="utf-8")
+    keep_settings(folder, asdict(settings))
     paths = {index: folder / f"everyday-{index:05d}.safetensors" for index in range(first, first + groups)}
     missing = {index: path for index, path in paths.items() if not path.is_file()}
     if not missing:

@@ -155,6 +155,13 @@ def test_a_picture_is_pooled_in_power(store: MapStore) -> None:
         picture(store, clip, 50.0, 7)
 
 
+def test_logits_are_in_single_precision(store: MapStore) -> None:
+    torch.manual_seed(0)
+    net, clips = Tiny(12), clips_of(store, ("through-wall",), 1, None)
+    pictures = [picture(store, clip, 50.0, SIZE) for clip in clips]
+    torch.testing.assert_close(logits_of(net, store, clips, (50.0, 50.0), SIZE), net(torch.stack(pictures)))
+
+
 def test_draws_of_ratios_cover_the_range() -> None:
     drawn = torch.tensor([drawn_snr(0, index, (10.0, 50.0)) for index in range(400)])
     assert float(drawn.min()) < 11

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tensorsim.commands.train_denoiser import TrainDenoiser
@@ -94,7 +95,7 @@ def test_patches_lie_at_one_place_in_both_maps(shape: tuple[int, int]) -> None:
 
 
 def test_learns_to_predict_the_noise(folder: Path, tmp_path: Path) -> None:
-    recipe = DenoiserRecipe(untrained(3), folder)
+    recipe = DenoiserRecipe(untrained(3), folder, 10)
     assert (len(recipe.training["image"]), len(recipe.held_out["image"])) == (9 * 12, 12)
     config = LoopConfig(
         tmp_path, 60, 8, workers=0, validate_every=60, ema_decay=0.0, quiet=True, log_every=10
@@ -112,7 +113,7 @@ def test_learns_to_predict_the_noise(folder: Path, tmp_path: Path) -> None:
 
 
 def test_begins_by_doing_nothing(folder: Path) -> None:
-    recipe = DenoiserRecipe(untrained(3), folder)
+    recipe = DenoiserRecipe(untrained(3), folder, 10)
     image = torch.rand(1, 1, 9, 9)
     assert torch.equal(recipe.net(image), image)
     with torch.no_grad():
@@ -120,15 +121,35 @@ def test_begins_by_doing_nothing(folder: Path) -> None:
 
 
 def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
-    one, other = DenoiserRecipe(untrained(2), folder), DenoiserRecipe(untrained(2), folder)
+    one, other = DenoiserRecipe(untrained(2), folder, 10), DenoiserRecipe(untrained(2), folder, 10)
     other.sample(3)
     for name, patch in one.sample(99).items():
         assert patch.shape == (1, TRAINED, TRAINED)
         assert torch.equal(patch, other.sample(99)[name])
 
 
+def test_every_activity_is_held_out(tmp_path: Path) -> None:
+    for clip in range(12 * 11):
+        patch = torch.full((1, 2, 2), float(clip % 12))
+        save_file({"image": patch, "noise": patch.clone()}, tmp_path / f"free-space-{clip:05d}.safetensors")
+    recipe = DenoiserRecipe(untrained(2), tmp_path, 12 * 11)
+    assert recipe.held_out["image"][:, 0, 0].sort().values.tolist() == list(range(12))
+    assert recipe.training["image"][:, 0, 0].unique().tolist() == list(range(12))
+
+
+def test_validation_is_in_single_precision(folder: Path) -> None:
+    recipe = DenoiserRecipe(untrained(3), folder, 10)
+    nn.init.normal_(recipe.net.model[-1].weight, std=0.1)  # type: ignore[index,union-attr]
+    image, noise = (recipe.held_out[name][::4].float().unsqueeze(1) for name in ("image", "noise"))
+    with torch.no_grad():
+        error = image - recipe.net.eval()(image) - noise
+        figures = recipe.validate(recipe.net)
+    expected = -10 * float((error.square().sum() / noise.square().sum()).log10())
+    assert figures["gain_db"] == pytest.approx(expected, abs=1e-5)
+
+
 def test_loss_is_half_the_error_of_the_residual(folder: Path) -> None:
-    recipe = DenoiserRecipe(untrained(2), folder)
+    recipe = DenoiserRecipe(untrained(2), folder, 10)
     nn.init.normal_(recipe.net.model[-1].weight)  # type: ignore[index,union-attr]
     sample = {name: patch[None] for name, patch in recipe.sample(0).items()}
     residual = recipe.net.noise(sample["image"]) - sample["noise"]  # type: ignore[operator]
@@ -146,8 +167,12 @@ def test_goes_on_and_refuses(folder: Path, tmp_path: Path) -> None:
     path.unlink()
     build_pairs(folder, 10, per_map=6, scenes=("through-wall",), quiet=True)
     assert path.read_bytes() == content
+    with pytest.raises(TensorsimError, match=r"got maps of .*'seed': 0.*expected .*'seed': 1"):
+        build_pairs(folder, 10, seed=1, per_map=6, scenes=("through-wall",), quiet=True)
+    with pytest.raises(TensorsimError, match="got 9 files of patches"):
+        DenoiserRecipe(untrained(2), folder, 9)
     with pytest.raises(TensorsimError, match="got 0 files of patches, expected at least 10"):
-        DenoiserRecipe(untrained(2), tmp_path)
+        DenoiserRecipe(untrained(2), tmp_path, 10)
 
 
 @pytest.mark.parametrize(
