@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from tensorsim.commands.training import PeopleOptions, digest
 from tensorsim.exceptions import check_positive
@@ -17,7 +18,7 @@ class TrainDetector(PeopleOptions):
         data: folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, films_teacher, lspet, pedestrian
             and backgrounds (NAME-*.tar).
         teacher: weights of a better RTMDet (.safetensors, .pth, .onnx), whose answers are learnt besides the labels.
-        variant: of RTMDet.
+        variant: of RTMDet, of those for people alone.
         steps: optimiser steps.
         batch: pictures per step.
         learning_rate: highest learning rate.
@@ -26,7 +27,7 @@ class TrainDetector(PeopleOptions):
 
     data: Path
     teacher: Path | None = None
-    variant: str = "small-person"
+    variant: Literal["nano-person", "small-person", "m-person"] = "small-person"
     steps: int = 5000
     batch: int = 16
     learning_rate: float = 1e-3
@@ -36,6 +37,7 @@ class TrainDetector(PeopleOptions):
         """Do it."""
         import torch
 
+        from tensorsim.device import rank_and_processes
         from tensorsim.training.detector import DetectorRecipe, TrainedRTMDet, read_sources
         from tensorsim.training.detector_metrics import calibrate
         from tensorsim.vision.detection.rtmdet import RTMDet
@@ -56,8 +58,11 @@ class TrainDetector(PeopleOptions):
         sources = replace(sources, cutouts=self.rendered_people() or ())
         recipe = DetectorRecipe(net, sources, held_out, self.seed, self.learning_rate, teacher=teacher)
         recipe.settings["teacher"] = digest(self.teacher)
-        detector = RTMDet.from_pretrained(self.train(recipe, loop))
-        calibrate(detector, held_out)
+        best = self.train(recipe, loop)
+        if rank_and_processes()[0] > 0:
+            return
+        detector = RTMDet.from_pretrained(best)
+        calibrate(detector, held_out, quiet=self.quiet)
         calibrated = self.out / "detector.safetensors"
         save_weights(detector, calibrated, recipe.metadata)
         print(f"{calibrated}: these with calibrated scores")

@@ -38,6 +38,7 @@ class TrainEveryday(TrainOptions):
 
     def run(self) -> None:
         """Do it."""
+        from tensorsim.device import rank_and_processes
         from tensorsim.training.everyday_classifier import EverydayRecipe, load_between, save_calibrated
         from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
 
@@ -62,6 +63,8 @@ class TrainEveryday(TrainOptions):
         )
         loop = self.epochs_loop(self.epochs, len(recipe.training), self.batch, ema_decay=0.99)
         best = self.train(recipe, loop)
+        if rank_and_processes()[0] > 0:
+            return
         load_between(recipe.net, best if self.init is None else self.init, best, self.share)
         path = self.out / "classifier.safetensors"
         temperature, error = save_calibrated(recipe, path)

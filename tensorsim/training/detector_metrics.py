@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
@@ -134,7 +135,9 @@ def people_in(detector: RTMDet | AcfDetector, sample: Sample) -> tuple[Tensor, T
     return seen.boxes[0][persons].cpu(), seen.scores[0][persons].cpu()
 
 
-def calibrate(detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: float = 0.1) -> float:
+def calibrate(
+    detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: float = 0.1, quiet: bool = False
+) -> float:
     """Shift the scores of a one-class detector so that one of 0.5 means the same as in others.
 
     A network that is not trained to the end doubts what it rightly finds. A constant is added to its logits, in
@@ -146,6 +149,7 @@ def calibrate(detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: f
         detector: the detector, changed in place.
         samples: pictures that it has not learnt from; those with people are passed over.
         alarms_per_picture: detections per picture without people.
+        quiet: no progress bar.
 
     Returns:
         The constant.
@@ -156,7 +160,8 @@ def calibrate(detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: f
     empty = [sample for sample in samples if len(sample.boxes) == 0 and sample.all_labelled]
     if not empty:
         raise TensorsimError(f"calibrate: got {len(samples)} pictures with people, expected some without")
-    highest = torch.cat([people_in(detector, sample)[1] for sample in empty]).sort(descending=True).values
+    bar = tqdm(empty, desc="calibrate", unit="picture", disable=quiet)
+    highest = torch.cat([people_in(detector, sample)[1] for sample in bar]).sort(descending=True).values
     allowed = int(alarms_per_picture * len(empty))
     if allowed >= len(highest):
         return 0.0

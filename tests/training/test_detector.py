@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tensorsim.cli import main
 from tensorsim.commands.evaluate_detector import EvaluateDetector
 from tensorsim.commands.train_detector import TrainDetector
 from tensorsim.errors import TensorsimError
@@ -176,6 +177,19 @@ def test_command_trains_and_goes_on_from_weights(
     for name, value in second.items():
         if "running" not in name and "num_batches" not in name:
             torch.testing.assert_close(value, first[name], rtol=2e-3, atol=1e-6, msg=name)
+    # Of several processes the first one calibrates.
+    monkeypatch.setattr(TrainDetector, "train", lambda self, recipe, loop: trained)
+    monkeypatch.setenv("RANK", "1")
+    TrainDetector(tmp_path, variant="test", out=tmp_path / "c", quiet=True).run()  # type: ignore[arg-type]
+    assert not (tmp_path / "c").exists()
+
+
+def test_only_networks_for_people_alone_can_be_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "detector", "--data", str(tmp_path), "--out", str(tmp_path), "--variant", "tiny"])
+    assert "small-person" in capsys.readouterr().err
 
 
 def test_bad_options_are_refused_before_people_are_rendered(tmp_path: Path) -> None:

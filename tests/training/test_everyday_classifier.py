@@ -178,7 +178,7 @@ def test_weights_between_two_files_are_their_weighted_mean(tmp_path):
         load_between(net, tmp_path / "0.safetensors", tmp_path / "1.safetensors", 1.5)
 
 
-def test_the_command_trains_and_writes_a_classifier_that_the_recognizer_takes(tmp_path):
+def test_the_command_trains_and_writes_a_classifier_that_the_recognizer_takes(tmp_path, monkeypatch):
     store(tmp_path / "maps", EverydaySettings(), groups=5)
     start = tmp_path / "start.safetensors"
     save_weights(SPGNet(12), start, {})
@@ -199,6 +199,11 @@ def test_the_command_trains_and_writes_a_classifier_that_the_recognizer_takes(tm
     command.run()  # nothing is left to train
     for name, value in load_state_dict(path).items():
         torch.testing.assert_close(value, made[name], rtol=0, atol=0)
+    path.unlink()
+    monkeypatch.setattr(TrainEveryday, "train", lambda self, recipe, loop: path)
+    monkeypatch.setenv("RANK", "1")
+    command.run()  # of several processes the first one calibrates
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(

@@ -109,15 +109,15 @@ class RTMDet(nn.Module):
             TensorsimError: an unknown name, weights that cannot be fetched, or a file that is damaged, unsafe or
                 not of this network; see :func:`tensorsim.weights.load_state_dict`.
         """
+        from tensorsim.files import reading
         from tensorsim.registry import locate
         from tensorsim.weights import load_state_dict, load_strict, read_metadata
 
         path = locate(source, cls.__name__)
         stated = read_metadata(path)
-        if "input_size" in stated:
-            options = {"input_size": int(stated["input_size"])} | options
-        if "nms_iou" in stated:
-            options = {"nms_iou": float(stated["nms_iou"])} | options
+        with reading(path, "weights of RTMDet"):  # of another network, they state other things
+            kinds = {"input_size": int, "nms_iou": float}
+            options = {name: kinds[name](stated[name]) for name in kinds if name in stated} | options
         if path.suffix == ".onnx":
             from tensorsim.vision.detection.rtmdet_onnx import read_convolutions, unfold
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.detection.rtmdet_layers import RTMDET_SIZES
+from tensorsim.weights import save_weights
 from tests.stage import StageTester, assert_same
 
 # Parameters and state-dict entries of the published networks (those of x follow from the size table).
@@ -372,6 +373,11 @@ def test_from_pretrained_refuses_other_networks(tmp_path: Path) -> None:
     torch.save({k: v for k, v in state.items() if "out_convs.2" not in k}, tmp_path / "part.pth")
     with pytest.raises(TensorsimError, match=r"12 missing \(neck\.out_convs\.2\."):
         RTMDet.from_pretrained(tmp_path / "part.pth")
+    save_weights(nn.Linear(1, 1), tmp_path / "pose.safetensors", {"input_size": "256x192"})
+    with pytest.raises(
+        TensorsimError, match=r"pose\.safetensors: got a file that cannot be read as weights of RTMDet"
+    ):
+        RTMDet.from_pretrained(tmp_path / "pose.safetensors")
     (tmp_path / "text.onnx").write_text("this is no network")
     with pytest.raises(TensorsimError, match="damaged or not an ONNX file"):
         RTMDet.from_pretrained(tmp_path / "text.onnx")
