@@ -158,14 +158,14 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
         return [
             Sample(
                 Path(image["file_name"]).stem,
-                *_labels(persons[image["id"]]),
+                *_labels(image["file_name"], persons[image["id"]]),
                 not crowds[image["id"]],
                 folder / image["file_name"],
-                crowds=_labels(crowds[image["id"]])[0],
+                crowds=_labels(image["file_name"], crowds[image["id"]])[0],
             )
             for image in content["images"]
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TensorsimError(f"{path}: not a COCO annotation file ({error})") from error
 
 
@@ -196,24 +196,36 @@ def _read_tar(path: Path) -> list[Sample]:
         samples = []
         for key, member in sorted(pictures.items()):
             label = labels.get(key, {"persons": [], "all_persons_labelled": True})
-            everyone = bool(label["all_persons_labelled"])
-            labelled = _labels(label["persons"])
+            everyone = label["all_persons_labelled"]
+            if not isinstance(everyone, bool):
+                raise ValueError(f"{key}: got all_persons_labelled {everyone!r}, expected true or false")
+            labelled = _labels(key, label["persons"])
             samples.append(Sample(key, *labelled, everyone, path, member.offset_data, member.size))
-    except (OSError, tarfile.TarError, ValueError, KeyError, TypeError) as error:
+    except (OSError, tarfile.TarError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TensorsimError(f"{path}: not a shard of jpg and json ({error})") from error
     if not samples:
         raise TensorsimError(f"{path}: got no pictures, expected a shard of KEY.jpg and KEY.json")
     return samples
 
 
-def _labels(persons: list[dict[str, Any]]) -> tuple[Floats, Floats, Floats]:
-    """Boxes (n, 4) ``xyxy``, points (n, 19, 3) and areas (n,) of annotated people."""
-    boxes = np.array([person["bbox"] for person in persons], np.float32).reshape(-1, 4)
-    usual = AREA_OF_BOX * boxes[:, 2:].prod(1)
-    boxes[:, 2:] += boxes[:, :2]
+def _labels(key: str, persons: list[dict[str, Any]]) -> tuple[Floats, Floats, Floats]:
+    """Boxes (n, 4) ``xyxy``, points (n, 19, 3) and areas (n,) of the annotated people of the picture ``key``."""
+    boxes = np.zeros((len(persons), 4), np.float32)
     keypoints = np.zeros((len(persons), len(POINTS), 3), np.float32)
-    for person, rows in zip(persons, keypoints, strict=True):
+    areas = np.zeros(len(persons), np.float32)
+    for i, person in enumerate(persons):
+        box = np.array(person["bbox"], np.float32)
+        if box.shape != (4,) or not np.isfinite(box).all() or (box[2:] < 0).any():
+            raise ValueError(f"{key}: got bbox {person['bbox']}, expected x, y, width, height")
+        boxes[i] = [*box[:2], *box[:2] + box[2:]]
+        areas[i] = person.get("area", AREA_OF_BOX * box[2:].prod())
+        if not 0 <= areas[i] < np.inf:
+            raise ValueError(f"{key}: got area {person['area']}, expected pixels")
         if person["keypoints"] is not None:
-            rows[: len(person["keypoints"])] = person["keypoints"]
-    annotated = [person.get("area", area) for person, area in zip(persons, usual, strict=True)]
-    return boxes, keypoints, np.array(annotated, np.float32)
+            points = np.array(person["keypoints"], np.float32)
+            if points.shape not in ((17, 3), (19, 3)) or not np.isfinite(points).all():
+                raise ValueError(
+                    f"{key}: got keypoints {points.shape}, expected 17 or 19 rows of finite x, y, v"
+                )
+            keypoints[i, : len(points)] = points
+    return boxes, keypoints, areas

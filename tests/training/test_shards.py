@@ -85,6 +85,34 @@ def test_other_tars_are_refused(tmp_path: Path, files: dict[str, Any]) -> None:
         Shards([write_tar(tmp_path / "bad.tar", files)])
 
 
+@pytest.mark.parametrize(
+    ("person", "message"),
+    [
+        ({"bbox": [2, 3, 10]}, r"a: got bbox \[2, 3, 10\], expected x, y, width, height"),
+        ({"bbox": [2, 3, 10, 12, 0, 0, 5, 5]}, "a: got bbox"),
+        ({"bbox": [2, 3, float("nan"), 12]}, "a: got bbox"),
+        ({"bbox": [2, 3, -10, 12]}, "a: got bbox"),
+        ({"area": float("inf")}, "a: got area inf, expected pixels"),
+        ({"keypoints": [[1, 2, 2]] * 18}, r"a: got keypoints \(18, 3\), expected 17 or 19 rows"),
+        ({"keypoints": [1, 2, 2] * 17}, r"a: got keypoints \(51,\)"),
+        ({"keypoints": [[float("nan"), 2, 2]] * 17}, "expected 17 or 19 rows of finite x, y, v"),
+        ({"keypoints": [[1, 2, "high"]] * 17}, "not a shard"),
+    ],
+)
+def test_wrong_labels_are_refused(tmp_path: Path, person: dict[str, Any], message: str) -> None:
+    labelled = label([{"bbox": [2, 3, 10, 12], "keypoints": None} | person])
+    with pytest.raises(TensorsimError, match=message):
+        Shards([write_tar(tmp_path / "bad.tar", {"a.jpg": jpg(0), "a.json": labelled})])
+
+
+def test_labels_that_are_not_what_they_should_be_are_refused(tmp_path: Path) -> None:
+    everyone = label([]) | {"all_persons_labelled": "no"}
+    with pytest.raises(TensorsimError, match="a: got all_persons_labelled 'no', expected true or false"):
+        Shards([write_tar(tmp_path / "bad.tar", {"a.jpg": jpg(0), "a.json": everyone})])
+    with pytest.raises(TensorsimError, match="not a shard"):
+        Shards([write_tar(tmp_path / "bad.tar", {"a.jpg": jpg(0), "a.json": b"[" * 100_000})])
+
+
 def test_what_is_no_tar_or_no_picture_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.tar"
     path.write_bytes(b"not a tar at all" * 100)
