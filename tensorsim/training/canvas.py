@@ -86,8 +86,8 @@ class Canvas:
         # OpenCV has pixel centres at integers, boxes have corners there.
         centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
         matrix = np.linalg.inv(centre) @ matrix @ centre
-        if scale < 0.6:
-            picture = cv2.blur(picture, (round(1 / scale),) * 2)  # type: ignore[assignment]
+        if scale <= 0.5:  # an odd width, for an even one would move the picture
+            picture = cv2.blur(picture, (2 * int(0.5 / scale) + 1,) * 2)  # type: ignore[assignment]
         self.image[top:bottom, left:right] = cv2.warpPerspective(
             picture, matrix, tuple(room.tolist()), flags=cv2.INTER_LINEAR, borderValue=(LETTERBOX_GREY,) * 3
         )

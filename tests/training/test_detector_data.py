@@ -118,6 +118,31 @@ def test_placed_boxes_hold_the_person(sources: Sources, seed: int) -> None:
     assert canvas.known.all()
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_shrunk_pictures_do_not_move(sources: Sources, seed: int) -> None:
+    canvas = Canvas(40)
+    canvas.place(sources.complete[0], (0, 0, 40, 40), np.random.default_rng(seed))
+    left, top, right, bottom = canvas.final_boxes()[0]
+    red = np.maximum(canvas.image[..., 0].astype(float) - canvas.image[..., 1] - 20, 0)
+    if min(left, top) > 1 and max(right, bottom) < 39:
+        v, u = np.mgrid[:40, :40] + 0.5
+        centre = np.array([(u * red).sum(), (v * red).sum()]) / red.sum()
+        np.testing.assert_allclose(centre, [(left + right) / 2, (top + bottom) / 2], atol=0.08)
+
+
+def test_of_whom_the_edge_leaves_little_nothing_is_known(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five of the 30 columns of the person are left, at the one edge or in the mirror at the other."""
+    monkeypatch.setattr("tensorsim.training.canvas._placement", lambda *_: (1.0, np.array([-65.0, 0.0])))
+    canvas = Canvas(80)
+    canvas.place(sources.complete[0], (0, 0, 80, 80), np.random.default_rng(0))
+    assert len(canvas.final_boxes()) == 0
+    unknown = np.zeros_like(canvas.known)
+    unknown[10:, :3] = True
+    assert (~canvas.known == unknown).all() or (~canvas.known == unknown[:, ::-1]).all()
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_boxes_are_tight_around_people_in_turned_pictures(tmp_path: Path, seed: int) -> None:
     """Around an ellipse, which the recomputed box should hold to the pixel at any turn."""
