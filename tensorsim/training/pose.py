@@ -122,9 +122,9 @@ def heatmap_loss(
 ) -> Tensor:
     """What heat maps (..., h, w) cost, per map (...); zero where they equal the targets.
 
-    ``sum_x (1 + foreground e) (m - t)^2 / sum_x t^2`` and, weighted with ``places``, the Kullback-Leibler divergence
-    of ``softmax(sharpness m)`` from ``softmax(sharpness t)`` over places x. Both have their minimum at m = t. The
-    emphasis e, in [0, 1], is t itself unless given.
+    ``sum_x (1 + foreground e) (m - t)^2 / ((1 + foreground) max(sum_x t^2, 1))`` and, weighted with ``places``, the
+    Kullback-Leibler divergence of ``softmax(sharpness m)`` from ``softmax(sharpness t)`` over places x. Both have their
+    minimum at m = t. The emphasis e, in [0, 1], is t itself unless given.
     """
     emphasis = targets if emphasis is None else emphasis
     energy = (targets**2).sum((-2, -1)).clamp_min(1.0)

@@ -55,13 +55,14 @@ class GNNTracker(nn.Module):
     2. Hungarian assignment in two passes (as in ByteTrack, Zhang et al., ECCV 2022), first of detections of at least
        ``start_score``, then of the others to the tracks that are left. The cost of a pair is ``(1 - IoU) + d^2 /
        assignment_threshold``, d the Mahalanobis distance of the detection to the predicted box, so that the distance
-       decides where boxes do not overlap, plus the share of ``delete_window`` since the last match, as the covariance
-       of a lost track admits much. A pair needs ``d^2 <= assignment_threshold``, centres within ``reach`` sizes and
-       areas within a factor of 4; in the second pass also an IoU of ``weak_iou``, so that a lost person is not found
-       in a piece of furniture, and a detection that is no duplicate of a matched one. A confirmed track with a match
-       in the last ``confirm_window`` observed frames may there take one of ``faint_score`` whatever d, also if one
-       box covers half of the other, unless a fifth of it is covered by a matched one: somebody who lies down is found
-       badly, in a box of another shape. Any such pair is better than none.
+       decides where boxes do not overlap, plus the share of ``delete_window`` since the last match, as the
+       covariance of a lost track admits much, plus ``1 - score``. A pair needs ``d^2 <= assignment_threshold``,
+       centres within ``reach`` sizes and areas within a factor of 4; in the second pass also an IoU of
+       ``weak_iou``, so that a lost person is not found in a piece of furniture, and a detection that is no
+       duplicate of a matched one. A confirmed track with a match in the last ``confirm_window`` observed frames
+       may there take one of ``faint_score`` whatever d, also if one box covers half of the other, unless a
+       fifth of it is covered by a matched one: somebody who lies down is found badly, in a box of another
+       shape. Any such pair is better than none.
     3. An unmatched detection of at least ``start_score`` starts a track, unless it overlaps a better or
        matched one by an IoU above ``duplicate_iou``, or with more than ``duplicate_part`` of its own area:
        one person detected twice.
