@@ -128,6 +128,18 @@ def test_a_sample_depends_on_its_number_only(folder: Path) -> None:
         assert torch.equal(patch, other.sample(99)[name])
 
 
+def test_patch_and_noise_are_cut_and_mirrored_alike(folder: Path) -> None:
+    recipe = DenoiserRecipe(untrained(2), folder, 10)
+    recipe.training["noise"] = recipe.training["image"]
+    turned = 0
+    for index in range(20):
+        image, noise = recipe.sample(index).values()
+        assert torch.equal(image, noise)
+        windows = recipe.training["image"].unfold(1, TRAINED, 1).unfold(2, TRAINED, 1)
+        turned += not bool((windows == image[0]).flatten(-2).all(-1).any())
+    assert turned > 5
+
+
 def test_every_activity_is_held_out(tmp_path: Path) -> None:
     for clip in range(12 * 11):
         patch = torch.full((1, 2, 2), float(clip % 12))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 import tensorsim as ts
@@ -41,6 +42,22 @@ def test_bytes_keep_a_fifth_of_a_decibel() -> None:
     error_db = 10 * (from_bytes(to_bytes(power)) / power).log10()
     assert float(error_db.abs().max()) <= 0.2 + 1e-4
     assert from_bytes(to_bytes(torch.zeros(3))).tolist() == [0, 0, 0]
+
+
+def test_the_spectra_of_echo_and_noise_mix(tmp_path: Path) -> None:
+    """``A + 2 s B + s^2 C`` of one pixel: |S + s N|^2 of numbers that point alike, apart, or at right angles."""
+    (tmp_path / "settings.json").write_text(json.dumps(asdict(replace(SMALL, size=1))))
+    for person, cross in enumerate((127, -127, 0)):
+        content = {
+            "signal": torch.full((1, 1, 1), 255, dtype=torch.uint8),
+            "cross": torch.full((1, 1, 1), cross, dtype=torch.int8),
+            "noise": torch.full((1, 1), 255, dtype=torch.uint8),
+            "gain_db": torch.zeros(1),
+        }
+        save_file(content, tmp_path / f"free-space-{person:05d}.safetensors")
+    store = MapStore(tmp_path)
+    found = [float(store.power("free-space", person, 0, 20.0)) for person in range(3)]
+    assert found == pytest.approx([1.1**2, 0.9**2, 1 + 0.1**2])
 
 
 def difference_db(folder: Path, scene: str, activity: int, snr_db: float) -> Tensor:

@@ -249,6 +249,27 @@ def test_samples_depend_on_seed_and_number_only(tmp_path: Path) -> None:
     assert {s["sided"] for s in samples} == {True, False}
 
 
+def test_legs_below_the_picture_are_gone(tmp_path: Path) -> None:
+    some = recipe(tmp_path)
+    legless, box = standing(), BOX.copy()
+    legless[13:17, 2], box[3] = 0, 279
+    person = some.groups[0][0]._replace(keypoints=legless, box=box)
+    for shown, gone in ((person, True), (person._replace(box=BOX), False)):
+        only = PoseRecipe(some.net, PosePeople([shown], [], []), {}, augmentation=Augmentation(cut=0, half=0))  # type: ignore[arg-type]
+        assert all(only.sample(n)["gone"][13:17].all() == gone for n in range(5))
+
+
+def test_who_stands_and_who_has_others_beside_comes_more_often(tmp_path: Path) -> None:
+    some = recipe(tmp_path)
+    alone = some.groups[0][0]
+    lying = standing()
+    lying[:, :2] = lying[:, [1, 0]]
+    beside = alone._replace(others=standing()[None, :17])
+    persons = [alone._replace(keypoints=lying), alone, beside]
+    recipe_of_them = PoseRecipe(some.net, PosePeople(persons, [], []), {})  # type: ignore[arg-type]
+    np.testing.assert_allclose(recipe_of_them.weights[0], [1 / 6, 2 / 6, 3 / 6])
+
+
 def test_sources_left_out(tmp_path: Path) -> None:
     full = recipe(tmp_path)
     only = PoseRecipe(full.net, PosePeople(full.groups[0], [], []), {})  # type: ignore[arg-type]

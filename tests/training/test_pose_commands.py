@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tensorsim.commands.evaluate_pose import EvaluatePose
@@ -90,6 +91,12 @@ def test_nobody_held_out_is_trained_on(data: Path) -> None:
         assert not keys & apart
         assert keys | apart == {f"im{n}" for n in range(40)}
     assert len(persons.films) == 40
+    # What the teacher leaves out of films is beyond the edge.
+    labelled = standing()[:17, 2]
+    assert all(
+        (film.keypoints[:17, 2] == np.where(labelled > 0, labelled, -1)).all() for film in persons.films
+    )
+    assert all((person.keypoints[:17, 2] == labelled).all() for person in persons.sided)
 
 
 def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> None:

@@ -105,6 +105,24 @@ def test_points_stay_on_what_they_label_and_sides_are_exchanged_in_the_mirror() 
     assert min(straight, mirrored) > 15
 
 
+def test_others_are_moved_as_the_person_is() -> None:
+    """By the mirror, whose sides change, the edge that cuts and the turn: where they are the person, they stay it."""
+    keypoints = standing()
+    labelled = keypoints[:17, 2] > 0
+    for seed in range(40):
+        crop = crop_person(
+            drawn(keypoints),
+            BOX,
+            keypoints,
+            SIZE,
+            Augmentation(cut=0.5),
+            np.random.default_rng(seed),
+            keypoints[None, :17],
+        )
+        np.testing.assert_allclose(crop.rivals[0][labelled], crop.points[labelled], atol=1e-2)
+        assert (crop.rivals[0][~labelled] < -1000).all()
+
+
 def test_mild_crops_are_nearer_to_those_of_the_pipeline() -> None:
     image, keypoints = np.zeros((*SIZE, 3), np.uint8), standing()
     plain = crop_person(image, BOX, keypoints, SIZE).points
