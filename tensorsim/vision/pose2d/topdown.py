@@ -19,10 +19,11 @@ class FlipTest(nn.Module):
     """Flip test: a heat-map network runs on the crop and on its mirror image, and the maps are averaged.
 
     The maps of the mirror image are flipped back, left and right keypoints are exchanged, and the maps are shifted
-    right by one pixel: crop pixel 4u is at W - 1 - 4u in the mirror image, whose map flipped back has it at u - 3/4.
+    right by 1 - 1/s pixels, linearly interpolated, where maps are s times smaller than crops: crop pixel su is at
+    W - 1 - su in the mirror image, whose map flipped back has it at u - 1 + 1/s.
 
     Args:
-        network: (N, 3, H, W) -> (N, 17, h, w), as :class:`HRNet`.
+        network: (N, 3, H, W) -> (N, 17, H/s, W/s), as :class:`HRNet`.
     """
 
     mirrored: Tensor
@@ -33,11 +34,12 @@ class FlipTest(nn.Module):
         self.register_buffer("mirrored", torch.tensor(MIRRORED), persistent=False)
 
     def forward(self, crops: Tensor) -> Tensor:
-        """(N, 3, H, W) RGB in [0, 1] -> (N, 17, h, w)."""
+        """(N, 3, H, W) RGB in [0, 1] -> (N, 17, H/s, W/s)."""
         maps = self.network(crops)
         turned = self.network(crops.flip(-1)).flip(-1).index_select(1, self.mirrored)
-        turned = torch.cat([turned[..., :1], turned[..., :-1]], -1)
-        return (maps + turned) / 2
+        shifted = torch.cat([turned[..., :1], turned[..., :-1]], -1)
+        shift = 1 - maps.shape[-1] / crops.shape[-1]
+        return (maps + (1 - shift) * turned + shift * shifted) / 2
 
 
 def quarter_turns(keypoints: Tensor) -> Tensor:
