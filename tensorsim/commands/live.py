@@ -101,27 +101,35 @@ class Live(NetworkOptions, RadarOptions):
         from tensorsim.live.view import LiveView
 
         view = LiveView(live, plot.MapStyle(self.colormap, self.dynamic_range))
+        stopped: KeyboardInterrupt | TensorsimError | None = None
         with ExitStack() as stack:
             page = None if self.port is None else stack.enter_context(serving(self.port))
             if page is not None:
                 print(f"showing http://127.0.0.1:{page.port}/ (Ctrl-C ends)", file=sys.stderr)
             film = None if self.record is None else stack.enter_context(VideoWriter(self.record, camera.fps))
-            for frame, dropped in camera.frames():
-                for _ in range(dropped):
-                    missed = live.miss()
-                    view.add(missed)
-                    self._say(missed, camera)
-                new = live.push(frame)
-                view.add(new)
-                picture = view.draw(new, frame.permute(1, 2, 0).numpy(), camera.dropped)
-                if page is not None:
-                    page.show(picture)
-                if film is not None:
-                    for _ in range(1 + dropped):  # the film of the page lasts as long as what was filmed
-                        film.add(picture)
-                self._say(new, camera)
-                if self.seconds is not None and new.time_s >= self.seconds:
-                    break
+            try:
+                for frame, dropped in camera.frames():
+                    for _ in range(dropped):
+                        missed = live.miss()
+                        view.add(missed)
+                        self._say(missed, camera)
+                    new = live.push(frame)
+                    view.add(new)
+                    picture = view.draw(new, frame.permute(1, 2, 0).numpy(), camera.dropped)
+                    if page is not None:
+                        page.show(picture)
+                    if film is not None:
+                        for _ in range(1 + dropped):  # the film of the page lasts as long as what was filmed
+                            film.add(picture)
+                    self._say(new, camera)
+                    if self.seconds is not None and new.time_s >= self.seconds:
+                        break
+            except (KeyboardInterrupt, TensorsimError) as error:
+                if film is None or film.count == 0:
+                    raise
+                stopped = error  # raised once the film is complete
+        if stopped is not None:
+            raise stopped
 
     @staticmethod
     def _warn(messages: list[str]) -> int:

@@ -64,8 +64,9 @@ class VideoWriter:
             self._shape = frame.shape
             _open_writer(self._writer, self._partial, self.fps, (width + width % 2, height + height % 2))
         bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-        self._writer.write(cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
-        self.count += 1
+        bgr = cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        self.count += 1  # an interrupt, which comes after the write, must not leave the frame uncounted
+        self._writer.write(bgr)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._folder:

@@ -119,7 +119,7 @@ class Camera:
         """Put frames with their numbers into the queue as they come; the work of a thread."""
         start = time.monotonic()
         try:
-            for index, frame in self._film() if self.is_file else self._live(start):
+            for index, frame in self._film() if self.is_file else self._live():
                 if self.is_file:
                     time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
                 with arrived:
@@ -144,18 +144,21 @@ class Camera:
                 yield index, frame
             first = index + 1
 
-    def _live(self, start: float) -> Iterator[tuple[int, Tensor | None]]:
-        """Frames numbered by the time at which they came; None once there are no more."""
+    def _live(self) -> Iterator[tuple[int, Tensor | None]]:
+        """Frames numbered by the time at which they came, from the first one on; None once there are no more."""
         import cv2
 
-        last = -1
+        start, last = 0.0, -1
         try:
             while True:
                 found, frame = self.capture.read()
                 if not found:
                     yield last + 1, None
                     return
-                last = max(last + 1, round((time.monotonic() - start) * self.fps))
+                now = time.monotonic()
+                if last < 0:
+                    start = now  # a camera may take a second to start
+                last = max(last + 1, round((now - start) * self.fps))
                 yield last, torch.from_numpy(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
         finally:
             self.capture.release()

@@ -1,5 +1,6 @@
 """Live equals the causal stages on the whole film, with a bounded delay and memory; drops are counted."""
 
+import itertools
 import math
 import threading
 import time
@@ -24,6 +25,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.live import LiveFrame, LiveSimulator
+from tensorsim.live import camera as live_camera
 from tensorsim.live.camera import Camera, Grabbed
 from tensorsim.live.page import serving
 from tensorsim.live.radar import LiveRadar, cubic_b_spline
@@ -360,6 +362,29 @@ def test_an_error_while_frames_are_read_is_raised(clip: Path, monkeypatch: pytes
         list(camera.frames())
 
 
+class SlowCapture:
+    """A camera that takes a while to start, gives one frame and stops."""
+
+    def __init__(self) -> None:
+        self.answers = iter([(True, np.zeros((4, 4, 3), np.uint8)), (False, None)])
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        time.sleep(0.1)
+        return next(self.answers)
+
+    def release(self) -> None:
+        pass
+
+
+def test_time_starts_with_the_first_frame_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_camera, "_opened", lambda *_: (SlowCapture(), 30.0))
+    camera = Camera("0")
+    frames = camera.frames()
+    assert next(frames).dropped == camera.dropped == 0
+    with pytest.raises(TensorsimError, match="0: the camera gave no more frames"):
+        next(frames)
+
+
 def test_cameras_that_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no such file"):
         Camera(str(tmp_path / "no.mp4"))
@@ -394,6 +419,35 @@ def _every_third(camera: Camera) -> Iterator[Grabbed]:
         if index % 3 == 2:
             camera.dropped += 2
             yield Grabbed(frame, 2)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), TensorsimError("the camera gave no more frames")])
+def test_the_recorded_film_outlives_an_interrupt(
+    clip: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+) -> None:
+    def interrupted(camera: Camera) -> Iterator[Grabbed]:
+        for _, frame in itertools.islice(camera.reader.timed_frames(), 3):
+            yield Grabbed(frame, 0)
+        raise error
+
+    weights, path = tmp_path / "w.onnx", tmp_path / "live.webm"
+    weights.write_text("")
+    monkeypatch.setattr(live_command, "load_networks", lambda *_: networks())
+    monkeypatch.setattr(Camera, "frames", interrupted)
+    arguments = ["live", "--camera", str(clip), "--detector", str(weights), "--pose", str(weights)]
+    arguments += ["--port", "None", "--record", str(path)]
+    if isinstance(error, KeyboardInterrupt):
+        cli.main(arguments)
+        assert "0.3 s, " in capsys.readouterr().out
+    else:
+        with pytest.raises(SystemExit):
+            cli.main(arguments)
+        assert "the camera gave no more frames" in capsys.readouterr().err
+    assert sum(chunk.shape[0] for chunk in VideoReader(path).chunks(16)) == 3
 
 
 def test_command(
