@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import tensorsim as ts
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.motion import JointScatterers
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.results import Axes, doppler_span, people_of
 from tensorsim.streaming import maps_of_pose
@@ -140,6 +142,23 @@ def test_shipped_networks_look_into_the_mirror_unless_told_not_to() -> None:
     crops = torch.rand(1, 3, 128, 96)
     assert torch.equal(asked_twice.network(crops), once(crops))
     assert not torch.equal(asked_twice(crops), once(crops))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: VideoToActivity.from_pretrained(),
+        lambda: VideoToActivity.from_config(ts.SimulationConfig().replace(processing__denoiser="dncnn")),
+    ],
+)
+def test_pretrained_networks_are_frozen(make: Callable[[], VideoToActivity]) -> None:
+    assert not [name for name, values in make().named_parameters() if values.requires_grad]
+
+
+def test_a_learnable_scene_in_a_pretrained_graph_still_learns() -> None:
+    stage = PoseToDoppler(ts.radar.RadarSimulator(RADAR), scatterers=JointScatterers(learnable=True))
+    graph = VideoToDoppler.from_pretrained(pose_to_doppler=stage)
+    assert all(values.requires_grad for values in graph.pose_to_doppler.parameters())
 
 
 def test_a_person_who_walks_away_is_where_they_are_and_recedes() -> None:

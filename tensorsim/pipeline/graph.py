@@ -103,7 +103,7 @@ class VideoToDoppler(nn.Module):
     def from_config(
         cls, config: SimulationConfig, detector: nn.Module | None = None, pose: nn.Module | None = None
     ) -> "VideoToDoppler":
-        """The graph that a configuration describes, in evaluation mode.
+        """The graph that a configuration describes, in evaluation mode, its networks frozen.
 
         Args:
             config: the configuration.
@@ -139,7 +139,7 @@ class VideoToDoppler(nn.Module):
         flip_test: bool = True,
         **options: Any,
     ) -> "VideoToDoppler":
-        """The whole with trained networks, in evaluation mode.
+        """The whole with trained networks, in evaluation mode, its networks frozen.
 
         Args:
             detector, pose: paths or names of ``tensorsim models list``; None: the shipped weights.
@@ -149,7 +149,9 @@ class VideoToDoppler(nn.Module):
         Raises:
             TensorsimError: weights that are not there or of another network.
         """
-        return cls(RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test), **options).eval()
+        whole = cls(RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test), **options).eval()
+        whole.video_to_pose.requires_grad_(False)
+        return whole
 
     def forward(
         self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
@@ -220,7 +222,7 @@ class VideoToActivity(nn.Module):
         radar: RadarConfig | str | None = None,
         **options: Any,
     ) -> "VideoToActivity":
-        """The whole with trained networks, in evaluation mode.
+        """The whole with trained networks, in evaluation mode, its networks frozen.
 
         Args:
             detector, pose, classifier: paths or names of ``tensorsim models list``; None: the shipped weights.
@@ -231,21 +233,20 @@ class VideoToActivity(nn.Module):
         """
         whole = VideoToDoppler.from_pretrained(detector, pose, radar=radar, **options)
         radar = whole.pose_to_doppler.simulator.radar
-        return cls(whole, ActivityRecognizer.from_pretrained(radar, classifier)).eval()
+        recognizer = ActivityRecognizer.from_pretrained(radar, classifier).requires_grad_(False)
+        return cls(whole, recognizer).eval()
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "VideoToActivity":
-        """The graph that a configuration describes, in evaluation mode.
+        """The graph that a configuration describes, in evaluation mode, its networks frozen.
 
         Raises:
             TensorsimError: weights that are not there or of another network, or ``classifier="none"``.
         """
         if config.classifier == "none":
             raise TensorsimError("VideoToActivity: got the classifier 'none', expected weights")
-        return cls(
-            VideoToDoppler.from_config(config),
-            ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier),
-        ).eval()
+        recognizer = ActivityRecognizer.from_pretrained(config.scene.radar, config.classifier)
+        return cls(VideoToDoppler.from_config(config), recognizer.requires_grad_(False)).eval()
 
     def forward(
         self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None

@@ -89,7 +89,7 @@ class PoseToDoppler(nn.Module):
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "PoseToDoppler":
-        """The stage that ``scene``, ``processing`` and ``smoothing`` of a configuration describe, in evaluation mode.
+        """The stage of ``scene``, ``processing`` and ``smoothing`` of a configuration, in evaluation mode, frozen.
 
         Raises:
             TensorsimError: weights of the denoiser that are not there or of another network.
@@ -117,7 +117,7 @@ class PoseToDoppler(nn.Module):
             small_motions.append(VitalSigns(prf_hz, seed=config.seed))
         denoiser = map_denoiser(processing.denoiser)
         people = len(config.pose.person_weight_kg)
-        return cls(
+        stage = cls(
             RadarSimulator(scene, processing=processing, seed=config.seed),
             PoseResampler(prf_hz, method=smoothing.resampling),
             pulse_smoother,
@@ -125,7 +125,8 @@ class PoseToDoppler(nn.Module):
             denoiser,
             tuple(config.pose.rcs_scale(person) for person in range(people)),
             small_motions,
-        ).eval()
+        )
+        return stage.eval().requires_grad_(False)
 
     def forward(self, joints: Tensor, valid: Tensor, fps: float) -> RadarMaps:
         """Joints (B, P, T, 14, 3) in metres and their validity (B, P, T) -> maps of B scenes.

@@ -128,7 +128,7 @@ class VideoToPose(nn.Module):
     def from_config(
         cls, config: SimulationConfig, detector: nn.Module | None = None, pose: nn.Module | None = None
     ) -> "VideoToPose":
-        """The stage that a configuration describes, in evaluation mode.
+        """The stage that a configuration describes, in evaluation mode, its networks frozen.
 
         Args:
             config: its ``tracking``, ``pose`` and ``smoothing``.
@@ -142,7 +142,7 @@ class VideoToPose(nn.Module):
             detector = pretrained_detector(tracking.detector)
         if pose is None:
             pose = pretrained_pose(people.network, people.flip_test)
-        return cls(
+        stage = cls(
             detector,
             top_down(pose, people.flip_test),
             keypoint_threshold=people.keypoint_threshold,
@@ -169,7 +169,8 @@ class VideoToPose(nn.Module):
                 mode=people.position,
             ),
             smoother=KalmanSmoother(mode=smoothing.mode),
-        ).eval()
+        )
+        return stage.eval().requires_grad_(False)
 
     def seen_by(self, camera: CameraConfig, known: bool = True) -> "VideoToPose":
         """The same stage, with the same networks, for another camera, known or estimated from a film.
