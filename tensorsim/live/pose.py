@@ -120,7 +120,7 @@ class CausalPose(nn.Module):
 
         whole = usable & (reliable.sum(dim=-1) >= self.metric_pose.whole_body_joints)
         whole = whole & (lifted.distance[:, 0] < self.metric_pose.poor_fit)
-        first = whole & (state.size.p00[:, 0] >= self.unknown)
+        first = whole & ((state.size.p00[:, 0] >= self.unknown) | (state.missed > self.brief_gap))
         cut_off = cut_off_beside(boxes, width)[:, None]
         size = self._filtered(
             state.size,
@@ -160,7 +160,7 @@ class CausalPose(nn.Module):
         """The state after joints (P, 14, 3) that were placed in the world."""
         hidden = torch.where(seen, 0, state.hidden + 1)
         measured = usable[:, None] & (seen | (hidden > self.brief_gap))
-        newly = usable & (state.frames == 0)
+        newly = usable & (state.missed > self.brief_gap)
         joints = self._filtered(
             state.joints,
             placed,

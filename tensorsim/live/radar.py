@@ -34,11 +34,13 @@ class NewColumns(NamedTuple):
 
 @dataclass
 class _Person:
-    """The last four frames of somebody: joints (4, 14, 3) and presence (4,), and the order of appearance."""
+    """The last four frames of somebody: joints (4, 14, 3) and presence (4,), the order of appearance, and whether
+    somebody who was absent has not come back yet."""
 
     joints: Tensor
     presence: Tensor
     order: int
+    away: bool = False
 
 
 def cubic_b_spline(knots: Tensor, u: Tensor) -> Tensor:
@@ -138,7 +140,14 @@ class LiveRadar:
                 self.people[number] = _Person(place.expand(4, 14, 3), torch.zeros(4).double(), number)
         for number, person in list(self.people.items()):
             place, there = joints.get(number, (person.joints[-1], False))
-            level = float(person.presence[-1]) + (step if there else -step)
+            # Who was absent appears where they are now once nothing is heard of them where they were.
+            silent = float(person.presence.amax()) == 0
+            if there and silent:
+                person.joints = place.expand(4, 14, 3)
+            person.away = not there or (person.away and not silent)
+            if person.away:
+                place = person.joints[-1]
+            level = float(person.presence[-1]) + (-step if person.away else step)
             person.joints = torch.cat([person.joints[1:], place[None]])
             person.presence = torch.cat(
                 [person.presence[1:], torch.tensor([min(max(level, 0.0), 1.0)]).double()]

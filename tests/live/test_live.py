@@ -136,6 +136,22 @@ def test_sizes_of_who_is_cut_off_by_the_edge_count_little(left_px: float, off: t
     assert off[0] <= abs(found / true - 1) <= off[1]
 
 
+def test_who_was_hidden_is_placed_anew() -> None:
+    stage = simulator().poses[0]
+
+    def shown(sizes: list[float]) -> Tensor:
+        state = stage.begin(1)
+        for size in sizes:
+            keypoints = torch.tensor(STANDING)[None] * size + torch.tensor([150.0, 30.0])
+            there = torch.tensor([size > 0])
+            state = stage(state, keypoints, torch.full((1, 17), 0.9), INSIDE, there, 240, 320)
+        return state.shown[0] - state.shown[0].amin(dim=0)[2] * torch.tensor([0.0, 0.0, 1.0])
+
+    with torch.no_grad():
+        again, anew = shown([120.0] * 12 + [0.0] * 5 + [90.0] * 2), shown([90.0] * 2)
+    assert torch.allclose(again, anew, atol=0.01)
+
+
 def test_poses_are_those_of_the_causal_stages_on_the_whole_film() -> None:
     """The same stages, each on all frames at once: lifter, forward filter of the size, metric pose, floor, filter."""
     stage = simulator().poses[0]
@@ -234,6 +250,22 @@ def test_maps_are_those_of_the_whole_motion(fps: float, prf_hz: float, mti: str)
         expected = getattr(maps, name)[0][:, : live.shape[-1]]
         assert expected.shape[-1] - live.shape[-1] <= 1, "but for what fills no column"
         assert torch.allclose(live, expected[:, : live.shape[-1]], atol=1e-4 * float(expected.max()))
+
+
+@pytest.mark.parametrize("absent", [1, 3, 20])
+def test_nobody_hears_how_somebody_gets_elsewhere_while_hidden(absent: int) -> None:
+    body = (
+        ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=2.0, rate_hz=30.0).joints[0, 0]
+    )
+    here, there = body.double(), body.double() + torch.tensor([0.0, 0.6, 0.0])
+    frames = [(here, True)] * 20 + [(here, False)] * absent + [(there, True)] * 20
+    radar = LiveRadar(ts.PoseToDoppler.from_config(CONFIG), 30.0)
+    with torch.no_grad():
+        maps = torch.cat([radar.push({0: frame}).doppler_time for frame in frames], dim=-1)
+        radar = LiveRadar(radar.stage, 30.0)
+        appears = torch.cat([radar.push({0: (here, True)}).doppler_time for _ in range(20)], dim=-1)
+    fast = radar.simulator.doppler.doppler_hz.abs() * radar.simulator.radar.doppler_wavelength_m > 3.0
+    assert float(maps[fast].max()) < 1.5 * float(appears[fast].max())
 
 
 def test_a_file_as_a_camera_equals_its_frames(clip: Path) -> None:
