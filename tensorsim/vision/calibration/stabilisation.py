@@ -16,6 +16,8 @@ from tensorsim.types import Tracks
 
 #: A camera that turns by more than this from its mean direction is not made still: its pictures have no common plane.
 MOST_TURN_RAD = math.radians(45)
+#: Nor where a corner of a picture has a smaller share of its depth along the mean direction: it would be far outside.
+LEAST_DEPTH = 0.2
 #: Share of the picture's width and height at its left, right and lower edges where key points count as cut off.
 _BESIDE, _BELOW = 0.01, 0.03
 
@@ -70,7 +72,7 @@ def camera_path(steps: Tensor, focal: float) -> tuple[Tensor, Tensor]:
 
 
 def homographies(steps: Tensor, focal: float, size: tuple[int, int]) -> Tensor | None:
-    """Homographies (T, 3, 3) of :attr:`StillPicture.from_film`; None where the camera turns too far.
+    """Homographies (T, 3, 3) of :attr:`StillPicture.from_film`; None where the camera turns too far for its view.
 
     Args:
         steps: see :func:`camera_path`.
@@ -87,7 +89,21 @@ def homographies(steps: Tensor, focal: float, size: tuple[int, int]) -> Tensor |
     trace = turns.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
     if float(torch.acos(((trace - 1) / 2).clamp(-1, 1)).max()) > MOST_TURN_RAD:
         return None
-    return _intrinsics(torch.full_like(focals, focal), size) @ turns @ _intrinsics(focals, size).inverse()
+    through = _intrinsics(torch.full_like(focals, focal), size) @ turns @ _intrinsics(focals, size).inverse()
+    if float(_projected(_corners(size), through)[..., 2].min()) < LEAST_DEPTH:
+        return None
+    return through
+
+
+def _corners(size: tuple[int, int]) -> Tensor:
+    """The corners (4, 2) of a picture of this height and width."""
+    return torch.tensor([(u, v) for u in (-0.5, size[1] - 0.5) for v in (-0.5, size[0] - 0.5)])
+
+
+def _projected(points: Tensor, through: Tensor) -> Tensor:
+    """Points (..., T, N, 2) in pixels to homogeneous ones (..., T, N, 3) through homographies (T, 3, 3)."""
+    whole = torch.cat([points.double(), torch.ones_like(points[..., :1]).double()], dim=-1)
+    return whole @ through.to(points.device).mT
 
 
 def _intrinsics(focals: Tensor, size: tuple[int, int]) -> Tensor:
@@ -107,9 +123,18 @@ def at_even_times(steps: Tensor, times_s: Tensor, fps: float) -> Tensor:
 
 
 def mapped(points: Tensor, through: Tensor) -> Tensor:
-    """Points (..., T, N, 2) in pixels through homographies (T, 3, 3), in float64."""
-    whole = torch.cat([points.double(), torch.ones_like(points[..., :1]).double()], dim=-1) @ through.mT
+    """Points (..., T, N, 2) in pixels through homographies (T, 3, 3), in float64 on the device of the points."""
+    whole = _projected(points, through)
     return whole[..., :2] / whole[..., 2:]
+
+
+def _margin(size: tuple[int, int], through: Tensor) -> tuple[int, int]:
+    """Pixels to add left and above, and as many right and below, to a picture so that it holds all of a film."""
+    corners = mapped(_corners(size), through)
+    outside = torch.cat([corners.amax(dim=(0, 1)), -corners.amin(dim=(0, 1))])
+    beyond = outside - torch.tensor([size[1] - 0.5, size[0] - 0.5, 0.5, 0.5])
+    left, above = beyond.clamp(min=0).unflatten(0, (2, 2)).amax(dim=0).ceil().tolist()
+    return int(left), int(above)
 
 
 def still_picture(
@@ -129,19 +154,16 @@ def still_picture(
         focal: mean focal length in pixels.
 
     Returns:
-        None where the camera turns by more than :data:`MOST_TURN_RAD` from its mean direction.
+        None where the camera turns by more than :data:`MOST_TURN_RAD` from its mean direction, or by so much that a
+        corner of a picture has less than :data:`LEAST_DEPTH`.
     """
     through = homographies(steps, focal, size)
     if through is None:
         return None
     height, width = size
-    corners = torch.tensor([(u, v) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
-    outside = torch.cat(
-        [mapped(corners, through).amax(dim=(0, 1)), -mapped(corners, through).amin(dim=(0, 1))]
-    )
-    beyond = outside - torch.tensor([width - 0.5, height - 0.5, 0.5, 0.5])
-    margin = beyond.clamp(min=0).unflatten(0, (2, 2)).amax(dim=0).ceil()
-    large = (height + 2 * int(margin[1]), width + 2 * int(margin[0]))
+    beside = _margin(size, through)
+    large = (height + 2 * beside[1], width + 2 * beside[0])
+    margin = torch.tensor(beside, dtype=torch.float64, device=keypoints.device)
 
     cut_off = (keypoints[..., 0] < _BESIDE * width) | (keypoints[..., 0] > (1 - _BESIDE) * width)
     cut_off = cut_off | (keypoints[..., 1] > (1 - _BELOW) * height)
@@ -149,10 +171,10 @@ def still_picture(
     # A box of the same shape about where its middle is.
     middle = (boxes[..., :2] + boxes[..., 2:])[..., None, :] / 2
     ends = torch.cat([middle, middle + torch.tensor([1.0, 0.0]).to(middle)], dim=-2)
-    at, beside = mapped(ends, through).unbind(-2)
-    half = (boxes[..., 2:] - boxes[..., :2]).double() / 2 * (beside - at).norm(dim=-1, keepdim=True)
+    at, by_one = mapped(ends, through).unbind(-2)
+    half = (boxes[..., 2:] - boxes[..., :2]).double() / 2 * (by_one - at).norm(dim=-1, keepdim=True)
     moved = torch.cat([at - half, at + half], dim=-1) + margin.repeat(2)
-    edge = torch.tensor([0.0, 0.0, large[1] - 1.0, large[0] - 1.0], dtype=moved.dtype)
+    edge = torch.tensor([0.0, 0.0, large[1] - 1.0, large[0] - 1.0]).to(moved)
     reaches = torch.cat(
         [boxes[..., :2] <= 1, boxes[..., 2:] >= torch.tensor([width - 2, height - 2]).to(boxes)], dim=-1
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tensorsim import plot
 from tensorsim.body.kinematics import rotation
@@ -19,6 +20,7 @@ from tensorsim.pipeline import VideoToPose
 from tensorsim.streaming import lifted_film
 from tensorsim.types import Tracks
 from tensorsim.vision import TemporalLifter
+from tensorsim.vision.calibration import stabilisation
 from tensorsim.vision.calibration.camera_motion import BackgroundMotion
 from tensorsim.vision.calibration.stabilisation import (
     at_even_times,
@@ -94,6 +96,28 @@ def test_what_stands_still_stays_at_one_pixel() -> None:
 def test_a_camera_that_turns_round_has_no_still_picture() -> None:
     turns, zooms = swaying(FRAMES, pan_deg=150.0)
     assert homographies(steps_of(turns, zooms), FOCAL, SIZE) is None
+
+
+@pytest.mark.parametrize(("focal", "there"), [(700.0, True), (300.0, False)])
+def test_no_corner_comes_near_the_horizon_of_the_still_picture(focal: float, there: bool) -> None:
+    """A camera with a wide view turns to either side by 35 degrees."""
+    turns, zooms = swaying(FRAMES, pan_deg=70.0)
+    through = homographies(steps_of(turns, zooms, focal), focal, SIZE)
+    assert (through is not None) == there
+
+
+def test_people_on_another_device_stay_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    steady = homographies(torch.zeros(FRAMES, 4), FOCAL, SIZE)
+    monkeypatch.setattr(stabilisation, "homographies", lambda *_: steady)  # of the steps, on the CPU
+    monkeypatch.setattr(stabilisation, "_margin", lambda *_: (0, 0))
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        keypoints = torch.empty(1, 2, FRAMES, 17, 2, device="cuda")
+        valid = torch.empty(1, 2, FRAMES, dtype=torch.bool, device="cuda")
+        tracks = Tracks(torch.empty(1, 2, FRAMES, 4, device="cuda"), valid, valid)
+        still = still_picture(tracks, keypoints, keypoints[..., 0], SIZE, torch.zeros(FRAMES, 4), FOCAL)
+        assert still is not None
+        assert still.tracks.boxes.device.type == still.keypoints.device.type == "cuda"
+        assert mapped(still.keypoints, still.from_film.inverse()).device.type == "cuda"
 
 
 def test_a_still_camera_changes_nothing() -> None:
