@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -24,10 +25,22 @@ from tensorsim.vision.smoothing.along_time import nearest_valid
 #: Files of captured motion by suffix; other files are key points (.json) or films.
 _MOTION = (".bvh", ".npz", ".skeleton", ".mat")
 
+T = TypeVar("T")
+
 
 def is_film(file: Path) -> bool:
     """Whether networks have to find the people of a file."""
     return file.suffix.lower() not in (*_MOTION, ".json") and not file.is_dir()
+
+
+def _at_own_rate(read: Callable[[float | None], T], fps: float | None) -> T:
+    """What is read at the frame rate that a file states, or at ``fps`` where it states none that makes sense."""
+    try:
+        return read(None)
+    except TensorsimError:
+        if fps is None:
+            raise
+        return read(fps)
 
 
 def finite_everywhere(motion: Motion, name: str) -> Motion:
@@ -81,7 +94,7 @@ class PeopleFinder:
             return read_ntu(file)
         if suffix == ".mat":
             return read_movi(file, key)
-        return load_motion(file, key or None, self.source.fps)
+        return _at_own_rate(lambda fps: load_motion(file, key or None, fps), self.source.fps)
 
     def _of_keypoints(self, file: Path) -> Motion:
         from tensorsim.sources import keypoint_source
@@ -128,12 +141,7 @@ class PeopleFinder:
         from tensorsim.data.video import VideoReader
         from tensorsim.streaming import people_of_film
 
-        try:
-            reader = VideoReader(file)
-        except TensorsimError:
-            if self.source.fps is None:
-                raise
-            reader = VideoReader(file, fps=self.source.fps)  # the file's own rate makes no sense
+        reader = _at_own_rate(lambda fps: VideoReader(file, fps=fps), self.source.fps)
         with one_thread():  # for the same bits everywhere
             pose = people_of_film(self.networks, reader, torch.device("cpu"), True, calibrate=True).pose
         return Motion(pose.joints[0], pose.valid[0], reader.fps)
@@ -145,11 +153,12 @@ class PeopleFinder:
 
     @cached_property
     def of_networks(self) -> bytes:
-        """Hash of the networks."""
+        """Hash of the networks, and the version of the package."""
+        from tensorsim import __version__
         from tensorsim.registry import locate
 
-        files = [locate(None, "RTMDet"), locate(None, "HRNet", "CPM")]
-        return b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
+        files = [locate(None, "RTMDet"), locate(None, "HRNet", "CPM"), locate(None, "TemporalLifter")]
+        return __version__.encode() + b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
 
     def _digest(self, file: Path) -> str:
         content = hashlib.sha256(self.of_networks)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tensorsim import registry
 from tensorsim.config import SimulationConfig
 from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.manifest import rows_of
@@ -129,6 +130,40 @@ def test_joints_are_those_of_the_pipeline(films: Path) -> None:
     assert motion.fps == FPS
     assert torch.allclose(motion.joints[there], pose.joints[0][there], atol=1e-5)
     assert bool(torch.isfinite(motion.joints).all())
+
+
+def test_what_is_kept_is_of_the_lifter_too_and_no_fault_of_weights_that_are_missing(
+    films: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, located = films / "leave" / "good.avi", registry.locate
+
+    def finder() -> PeopleFinder:
+        return PeopleFinder(SourceConfig("films", str(films)), tmp_path / "people")
+
+    def without_lifter(source: None, *kinds: str) -> Path:
+        if "TemporalLifter" in kinds:
+            raise TensorsimError("weights: no such file")
+        return located(source, *kinds)
+
+    def other_lifter(source: None, *kinds: str) -> Path:
+        return located(source, "SPGNet") if "TemporalLifter" in kinds else located(source, *kinds)
+
+    known = finder().of_networks
+    monkeypatch.setattr(registry, "locate", other_lifter)
+    assert finder().of_networks != known
+    monkeypatch.setattr(registry, "locate", without_lifter)
+    with pytest.raises(TensorsimError, match="weights: no such file"):
+        finder().motion(str(path), "")
+    assert not list(tmp_path.glob("people/*"))
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_frame_rates_of_a_source_serve_motion_that_tells_none(tmp_path: Path, stated: bool) -> None:
+    joints = ActivityGenerator().generate("walking", seed=0, duration_s=0.5, rate_hz=120.0).joints
+    np.savez(tmp_path / "walk.npz", joints_m=joints.numpy(), **({"fps": 120.0} if stated else {}))
+    source = SourceConfig("motion", str(tmp_path), fps=30.0)
+    motion = PeopleFinder(source, None).motion(str(tmp_path / "walk.npz"), "")
+    assert motion.fps == (120.0 if stated else 30.0)
 
 
 @pytest.mark.slow
