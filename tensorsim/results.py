@@ -227,10 +227,10 @@ def save_pose(folder: Path, pose: Pose, fps: float, formats: Sequence[str] = ("n
     save_arrays(folder / "pose", arrays, formats)
 
 
-def draw_pose(folder: Path, pose: Pose, fps: float, pictures: Pictures) -> None:
-    """Write a picture of the skeletons in the world."""
+def draw_pose(folder: Path, pose: Pose, fps: float, pictures: Pictures, radar: RadarConfig) -> None:
+    """Write a picture of the skeletons in the world, with the radar."""
     joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
-    figure = plot.skeleton_figure(joints, valid, fps, subtitle=pictures.subtitle)
+    figure = plot.skeleton_figure(joints, valid, fps, subtitle=pictures.subtitle, radar_m=radar.middle_m)
     plot.save_figure(figure, folder / f"skeleton.{pictures.suffix}")
 
 
@@ -304,7 +304,12 @@ def simulated(
     picture(
         "world",
         lambda: _figure_pixels(
-            plot.skeleton_figure(pose.joints[0].numpy(), pose.valid[0].numpy(), source.fps)
+            plot.skeleton_figure(
+                pose.joints[0].numpy(),
+                pose.valid[0].numpy(),
+                source.fps,
+                radar_m=config.scene.radar.middle_m,
+            )
         ),
     )
     torch.manual_seed(config.seed)

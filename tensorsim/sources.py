@@ -153,8 +153,13 @@ def keypoint_source(
 
 
 def _check_size(found: Keypoints2D, size: tuple[int, int]) -> None:
-    """Refuse pictures (height, width) that do not hold most of the key points that were seen."""
+    """Refuse pictures (height, width) that do not hold most of the key points that were seen, and shares of them."""
     seen = found.keypoints[(found.scores > 0.3) & found.valid[..., None]]
+    if len(seen) and float(seen.abs().quantile(0.95)) <= 2.0:
+        raise TensorsimError(
+            f"key points: got coordinates up to {float(seen.abs().quantile(0.95)):.2g}, expected pixels, not shares of "
+            f"the picture"
+        )
     inside = ((seen >= 0) & (seen < seen.new_tensor([size[1], size[0]]))).all(dim=-1)
     if len(seen) and float(inside.float().mean()) < 0.5:
         right, low = seen.quantile(0.95, dim=0).tolist()

@@ -71,6 +71,21 @@ def test_people_are_drawn_where_they_are_on_a_copy() -> None:
     assert not drawn[2:4, 0:5].any(), "an invalid person is not drawn"
 
 
+def test_a_key_point_at_infinity_is_drawn_as_far_outside() -> None:
+    keypoints = np.full((1, 17, 2), 50.0)
+    keypoints[0, 9] = 1e11, 5.0
+    image, scores = np.zeros((100, 100, 3), np.uint8), np.ones((1, 17))
+    drawn = plot.draw_people(image, np.full((1, 4), 1e11), keypoints, scores, np.ones(1, dtype=bool), 0.3)
+    assert drawn[:50, 60:].any(), "the forearm leads there"
+
+
+def test_the_radar_stands_where_its_antennas_are() -> None:
+    joints = np.random.default_rng(0).normal(size=(1, 4, 14, 3))
+    figure = plot.skeleton_figure(joints, np.ones((1, 4), dtype=bool), 10.0, radar_m=(0.2, 0.1, 2.5))
+    radar = figure.axes[0].collections[0]
+    assert np.array(radar._offsets3d)[:, 0].tolist() == [0.2, 0.1, 2.5]
+
+
 def test_skeleton_figure_shows_only_people_who_are_there() -> None:
     joints = np.random.default_rng(0).normal(size=(2, 10, 14, 3))
     valid = np.zeros((2, 10), dtype=bool)

@@ -223,6 +223,52 @@ def test_every_second_frame_is_a_file_of_half_the_rate(
     assert torch.equal(kept.joints, alone.joints)
 
 
+def write_results(
+    path: Path, keypoints: np.ndarray, scores: np.ndarray, orders: list[tuple[int, ...]]
+) -> None:
+    """Results without ``track_id`` of people (P, T, 17, 2), in each frame those of an order."""
+    results = [
+        {"image_id": t, "keypoints": np.c_[keypoints[p, t], scores[p, t]].ravel().tolist(), "score": 1.0}
+        for t, order in enumerate(orders)
+        for p in order
+    ]
+    path.write_text(json.dumps(results))
+
+
+def test_people_without_track_id_are_told_apart_by_where_they_are(
+    filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    _, keypoints, scores = filmed
+    both = np.concatenate([keypoints, keypoints[:, ::-1] + [60.0, 0.0]])
+    orders = [((0, 1), (1, 0), (1,), (0,))[int(k)] for k in np.random.default_rng(0).integers(0, 4, 45)]
+    write_results(tmp_path / "two.json", both, np.repeat(scores, 2, 0), [(0, 1), *orders[1:]])
+    found = load_coco_keypoints(tmp_path / "two.json")
+    for p in range(2):
+        there = found.valid[:, p]
+        assert there.tolist() == [p in order for order in [(0, 1), *orders[1:]]]
+        torch.testing.assert_close(found.keypoints[there, p], torch.tensor(both[p]).float()[there])
+
+
+def test_scores_above_one_count_as_one_and_percents_are_refused(
+    filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    _, keypoints, scores = filmed
+    write_results(tmp_path / "walk.json", keypoints, 0 * scores + 1.04, [(0,)] * 45)
+    assert torch.equal(load_coco_keypoints(tmp_path / "walk.json").scores, torch.ones(45, 1, 17))
+    write_results(tmp_path / "walk.json", keypoints, 0 * scores + 87.5, [(0,)] * 45)
+    with pytest.raises(TensorsimError, match=r"got a score of 87\.5 for a key point, expected 0 to 1"):
+        load_coco_keypoints(tmp_path / "walk.json")
+
+
+def test_shares_of_the_picture_are_no_pixels(
+    filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    camera, keypoints, scores = filmed
+    (tmp_path / "walk.json").write_text(json.dumps(coco_json(keypoints / CANVAS[::-1], scores)))
+    with pytest.raises(TensorsimError, match=r"key points: got coordinates up to 0\.\d+, expected pixels"):
+        keypoint_source(tmp_path / "walk.json", lifter(camera, 1.75), FPS, CANVAS)
+
+
 @pytest.mark.parametrize("step", [1, 5])
 def test_frames_without_anybody_are_not_left_out_of_results(step: int, tmp_path: Path) -> None:
     person = {"keypoints": [1.0, 2.0, 0.9] * 17, "score": 1.0, "category_id": 1}

@@ -196,7 +196,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         with ThreadPoolExecutor(1) as pool:
             saved = pool.submit(save)
             results.draw_maps(folder, maps, axes, truth, pictures)
-            results.draw_pose(folder, pose, run.fps, pictures)
+            results.draw_pose(folder, pose, run.fps, pictures, run.config.scene.radar)
             saved.result()
         if self.sound:
             results.write_doppler_sound(folder, stage, pose, run.fps, run.device)

@@ -13,6 +13,10 @@ from torch import Tensor
 from tensorsim.errors import TensorsimError, check_finite
 from tensorsim.files import reading
 from tensorsim.limits import check_range
+from tensorsim.vision.tracking.assignment import assign
+
+#: Who was never seen before is as far away as somebody who moved by so many body sizes.
+_NEW = 2.0
 
 
 class Keypoints2D(NamedTuple):
@@ -36,12 +40,12 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
 
     Frames are in ascending order of their image ids, or of the names of the files in a folder. Results do not list
     images in which nobody was found: numbers that are left out between others, in even steps, are such frames. People
-    are told apart by ``track_id`` where there is one, else by their order in each frame. ``keypoints`` are 51 numbers:
-    x, y, and visibility or score of each.
+    are told apart by ``track_id`` where there is one, else by where they were last seen. ``keypoints`` are 51 numbers:
+    x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a little above 1 count as 1.
 
     Raises:
-        TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, a
-            ``track_id`` for some people only.
+        TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, scores
+            above 2, a ``track_id`` for some people only.
     """
     path = Path(path)
     return coco_of(path, json_files(path))
@@ -113,11 +117,38 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
                 data[t, place] = torch.tensor(person["keypoints"], dtype=torch.float32).view(17, 3)
                 valid[t, place] = True
     check_finite(data, str(path))
+    if not tracked:
+        data, valid = _told_apart(data, valid)
     # Annotations flag visibility by 0, 1 or 2; networks write scores.
     scores = data[..., 2]
-    if bool((scores == scores.round()).all()) and float(scores.max()) <= 2:
-        scores = (scores > 0).float()
+    if float(scores.max()) > 2:
+        raise TensorsimError(
+            f"{path}: got a score of {float(scores.max()):g} for a key point, expected 0 to 1, or visibility 0, 1 or 2"
+        )
+    scores = (scores > 0).float() if bool((scores == scores.round()).all()) else scores.clamp(0, 1)
     return Keypoints2D(data[..., :2], scores, valid, size)
+
+
+def _told_apart(data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """People (T, P, 17, 3), the first ones of each frame ``valid`` (T, P), each in the place of the nearest before."""
+    ordered, there = torch.zeros_like(data), torch.zeros_like(valid)
+    last = torch.zeros_like(data[0])
+    for t in range(len(data)):
+        people = data[t, valid[t]]
+        place = assign(_apart(people, last), torch.ones(len(people), len(last), dtype=torch.bool), 1e9)
+        ordered[t, place], there[t, place], last[place] = people, True, people
+    return ordered, there
+
+
+def _apart(people: Tensor, others: Tensor) -> Tensor:
+    """Mean distances (n, m) of the key points (..., 17, 3) that both have, in sizes of the former."""
+    here, other = people[:, None, :, :2].double(), others[None, :, :, :2].double()
+    seen = people[:, None, :, 2:] > 0
+    high, low = torch.where(seen, here, -math.inf).amax(dim=2), torch.where(seen, here, math.inf).amin(dim=2)
+    size = (high - low).amax(dim=-1).clamp(min=1.0)
+    both = (seen & (others[None, :, :, 2:] > 0))[..., 0]
+    apart = ((here - other).norm(dim=-1) * both).sum(dim=-1) / both.sum(dim=-1).clamp(min=1) / size
+    return torch.where(both.any(dim=-1), apart, _NEW)
 
 
 def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from tensorsim.body.skeleton import LIMBS, mid_hips
+from tensorsim.config import Vector
 from tensorsim.plot.figure import new_figure
 
 if TYPE_CHECKING:
@@ -24,12 +25,20 @@ COCO_BONES = (
 #: One colour per person, RGB.
 PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (23, 190, 207))
 
+#: Nothing is drawn further outside a picture; OpenCV takes 32-bit coordinates.
+_FAR_PX = 10_000
 #: No joint is further than this from the middle of its hips; one that is was placed wrongly.
 _LIMB_REACH_M = 1.5
 
 
 def skeleton_figure(
-    joints_m: np.ndarray, valid: np.ndarray, fps: float, poses: int = 6, *, subtitle: str | None = None
+    joints_m: np.ndarray,
+    valid: np.ndarray,
+    fps: float,
+    poses: int = 6,
+    *,
+    subtitle: str | None = None,
+    radar_m: Vector = (0.0, 0.0, 1.5),
 ) -> Figure:
     """Draw people in the coordinates of the radar at a few moments spread over each one's time in the scene.
 
@@ -42,6 +51,7 @@ def skeleton_figure(
         fps: frames per second.
         poses: moments to draw of each person.
         subtitle: a line below the title, see :func:`caption`.
+        radar_m: the middle of the antennas, ``RadarConfig.middle_m``.
     """
     from matplotlib.ticker import MultipleLocator
 
@@ -55,11 +65,11 @@ def skeleton_figure(
         chosen = np.unique(frames[np.linspace(0, frames.size - 1, poses).astype(int)])
         shown.append(joints_m[person, chosen])
         _draw_person(axes, person, joints_m[person], frames, chosen, fps)
-    axes.scatter([0], [0], [1.5], color="black", marker="^", s=50, label="radar")
+    axes.scatter(*([value] for value in radar_m), color="black", marker="^", s=50, label="radar")
     bodies = np.concatenate([*shown, np.zeros((0, 14, 3))])
     hips = mid_hips(torch.from_numpy(bodies)).numpy()
     attached = np.linalg.norm(bodies - hips[:, None], axis=-1) <= _LIMB_REACH_M
-    points = np.concatenate([bodies[attached], [[-0.75, 0.0, 0.0], [0.75, 1.0, 2.0]]])
+    points = np.concatenate([bodies[attached], [[-0.75, 0.0, 0.0], [0.75, 1.0, 2.0], radar_m]])
     low, high = points.min(axis=0), points.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low)
@@ -134,7 +144,7 @@ def draw_people(
     stroke = max(1, round(min(image.shape[:2]) / 240))
     for person in np.flatnonzero(valid):
         colour = PERSON_COLOURS[person % len(PERSON_COLOURS)]
-        x1, y1, x2, y2 = (round(float(v)) for v in boxes[person])
+        x1, y1, x2, y2 = boxes[person].clip(-_FAR_PX, _FAR_PX).round().astype(int).tolist()
         cv2.rectangle(image, (x1, y1), (x2, y2), colour, stroke)
         cv2.putText(
             image,
@@ -145,7 +155,7 @@ def draw_people(
             colour,
             stroke,
         )
-        points = [(round(float(u)), round(float(v))) for u, v in keypoints[person]]
+        points = keypoints[person].clip(-_FAR_PX, _FAR_PX).round().astype(int).tolist()
         for a, b in COCO_BONES:
             if scores[person, a] >= threshold and scores[person, b] >= threshold:
                 cv2.line(image, points[a], points[b], (255, 255, 255), stroke + 1, cv2.LINE_AA)
