@@ -365,18 +365,35 @@ def test_a_metric_pose_of_ones_own_replaces_the_default() -> None:
 
 
 def test_padded_frames_do_not_count() -> None:
-    stage, clips = pipeline(), two_clips()
+    stage, clips = VideoToPose(RectangleDetector(), StandingPose()).eval(), two_clips()
+    graph = VideoToDoppler(video_to_pose=stage, radar=RADAR, snr_db=None)
     padded = clips.clone()
     padded[0, 12:] = 255  # rubbish in the padding
-    out = stage(padded, FPS, torch.tensor([12, 20]))
-    alone = stage(clips[:1, :12], FPS)
+    out = graph(padded, FPS, torch.tensor([12, 20]))
     assert not out.valid[0, :, 12:].any()
-    # Lifting and smoothing over time see the held poses of the padding: 2 cm in the last frame, next to nothing before.
-    assert_same(out.joints[:1, :1, :9], alone.joints[:, :, :9], atol=2e-3)
-    assert_same(out.joints[:1, :1, :12], alone.joints, atol=6e-3)
-    last = int((11 / FPS - 0.1) * RADAR.prf_hz)  # who leaves fades out over 0.1 s; a clip's end is no leaving
-    assert_same(out.range_time[:1, :, :last], alone.range_time[..., :last], atol=0.08)
+    assert_same(out.joints[0, :, 12:], out.joints[0, :, 11:12].expand(-1, 8, -1, -1), atol=0.0)
+    for clip, count in enumerate((12, 20)):
+        alone = graph(clips[clip : clip + 1, :count], FPS)
+        people = alone.joints.shape[1]
+        for name in ("boxes", "keypoints", "keypoint_scores", "joints", "valid"):
+            assert_same(getattr(out, name)[clip, :people, :count], getattr(alone, name)[0], atol=0.0)
+        last = int((count - 1) / FPS * RADAR.prf_hz) - 13  # fades out over 0.1 s; a clip's end is no leaving
+        assert_same(out.range_time[clip, :, :last], alone.range_time[0, :, :last], atol=0.08)
     assert float(out.range_time[0, :, -40:].abs().max()) < 1e-6 * float(out.range_time[0].max())
+
+
+def test_padded_frames_do_not_count_in_a_scripted_stage() -> None:
+    stage, clips = pipeline().video_to_pose, two_clips()
+    lengths = torch.tensor([12, 20])
+    assert_same(torch.jit.script(stage)(clips, FPS, lengths), stage(clips, FPS, lengths))
+
+
+def test_padded_frames_at_uneven_times_do_not_count() -> None:
+    stage, clips = VideoToPose(RectangleDetector(), StandingPose()).eval(), two_clips()
+    times_s = torch.arange(20) / FPS + 0.02 * torch.rand(2, 20)
+    out = stage(clips, FPS, torch.tensor([12, 20]), times_s)
+    alone = stage(clips[:1, :12], FPS, None, times_s[:1, :12])
+    assert_same(out.joints[:1, :1, : alone.joints.shape[2]], alone.joints, atol=0.0)
 
 
 def test_a_clip_without_people_gives_the_empty_scene_and_says_so() -> None:

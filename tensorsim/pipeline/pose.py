@@ -17,7 +17,7 @@ from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within, gaps_with
-from tensorsim.vision.smoothing.even_time import to_even_time
+from tensorsim.vision.smoothing.even_time import even_count, to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise, noise_with_depth
 from tensorsim.vision.smoothing.outliers import limit_speed, without_jumps
@@ -232,9 +232,12 @@ class VideoToPose(nn.Module):
         keypoints, scores = self.estimate(frames, boxes, valid)
         keypoints = keypoints.reshape(b, t, people, 17, 2).transpose(1, 2)
         scores = scores.reshape(b, t, people, 17).transpose(1, 2)
+        counts = present.sum(dim=-1)
         if times_s is not None:
             tracks, keypoints, scores = to_even_time(tracks, keypoints, scores, times_s, fps)
-        return self.lift(tracks, keypoints, scores, height, width, fps)
+            last_s = times_s.gather(1, counts.to(times_s.device)[:, None] - 1) - times_s[:, :1]
+            counts = even_count(last_s[:, 0], fps)
+        return self.lift_each_length(tracks, keypoints, scores, counts, height, width, fps)
 
     def frames_present(self, clips: int, frames: int, lengths: Tensor | None, device: torch.device) -> Tensor:
         """(B, T) bool: the frames that belong to a clip rather than to its padding."""
@@ -326,6 +329,43 @@ class VideoToPose(nn.Module):
             return often
         return often | good.unfold(-1, second, 1).all(dim=-1).any(dim=-1)
 
+    def lift_each_length(
+        self,
+        tracks: Tracks,
+        keypoints: Tensor,
+        scores: Tensor,
+        counts: Tensor,
+        height: int,
+        width: int,
+        fps: float,
+    ) -> Pose:
+        """:meth:`lift` of clips padded to T frames, each as if it were alone, as filters would see the padding.
+
+        Args:
+            tracks, keypoints, scores, height, width, fps: see :meth:`lift`.
+            counts: (B,) frames of each clip.
+
+        Returns:
+            In the padding joints are those of the last frame and nobody is valid.
+        """
+        frames = keypoints.shape[2]
+        lengths: list[int] = torch.unique(counts).tolist()
+        rows: list[Tensor] = []
+        joints: list[Tensor] = []
+        keypoints, scores, valid = keypoints.clone(), scores.clone(), torch.zeros_like(tracks.valid)
+        for n in lengths:
+            row = torch.nonzero(counts.to(valid.device) == n)[:, 0]
+            part = Tracks(tracks.boxes[row, :, :n], tracks.valid[row, :, :n], tracks.matched[row, :, :n])
+            pose = self.lift(part, keypoints[row, :, :n], scores[row, :, :n], height, width, fps)
+            rows.append(row)
+            joints.append(
+                torch.cat([pose.joints, pose.joints[:, :, -1:].expand(-1, -1, frames - n, -1, -1)], dim=2)
+            )
+            keypoints[row, :, :n] = pose.keypoints
+            scores[row, :, :n] = pose.keypoint_scores
+            valid[row, :, :n] = pose.valid
+        return Pose(tracks.boxes, keypoints, scores, torch.cat(joints)[torch.cat(rows).argsort()], valid)
+
     def lift(
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
@@ -377,11 +417,12 @@ class VideoToPose(nn.Module):
 
 
 def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> TemporalLifter:
-    """The shipped lifter, in float64, for the camera and people of a metric pose, or for the default ones."""
-    if not isinstance(metric_pose, MetricPose):
-        return TemporalLifter.from_pretrained(keypoint_threshold=keypoint_threshold).double()
-    heights = tuple(metric_pose.heights.tolist())
-    return TemporalLifter.from_pretrained(None, metric_pose.camera, heights, keypoint_threshold).double()
+    """The shipped lifter, in float64 and frozen, for the camera and people of a metric pose, or the default ones."""
+    camera, heights = CameraConfig(), PoseConfig().person_height_m
+    if isinstance(metric_pose, MetricPose):
+        camera, heights = metric_pose.camera, tuple(metric_pose.heights.tolist())
+    lifter = TemporalLifter.from_pretrained(None, camera, heights, keypoint_threshold)
+    return lifter.double().requires_grad_(False)
 
 
 class _AsPlaced(nn.Module):

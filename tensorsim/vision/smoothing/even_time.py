@@ -7,6 +7,11 @@ from tensorsim.errors import TensorsimError, check_finite, check_floating, check
 from tensorsim.types import Tracks
 
 
+def even_count(duration_s: Tensor, fps: float) -> Tensor:
+    """How many times ``k / fps`` there are from 0 to durations (...) in seconds, up to rounding: (...) int64."""
+    return torch.floor(duration_s.double() * fps + 1e-3).long() + 1
+
+
 def to_even_time(
     tracks: Tracks, keypoints: Tensor, scores: Tensor, times_s: Tensor, fps: float
 ) -> tuple[Tracks, Tensor, Tensor]:
@@ -40,7 +45,7 @@ def to_even_time(
     if bool((times_s.diff(dim=1) <= 0).any()):
         raise TensorsimError("times_s: got times that do not increase from frame to frame, expected them to")
     since = (times_s - times_s[:, :1]).to(keypoints.device, torch.float64)
-    count = int(torch.floor(since[:, -1].max() * fps + 1e-3)) + 1
+    count = int(even_count(since[:, -1].max(), fps))
     even = (torch.arange(count, dtype=torch.float64, device=since.device) / fps).expand(clips, count)
     after = torch.searchsorted(since, even.contiguous(), right=True).clamp(1, frames - 1)
     start, end = since.gather(1, after - 1), since.gather(1, after)
