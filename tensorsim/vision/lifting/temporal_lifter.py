@@ -77,8 +77,8 @@ class TemporalLifter(nn.Module):
         camera: where the camera stands, its tilt and focal length; None is the default one, at the radar.
         person_height_m: standing heights by order of person; the last one serves all further people.
         keypoint_threshold: score from which a key point counts as seen.
-        frames_per_block: frames that go through the network at once, which bounds the memory; the result does not
-            depend on it.
+        frames_per_block: frames that go through the network at once, of the tracks with somebody in or near them,
+            which bounds time and memory; the result, where somebody is followed, does not depend on it.
         camera_known: False for a camera that was estimated. The network sees where the floor is and takes the distance
             of those who lie or sit from it, which a tilt that is wrong by some degrees moves by a metre. Then people
             are put where their bones have the lengths that they should have.
@@ -86,7 +86,8 @@ class TemporalLifter(nn.Module):
     Shape:
         COCO key points (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
         valid (..., P, T) bool, height and width of the picture, frames per second -> :class:`TemporalPose`. Frames
-        in which nobody is followed are filled from those around them. Differentiable.
+        in which nobody is followed are filled from those around them, those far from anybody with the camera's place.
+        Differentiable.
 
     Raises:
         TensorsimError: heights that are not positive, wrong shapes, NaN, no frames.
@@ -106,7 +107,7 @@ class TemporalLifter(nn.Module):
         camera: CameraConfig | None = None,
         person_height_m: tuple[float, ...] = (1.80, 1.70),
         keypoint_threshold: float = 0.3,
-        frames_per_block: int = 4096,
+        frames_per_block: int = 256,
         camera_known: bool = True,
     ) -> None:
         super().__init__()
@@ -172,15 +173,16 @@ class TemporalLifter(nn.Module):
         for start in range(0, frames, self.frames_per_block):
             first, stop = max(start - self.reach, 0), min(start + self.frames_per_block, frames)
             last = min(stop + self.reach, frames)
+            rows = v[:, first:last].any(dim=1).nonzero()[:, 0]
             found, azimuth = self._block(
-                k[:, first:last], s[:, first:last], b[:, first:last], v[:, first:last], height_of_each,
-                image_height, image_width, fps,
+                k[rows, first:last], s[rows, first:last], b[rows, first:last], v[rows, first:last],
+                height_of_each[rows], image_height, image_width, fps,
             )  # fmt: skip
-            keep = stop - start
-            joints.append(found.joints[:, start - first :][:, :keep])
-            spreads.append(found.log_spread[:, start - first :][:, :keep])
-            ranges.append(found.log_range_spread[:, start - first :][:, :keep])
-            turns.append(azimuth[:, start - first :][:, :keep])
+            begin, end = start - first, stop - first
+            joints.append(_in_rows(found.joints[:, begin:end], rows, tracks))
+            spreads.append(_in_rows(found.log_spread[:, begin:end], rows, tracks))
+            ranges.append(_in_rows(found.log_range_spread[:, begin:end], rows, tracks))
+            turns.append(_in_rows(azimuth[:, begin:end], rows, tracks))
         height = height_of_each[:, None]
         azimuth = torch.cat(turns, dim=1)
         points = height[..., None, None] * turned_back(torch.cat(joints, dim=1), azimuth)
@@ -335,6 +337,11 @@ class TemporalLifter(nn.Module):
         network = TemporalNet(enter.shape[0])
         load_strict(network, weights, path)
         return cls(network, camera, person_height_m, keypoint_threshold).eval()
+
+
+def _in_rows(found: Tensor, rows: Tensor, tracks: int) -> Tensor:
+    """What was found of some tracks, (n, T, ...), in the ``rows`` (n,) of all of them, zeros elsewhere."""
+    return found.new_zeros([tracks] + list(found.shape[1:])).index_copy(0, rows, found)  # noqa: RUF005
 
 
 def _check(keypoints: Tensor, scores: Tensor, boxes: Tensor, valid: Tensor) -> None:

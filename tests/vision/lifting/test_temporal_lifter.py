@@ -214,6 +214,26 @@ def test_blocks_equal_the_whole(known: bool) -> None:
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
+def test_tracks_cost_time_only_around_the_frames_in_which_they_are() -> None:
+    keypoints, scores, boxes, valid = (x.expand(2, *x.shape[1:]) for x in filmed(600)[1:])
+    valid = valid.clone()
+    valid[0, 60:], valid[1, :540] = False, False
+    looked: list[int] = []
+    lifter = TemporalLifter(network().double(), CAMERA)
+    lifter.network.register_forward_pre_hook(
+        lambda _, sight: looked.append(sight[0].joints[..., 0, 0].numel())
+    )
+    with torch.no_grad():
+        found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        frames = sum(looked) / 2  # people and their mirror images
+        lifter.frames_per_block = 600
+        whole = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+    assert frames < 0.75 * valid.numel()
+    for one, other in zip(found, whole, strict=True):
+        torch.testing.assert_close(one[valid], other[valid], atol=1e-9, rtol=0)
+        assert bool(torch.isfinite(one).all())
+
+
 def test_before_an_estimated_camera_bones_have_their_lengths() -> None:
     """Somebody who keeps still: the same picture, from where all bones together are 2.39 standing heights long."""
     _, keypoints, scores, boxes, valid = filmed(60)
