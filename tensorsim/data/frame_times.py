@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from tensorsim.vision.smoothing.even_time import even_count
+
 #: Frames whose times differ from even ones by more than so many seconds and so many frames are at uneven times.
 _UNEVEN_S, _UNEVEN_FRAMES = 0.05, 1.5
 
@@ -63,6 +65,6 @@ def nearest_frames(times_s: Tensor, fps: float) -> Tensor:
     tensor([0, 1, 1, 2, 2, 2])
     """
     since = times_s - times_s[0]
-    count = int(float(since[-1]) * fps + 1e-3) + 1
+    count = int(even_count(since[-1], fps))
     middles = (since[1:] + since[:-1]) / 2
     return torch.searchsorted(middles, torch.arange(count, dtype=since.dtype) / fps, right=True)

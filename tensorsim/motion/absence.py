@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.errors import TensorsimError, check_min_rank
+from tensorsim.vision.smoothing.along_time import seen_beside
 
 #: Frames after which motion beyond the first or last frame of a run has slowed down to a third.
 _SLOWING = 6.0
@@ -36,8 +37,7 @@ def continued(joints: Tensor, valid: Tensor) -> Tensor:
     frames = joints.shape[-3]
     present = torch.where(valid[..., None, None], joints, torch.zeros_like(joints))
     frame = torch.arange(frames, device=valid.device)
-    before = torch.cummax(torch.where(valid, frame, -1), dim=-1)[0]
-    after = torch.cummin(torch.where(valid, frame, frames).flip(-1), dim=-1)[0].flip(-1)
+    before, after = seen_beside(valid)
     ahead = _beyond(present, valid, before, 1)
     back = _beyond(present, valid, after, -1)
     since, until = (frame - before).to(joints.dtype), (after - frame).to(joints.dtype)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.types import Tracks
+from tensorsim.vision.smoothing.even_time import even_count
 
 #: A camera that turns by more than this from its mean direction is not made still: its pictures have no common plane.
 MOST_TURN_RAD = math.radians(45)
@@ -116,7 +117,7 @@ def _intrinsics(focals: Tensor, size: tuple[int, int]) -> Tensor:
 def at_even_times(steps: Tensor, times_s: Tensor, fps: float) -> Tensor:
     """Steps (T, 4) of frames at times (T,), see :func:`camera_path`, at ``k / fps`` from the first to the last."""
     since = (times_s - times_s[0]).double().numpy()
-    even = np.arange(int(since[-1] * fps + 1e-3) + 1) / fps
+    even = np.arange(int(even_count(times_s[-1] - times_s[0], fps))) / fps
     way = steps.double().cumsum(dim=0).numpy()
     between = np.stack([np.interp(even, since, column) for column in way.T], axis=-1)
     return torch.from_numpy(np.diff(between, axis=0, prepend=between[:1]))

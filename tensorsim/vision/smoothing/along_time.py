@@ -21,7 +21,7 @@ def nearest_valid(valid: Tensor) -> Tensor:
     Without any valid frame each frame gets its own index.
     """
     time = torch.arange(valid.shape[-1], device=valid.device).expand(valid.shape)
-    before, after = _seen_beside(valid)
+    before, after = seen_beside(valid)
     nearest = torch.where(time - before <= after - time, before, after)
     return torch.where(valid.any(dim=-1, keepdim=True), nearest, time)
 
@@ -33,7 +33,7 @@ def fill_gaps(x: Tensor, valid: Tensor) -> Tensor:
 
 def brief_gaps(seen: Tensor, longest: int) -> Tensor:
     """Gaps (..., T) in ``seen`` (..., T) bool of at most ``longest`` frames, with seen frames on both sides."""
-    before, after = _seen_beside(seen)
+    before, after = seen_beside(seen)
     return ~seen & (after - before - 1 <= longest) & (before >= 0) & (after < seen.shape[-1])
 
 
@@ -45,7 +45,7 @@ def crossed_within(position: Tensor, seen: Tensor, step: float) -> Tensor:
         seen: (..., T) bool.
         step: in units of the position.
     """
-    before, after = _seen_beside(seen)
+    before, after = seen_beside(seen)
     inside = (before >= 0) & (after < seen.shape[-1])
     last = seen.shape[-1] - 1
     start = position.gather(-2, before.clamp(0, last).unsqueeze(-1).expand(position.shape))
@@ -56,14 +56,14 @@ def crossed_within(position: Tensor, seen: Tensor, step: float) -> Tensor:
 
 def gaps_with(event: Tensor, seen: Tensor) -> Tensor:
     """Frames (..., T) between two seen ones between which there is an ``event`` (..., T) bool in a frame not seen."""
-    before, after = _seen_beside(seen)
+    before, after = seen_beside(seen)
     last = seen.shape[-1] - 1
     inside = (before >= 0) & (after <= last) & ~seen
     count = (event & ~seen).to(torch.int64).cumsum(dim=-1)
     return inside & (count.gather(-1, after.clamp(0, last)) > count.gather(-1, before.clamp(0, last)))
 
 
-def _seen_beside(seen: Tensor) -> tuple[Tensor, Tensor]:
+def seen_beside(seen: Tensor) -> tuple[Tensor, Tensor]:
     """The last seen frame up to each one and the first from it on (..., T): -T and 2 T where there is none."""
     frames = seen.shape[-1]
     time = torch.arange(frames, device=seen.device).expand(seen.shape)
