@@ -158,6 +158,7 @@ class CameraCalibrator(nn.Module):
         self.least_rhythm = 0.4  # share of a sinusoid in the steps from which a cadence is believed
         self.correlation_s = 0.4  # after which the errors of a body are no longer those of before
         self.smoothing_s = 0.25
+        self.most_people = 12  # with the most independent observations; more tell hardly more of the camera
         self.path = 0.25  # body heights in the image after which somebody is seen anew
         mean = [0.0, 0.0, math.log(1.5), 60 * degree]
         deviation = [20 * degree, 3 * degree, 0.45, 15 * degree]
@@ -235,8 +236,14 @@ class CameraCalibrator(nn.Module):
         ends = torch.stack(smooth, dim=-1).unflatten(-1, [2, 2])
         chosen, apart, every = self._looked_at(upright, fps)
         ends, upright, walking = ends[:, chosen], upright[:, chosen] & ~apart, walking[:, chosen]
+        independent = self._independent(ends, upright, every / fps)
+        # Each person has parameters of their own, and time and memory grow with the square of their number.
+        told = independent[:, 0, 0] * upright.sum(dim=-1)
+        most = told.argsort(descending=True, stable=True)[: self.most_people].sort()[0]
 
         stature = self.stature[torch.arange(people, device=valid.device).clamp(max=self.stature.shape[0] - 1)]
+        ends, upright, walking, independent = ends[most], upright[most], walking[most], independent[most]
+        stature, cycles_hz, rhythm = stature[most], cycles_hz[most], rhythm[most]
         middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64, device=valid.device)
         image = torch.where(upright[..., None, None], (ends - middle) / (width / 2), 0.1)
         size = torch.linalg.vector_norm(image[..., 0, :] - image[..., 1, :], dim=-1)
@@ -247,7 +254,7 @@ class CameraCalibrator(nn.Module):
             walking,
             ((0.02 * size).square() + (2.0 / (width / 2)) ** 2).sqrt(),
         )
-        nothing = torch.zeros(people, dtype=torch.float64, device=valid.device)
+        nothing = torch.zeros_like(stature)
         stepping = rhythm >= self.least_rhythm
         pace = (torch.where(stepping, self.walk_ratio * cycles_hz.square(), self.pace) * stature).log()
         mean = torch.cat([self.mean, nothing, pace, self.lean * stature])
@@ -256,7 +263,6 @@ class CameraCalibrator(nn.Module):
             [self.deviation, self.height_sd_m / stature, pace_sd, self.lean_spread * stature]
         )
         rest = torch.cat([nothing, pace, self.lean * stature]).expand(self.starts.shape[0], -1)
-        independent = self._independent(ends, upright, every / fps)
         at, covariance, cost = fit_camera(
             torch.cat([self.starts, rest], dim=-1), mean, deviation, bodies, fps / every, independent
         )

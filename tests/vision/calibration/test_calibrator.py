@@ -474,3 +474,24 @@ def test_bodies_that_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert mean[[4, 6]].tolist() == pytest.approx([0.0, 0.035 * 1.6])
     assert float(mean[5]) == pytest.approx(math.log(0.9 * 1.6), abs=0.2)
     assert deviation[4:].tolist() == pytest.approx([0.08 / 1.6, 0.08, 0.02 * 1.6])
+
+
+def test_of_many_people_those_who_tell_most_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    time = torch.arange(60, dtype=torch.float64)
+    keypoints = standing(400.0, 200.0).expand(40, 60, 17, 2).clone()
+    keypoints[..., 0] += 30 * torch.arange(40)[:, None, None]
+    keypoints[30, :, :, 0] += 3 * time[:, None]  # the one who goes
+    valid = torch.ones(40, 60, dtype=torch.bool)
+    taken: list[Any] = []
+
+    def fit(start: Tensor, mean: Tensor, deviation: Tensor, bodies: Bodies, *_: Any) -> Any:
+        taken.extend([mean, deviation, bodies])
+        return start, torch.eye(start.shape[1]).double().expand(len(start), -1, -1), torch.zeros(len(start))
+
+    monkeypatch.setattr(calibrator, "fit_camera", fit)
+    CameraCalibrator()(keypoints, torch.ones(40, 60, 17).double(), valid, HEIGHT, WIDTH, FPS)
+    mean, deviation, bodies = taken
+    assert len(bodies.image) == 12
+    assert len(mean) == len(deviation) == 4 + 3 * 12
+    moved = bodies.image[:, -1, 0, 0] - bodies.image[:, 0, 0, 0]
+    assert float(moved.max()) > 0.4
