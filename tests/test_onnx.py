@@ -20,7 +20,7 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalPose
 #: Stages and inputs; the first dimension of the first input may have another size.
 STAGES: dict[str, tuple[nn.Module, Tensor, Tensor]] = {
     "map to picture": (
-        MapToImage.doppler(ts.RadarConfig.through_wall(), 256, size=32),
+        MapToImage.doppler(ts.RadarConfig.through_wall(), size=32),
         torch.rand(2, 256, 40),
         torch.rand(5, 256, 40),
     ),

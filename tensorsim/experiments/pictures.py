@@ -118,7 +118,7 @@ class RangeAndRidges:
             preset.radar, preset.wall, multipath=preset.wall is not None, snr_db=SNR_DB, **options
         )
         self.range_image = MapToImage.range(preset.radar, size=size)
-        self.doppler_image = MapToImage.doppler(preset.radar, self.simulator.doppler.bins, size=size)
+        self.doppler_image = MapToImage.doppler(preset.radar, size=size)
         self.resampler = PoseResampler(preset.radar.prf_hz)
         self.scatterers = JointScatterers()
 

@@ -57,6 +57,8 @@ class MapToImage(nn.Module):
 
     Args:
         axis: (F,) value of each bin, ascending in equal steps; each bin covers a step around its value.
+        any_bins: maps may divide the extent of the axis into other numbers of bins, as spectra do, the first of which
+            keeps its value.
         span: (low, high) limits of the image on the axis. Outside of the axis the image is 0.
         size: height and width in pixels.
         scale, range_db: see :func:`scaled`.
@@ -70,10 +72,8 @@ class MapToImage(nn.Module):
 
     Raises:
         TensorsimError: an axis that does not ascend in equal steps, a span without width, a size below 1, an unknown
-            scale; a map without F rows, with negative values, or NaN.
+            scale; a map without F rows (unless ``any_bins``), with negative values, or NaN.
     """
-
-    rows: Tensor
 
     def __init__(
         self,
@@ -82,6 +82,7 @@ class MapToImage(nn.Module):
         size: int = 224,
         scale: str = "db",
         range_db: float = 40.0,
+        any_bins: bool = False,
     ) -> None:
         super().__init__()
         if axis.dim() != 1 or axis.shape[0] < 2 or not bool((axis.diff() > 0).all()):
@@ -105,30 +106,27 @@ class MapToImage(nn.Module):
             raise TensorsimError(f"MapToImage.scale: got {scale!r}, expected one of {SCALES}")
         check_positive(range_db, "MapToImage.range_db")
         self.size, self.scale, self.range_db = size, scale, range_db
-        step = float(axis[-1] - axis[0]) / (axis.shape[0] - 1)
-        rows = area_weights(axis.double() - step / 2, step, low, high, size)
-        self.register_buffer("rows", rows, persistent=False)
+        self.low, self.high = float(low), float(high)
+        self.bins, self.any_bins = axis.shape[0], any_bins
+        self.first = float(axis[0])
+        self.extent = float(axis[-1] - axis[0]) * self.bins / (self.bins - 1)
 
     @classmethod
     def doppler(
         cls,
         radar: RadarConfig,
-        bins: int | None = None,
         speed_m_s: float = 3.8,
         size: int = 224,
         scale: str = "db",
         range_db: float = 40.0,
     ) -> "MapToImage":
-        """For Doppler-time maps of ``bins`` rows, with radial speeds from ``-speed_m_s`` to ``speed_m_s``.
+        """For Doppler-time maps of any even number of bins, with radial speeds from ``-speed_m_s`` to ``speed_m_s``.
 
         The span is a speed, so that images of radars with different carriers are alike; 3.8 m/s is the unambiguous
-        speed of the through-wall preset. None for ``bins`` is the number of ``DopplerTimeMap`` with its default window.
+        speed of the through-wall preset.
         """
-        if bins is None:
-            bins = 1 << (max(round(0.1 * radar.prf_hz), 256) - 1).bit_length()
-        step = radar.prf_hz / bins * radar.doppler_wavelength_m / 2
-        axis = (torch.arange(bins, dtype=torch.float64) - bins // 2) * step
-        return cls(axis, (-speed_m_s, speed_m_s), size, scale, range_db)
+        axis = torch.tensor([-radar.unambiguous_speed_m_s, 0.0], dtype=torch.float64)
+        return cls(axis, (-speed_m_s, speed_m_s), size, scale, range_db, any_bins=True)
 
     @classmethod
     def range(
@@ -144,19 +142,28 @@ class MapToImage(nn.Module):
         return cls(axis, (0.0, farthest_m), size, scale, range_db)
 
     @torch.jit.export
+    def rows(self, bins: int, device: torch.device | None = None) -> Tensor:
+        """Matrix (size, bins) that averages the bins of a map over each pixel."""
+        step = self.extent / bins
+        start = self.first + step * (torch.arange(bins, dtype=torch.float64, device=device) - 0.5)
+        return area_weights(start, step, self.low, self.high, self.size)
+
+    @torch.jit.export
     def average(self, power: Tensor) -> Tensor:
         """Mean of power (..., F, K) over each pixel: (..., size, size)."""
-        frames = power.shape[-1]
+        bins, frames = power.shape[-2], power.shape[-1]
         start = torch.arange(frames, dtype=torch.float64, device=power.device)
         columns = area_weights(start, 1.0, 0.0, float(frames), self.size).to(power.dtype)
-        return torch.matmul(torch.matmul(self.rows.to(power.dtype), power), columns.transpose(0, 1))
+        rows = self.rows(bins, power.device).to(power.dtype)
+        return torch.matmul(torch.matmul(rows, power), columns.transpose(0, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
         """Magnitudes (..., F, K) to images (..., 1, size, size)."""
-        layout = f"(..., {self.rows.shape[1]} bins, frames)"
+        layout = "(..., bins, frames)" if self.any_bins else f"(..., {self.bins} bins, frames)"
         check_floating(maps, "MapToImage")
         check_min_rank(maps, 2, "MapToImage", layout)
-        check_size(maps, -2, self.rows.shape[1], "MapToImage", layout)
+        if not self.any_bins:
+            check_size(maps, -2, self.bins, "MapToImage", layout)
         check_not_empty(maps, "MapToImage")
         check_finite(maps, "MapToImage")
         if not is_exporting() and bool((maps < 0).any()):

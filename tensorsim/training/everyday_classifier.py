@@ -137,7 +137,7 @@ class EverydayRecipe(Recipe):
         rows = []
         for scene in SCENES:
             radar = PRESETS[scene].radar
-            image = MapToImage.doppler(radar, None, store.settings.speed_m_s, stored)
+            image = MapToImage.doppler(radar, store.settings.speed_m_s, stored)
             rows.append(noise_rows(radar, image))
         self.noise = torch.stack([row / row.max() for row in rows]).float()
         torch.manual_seed(seed)

@@ -112,7 +112,7 @@ class Radars:
         )
         self.mti = MovingTargetIndicator()
         self.maps = DopplerTimeMap(wall.radar, overlap=0.7)
-        self.image = MapToImage.doppler(wall.radar, None, speed_m_s, size)
+        self.image = MapToImage.doppler(wall.radar, speed_m_s, size)
         self.noise = [noise_rows(free.radar, self.expected.image), noise_rows(wall.radar, self.image)]
         self.resamplers = [PoseResampler(rate) for rate in (_EXPECTED_HZ, wall.radar.prf_hz)]
         self.bodies: list[dict[str, nn.Module]] = [

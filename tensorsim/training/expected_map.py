@@ -33,7 +33,7 @@ def noise_rows(radar: RadarConfig, image: MapToImage) -> Tensor:
     window = frames.window
     lag = (window[:-1] * window[1:]).sum() / window.square().sum()
     gain = 2 - 2 * lag * torch.cos(2 * math.pi * frames.doppler_hz / radar.prf_hz)
-    return image.rows @ gain
+    return image.rows(frames.bins) @ gain
 
 
 class ExpectedMap:
@@ -55,7 +55,7 @@ class ExpectedMap:
         self.radar, self.rate_hz, self.size = radar, rate_hz, size
         frames = DopplerFrames(radar)
         self.window_s, self.bins = frames.length / radar.prf_hz, frames.bins
-        self.image = MapToImage.doppler(radar, frames.bins, speed_m_s, size)
+        self.image = MapToImage.doppler(radar, speed_m_s, size)
         spectrum = torch.fft.fft(frames.window, frames.bins).abs().square()
         kernel = torch.cat([spectrum[-_REACH:], spectrum[: _REACH + 1]])
         self.kernel = kernel / kernel.sum()
@@ -106,7 +106,7 @@ class ExpectedMap:
         ring = torch.nn.functional.pad(spread[:, None], (_REACH, _REACH), mode="circular")
         smooth = torch.nn.functional.conv1d(ring, self.kernel[None, None])[:, 0]
         # Of all Doppler bins, a target's power is in a few: per bin it is this many times the mean.
-        picture = self.image.rows @ (smooth * self.mti_gain * self.bins).T
+        picture = self.image.rows(self.bins) @ (smooth * self.mti_gain * self.bins).T
         if snr_db is not None:
             picture = picture + (echo * 10 ** (-snr_db / 10) * self.noise_rows)[:, None]
         return picture

@@ -197,8 +197,8 @@ class MapMaker:
         usual = DopplerFrames(self.radar)
         hop = max(usual.hop, (pulses - 1 - usual.length) // max(1, settings.size - 1))
         self.frames = DopplerFrames(self.radar, overlap=1 - (hop - 0.5) / usual.length)
-        self.image = MapToImage.doppler(self.radar, usual.bins, settings.speed_m_s, settings.size)
-        shown = torch.nonzero(self.image.rows.sum(0)).flatten()
+        self.image = MapToImage.doppler(self.radar, settings.speed_m_s, settings.size)
+        shown = torch.nonzero(self.image.rows(usual.bins).sum(0)).flatten()
         self.first, self.last = int(shown[0]), int(shown[-1]) + 1
 
     def spectra(self, profiles: Tensor) -> Iterator[Tensor]:
@@ -210,7 +210,7 @@ class MapMaker:
 
     def picture(self, power: Tensor) -> Tensor:
         """Power (K, F shown) to pixels (size, size)."""
-        beside = [self.first, self.image.rows.shape[1] - self.last]
+        beside = [self.first, self.frames.bins - self.last]
         return self.image.average(torch.nn.functional.pad(power, beside).double().transpose(0, 1))
 
     def noise(self, pulses: int, generator: torch.Generator) -> Tensor:

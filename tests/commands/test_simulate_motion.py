@@ -75,6 +75,16 @@ def test_maps_at_display_rate_or_of_every_pulse(walk: np.ndarray, tmp_path: Path
     assert loadmat(tmp_path / "few" / "pose.mat")["joints_m"].shape == (1, 12, 14, 3)
 
 
+@pytest.mark.parametrize("window_s", ["0.06", "0.2"])
+def test_labels_with_other_doppler_windows(walk: np.ndarray, tmp_path: Path, window_s: str) -> None:
+    np.savez(tmp_path / "walk.npz", walk=walk[:12], fps=FPS)
+    out = tmp_path / "out"
+    cli.main(
+        ["simulate", str(tmp_path / "walk.npz"), "--out", str(out), "--quiet", "--stft-window", window_s]
+    )
+    assert json.loads((out / "summary.json").read_text())["probabilities"]
+
+
 def test_place_heading_and_part(walk: np.ndarray, tmp_path: Path) -> None:
     np.savez(tmp_path / "two.npz", first=walk, second=walk * 0.9, fps=FPS)
     arguments = ["simulate", str(tmp_path / "two.npz"), "--out", str(tmp_path / "out"), "--clip", "first"]

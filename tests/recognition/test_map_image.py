@@ -40,6 +40,16 @@ class TestMapToImageLinear(TestMapToImage):
     scale = "linear"
 
 
+class TestMapToImageOfSpectra(TestMapToImage):
+    """Twice as many bins as its axis has, which share the extent."""
+
+    def make(self) -> nn.Module:
+        return MapToImage(axis(5, 1.0), (-1.9, 1.6), size=6, any_bins=True)
+
+    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
+        return [((torch.zeros(7),), r"got shape \[7\], expected \(\.\.\., bins, frames\)")]
+
+
 def finely_sampled(power: np.ndarray, low: float, high: float, size: int, fine: int = 9240) -> np.ndarray:
     """Mean over the pixel of a piecewise constant function of the first dimension, by brute force."""
     place = low + (np.arange(fine) + 0.5) * (high - low) / fine
@@ -99,6 +109,21 @@ def test_speed_is_where_both_presets_show_it() -> None:
         assert_same(MapToImage.doppler(radar)(5 * magnitude), image, atol=1e-6)
     expected = (2.0 + 3.8) / 7.6 * 224 - 0.5
     assert rows == pytest.approx([expected, expected], abs=1.0)
+
+
+def test_pictures_do_not_depend_on_the_doppler_window() -> None:
+    """Windows of 0.06, 0.1 and 0.2 s have 512, 1024 and 2048 bins; bin F / 2 is speed 0 in all of them."""
+    radar = RadarConfig.free_space()
+    speed = radar.unambiguous_speed_m_s
+    images = []
+    for bins in (512, 1024, 2048):
+        wave = torch.linspace(-1, 1, bins + 1, dtype=torch.float64)[:-1]
+        images.append(MapToImage.doppler(radar, size=32, scale="linear")(1 + wave[:, None].expand(-1, 3)))
+        step = 2 * speed / bins
+        inside = MapToImage.doppler(radar, 3.5 * step, size=7).rows(bins)
+        assert_same(inside[:, bins // 2 - 3 : bins // 2 + 4], torch.eye(7, dtype=torch.float64), atol=1e-9)
+    for image in images:
+        assert_same(image, images[-1], atol=3e-3)
 
 
 def test_range_picture_and_merged_channels() -> None:

@@ -68,7 +68,7 @@ def test_rows_of_noise_are_those_of_the_indicator(scene):
     profiles = torch.randn(8, pulses, 40, dtype=torch.complex64)
     image = MapToImage.doppler(radar, size=32)
     power = DopplerTimeMap(radar, overlap=0.5)(MovingTargetIndicator()(profiles)).double().square().mean(0)
-    rows = image.rows @ power.mean(1)
+    rows = image.rows(len(power)) @ power.mean(1)
     expected = noise_rows(radar, image)
     torch.testing.assert_close(rows / rows.sum(), expected / expected.sum(), rtol=0.08, atol=2e-5)
 

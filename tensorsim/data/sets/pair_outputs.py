@@ -108,7 +108,6 @@ def stored_maps(
     if "picture" in wanted.kinds:
         picture = MapToImage.doppler(
             simulator.radar,
-            simulator.doppler.bins,
             wanted.picture_speed_m_s,
             wanted.picture_size,
             range_db=wanted.picture_range_db,
