@@ -120,8 +120,8 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
 class FilmReader:
     """Finds the people of films; what the networks gave is kept in a folder and used again.
 
-    Detections are kept by film, cut and detector, key points by these, the tracks and the pose network; tracking,
-    lifting and smoothing run anew.
+    Detections are kept by film, cut and detector, key points by these, the tracks and the pose network, networks by
+    their file and what runs them; tracking, lifting and smoothing run anew.
 
     Args:
         stage: with the networks.
@@ -140,7 +140,11 @@ class FilmReader:
         calibrate: bool = True,
     ) -> None:
         self.stage, self.cache, self.stride, self.calibrate = stage, cache, stride, calibrate
-        self.detector, self.pose = (_digest(path.read_bytes()) for path in networks)
+        # The names of their parts say what runs the networks, and whether the pose network sees mirror images.
+        self.detector, self.pose = (
+            _digest(path.read_bytes(), repr(network).encode())
+            for path, network in zip(networks, (stage.detector, stage.pose), strict=True)
+        )
 
     def open(self, film: LabelledFilm) -> VideoReader:
         """The labelled seconds of a film."""
@@ -176,8 +180,7 @@ class FilmReader:
         reader.uneven_times_s = times_s if times_s.numel() else None
         tracks = stage.follow(Detections(*(part.to(device) for part in detections)), observed.to(device))
         boxes = tracks.boxes.cpu().numpy().tobytes()
-        # The names of its parts say whether the pose network sees mirror images.
-        key = _digest(key.encode(), self.pose.encode(), repr(stage.pose).encode(), boxes)
+        key = _digest(key.encode(), self.pose.encode(), boxes)
 
         def estimate() -> tuple[Tensor, ...]:
             background = BackgroundMotion(reader.fps)

@@ -76,6 +76,10 @@ class OnnxEngine(nn.Module):
                 self._run = _opened(self.network, self.size, self.runtime, self.threads)
         return [torch.from_numpy(output) for output in self._run(images.contiguous().numpy())]
 
+    def extra_repr(self) -> str:
+        """What runs it: results that are kept by the ``repr`` of a network are those of one runtime."""
+        return f"runtime={self.runtime!r}"
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_run": None}
 

@@ -29,6 +29,7 @@ from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.streaming import Found
 from tensorsim.types import Detections, Pose, RadarMaps
+from tensorsim.vision.onnx_engine import OnnxEngine
 from tests.film import RectangleDetector, StandingPose, film, panned, walker
 
 FPS = 10.0
@@ -166,6 +167,25 @@ def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -
     assert CountingDetector.frames == 0, "kept in the cache"
     for first, second in zip(found[0].pose, found[1].pose, strict=True):
         assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("part", ["detector", "pose"])
+def test_what_networks_found_is_kept_for_each_engine(data: Path, tmp_path: Path, part: str) -> None:
+    """The same weights in integers find something else."""
+    known = read_labels(data)[0]
+    (tmp_path / "w.onnx").write_text("")
+    kept = []
+    for runtime in ("onnxruntime", "int8", "int8"):
+        networks = {"detector": CountingDetector(), "pose": StandingPose()}
+        engine = OnnxEngine(nn.Identity(), (8, 8), runtime)  # type: ignore[arg-type]
+        networks[part].add_module("engine", engine)
+        reader = FilmReader(VideoToPose(**networks).eval(), (tmp_path / "w.onnx",) * 2, tmp_path / "cache")
+        with torch.inference_mode():
+            reader.observed(known, reader.open(known), torch.device("cpu"), quiet=True)
+        kept.append(
+            len([path for path in (tmp_path / "cache").iterdir() if path.name.startswith(("det", "key"))])
+        )
+    assert kept == ([2, 4, 4] if part == "detector" else [2, 3, 3])
 
 
 def test_how_the_camera_moves_is_kept_with_what_the_networks_found(tmp_path: Path) -> None:
