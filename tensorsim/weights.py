@@ -225,7 +225,7 @@ def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict
     Args:
         module: its state dict is written.
         path: ends in ``.safetensors``.
-        metadata: strings stored in the header.
+        metadata: strings stored in the header, beside those of ``module.metadata`` if there is one.
 
     Raises:
         TensorsimError: a parameter that float16 cannot hold.
@@ -247,7 +247,7 @@ def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict
                 raise TensorsimError(f"{path}: {key} has values that float16 cannot hold")
         stored[key] = value
     with complete_file(path) as scratch:
-        save_file(stored, scratch, metadata)
+        save_file(stored, scratch, {**getattr(module, "metadata", {}), **metadata})
 
 
 def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:

@@ -54,6 +54,7 @@ class SPNet(nn.Module):
 
     Attributes:
         mean: (C,) mean of each channel over the training images, which is subtracted; part of the weights.
+        metadata: activation and padding, for the header of a weight file.
 
     Shapes: images (..., C, H, W) in [0, 1], 224x224 in the paper -> logits (..., num_classes). Differentiable.
     11 055 660 parameters for 12 classes and 3 channels.
@@ -82,6 +83,7 @@ class SPNet(nn.Module):
         if padding not in ("matlab", "torch"):
             raise TensorsimError(f"SPNet.padding: got {padding!r}, expected 'matlab' or 'torch'")
         self.num_classes, self.in_channels = num_classes, in_channels
+        self.metadata = {"activation": activation, "padding": padding}
         self.register_buffer("mean", torch.zeros(in_channels))
         self.conv1 = SameConv(in_channels, 12, stride=2, padding=padding)
         self.conv2 = SameConv(12, 24, stride=2, padding=padding)
@@ -115,7 +117,7 @@ class SPNet(nn.Module):
             TensorsimError: no such file or name, or weights of another network.
         """
         from tensorsim.registry import locate
-        from tensorsim.weights import load_state_dict, load_strict
+        from tensorsim.weights import load_state_dict, load_strict, read_metadata
 
         path = locate(source, "SPNet")
         weights = load_state_dict(path)
@@ -124,6 +126,8 @@ class SPNet(nn.Module):
             raise TensorsimError(
                 f"{path}: got the weights {', '.join(sorted(weights)[:3])}, ..., expected those of an SPNet"
             )
-        network = cls(last.shape[0], first.shape[1])
+        stated = read_metadata(path)
+        activation, padding = stated.get("activation", "relu"), stated.get("padding", "matlab")
+        network = cls(last.shape[0], first.shape[1], activation, padding)
         load_strict(network, weights, path)
         return network.eval()

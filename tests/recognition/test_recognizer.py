@@ -105,6 +105,18 @@ def test_weights_say_what_they_were_trained_on(tmp_path: Path, network: nn.Modul
         ActivityRecognizer.from_pretrained(RADAR, path)
 
 
+def test_networks_come_back_with_their_activation_and_padding(tmp_path: Path) -> None:
+    network = SPNet(2, activation="none", padding="torch").eval()
+    path = tmp_path / "literal.safetensors"
+    ActivityRecognizer(RADAR, network, size=32, class_names=("a", "b")).save_pretrained(path)
+    pictures = torch.rand(2, 1, 32, 32)
+    with torch.no_grad():
+        loaded = ActivityRecognizer.from_pretrained(RADAR, path).network(pictures)
+        torch.testing.assert_close(loaded, network(pictures), rtol=0.01, atol=1e-3)
+        network.act = nn.ReLU()
+        assert float((loaded - network(pictures)).abs().max()) > 0.05
+
+
 def test_bad_arguments() -> None:
     with pytest.raises(
         TensorsimError, match="inputs: got 'picture', expected one of doppler, ridges, merged"
