@@ -1,5 +1,6 @@
 """Reading files with one kind of error; writing files and folders completely or not at all."""
 
+import hashlib
 import json
 import math
 import os
@@ -44,6 +45,11 @@ def check_pickle_memo(file: IO[bytes]) -> None:
         if "PUT" in opcode.name and (argument or 0) > MAX_MEMO:
             raise TensorsimError(f"a pickle with a memo of {argument} entries, expected at most {MAX_MEMO}")
     file.seek(start)
+
+
+def sha256_of(path: Path) -> str:
+    """Hexadecimal SHA-256 of the content of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @contextmanager

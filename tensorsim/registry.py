@@ -4,13 +4,12 @@ Shipped files are inside the package; others are downloaded once into the user's
 SHA-256. A path can be given in place of a name.
 """
 
-import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, sha256_of
 from tensorsim.model_files import manifest, models_dir
 
 
@@ -193,6 +192,11 @@ def shipped() -> tuple[ModelEntry, ...]:
     )
 
 
+def shipped_weights(*networks: str) -> dict[str, str]:
+    """Digests of the shipped files of these networks by name: a result that they made is not that of others."""
+    return {entry.name: entry.sha256 for entry in shipped() if entry.network in networks}
+
+
 def entries() -> tuple[ModelEntry, ...]:
     """All entries: shipped files, then published ones."""
     return (*shipped(), *PUBLISHED)
@@ -310,7 +314,7 @@ def verify(entry: ModelEntry) -> str:
         raise TensorsimError(
             f"{entry.name}: {entry.path} is not there; fetch it: tensorsim models fetch {entry.name}"
         )
-    digest = hashlib.sha256(entry.path.read_bytes()).hexdigest()
+    digest = sha256_of(entry.path)
     kept = _kept_digest(entry)
     expected = entry.sha256
     if not entry.shipped and digest.startswith(expected) and kept.is_file():

@@ -1,6 +1,5 @@
 """``tensorsim check``: tests of the installation."""
 
-import hashlib
 import importlib
 import os
 from collections.abc import Callable
@@ -32,11 +31,12 @@ def _libraries() -> str:
 
 
 def _shipped_files() -> str:
+    from tensorsim.files import sha256_of
     from tensorsim.model_files import manifest, model_path
 
     entries = manifest()
     for entry in entries:
-        digest = hashlib.sha256(model_path(entry["file"]).read_bytes()).hexdigest()
+        digest = sha256_of(model_path(entry["file"]))
         if digest != entry["sha256"]:
             raise ValueError(f"{entry['file']} has SHA-256 {digest}, the manifest says {entry['sha256']}")
     return ", ".join(entry["file"] for entry in entries)

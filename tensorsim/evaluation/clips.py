@@ -12,6 +12,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.data.motion_files import load_motion, motion_keys, place
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
+from tensorsim.files import sha256_of
 from tensorsim.motion.activities import ActivityGenerator, activity_index
 from tensorsim.motion.resample import PoseResampler
 
@@ -62,12 +63,14 @@ class CapturedClip:
     Attributes:
         row, name: see :class:`ActivityClip`.
         motion: one person on the floor, cut to the clip.
+        source: what the motion was read from: digest of the file, and the frame rate that was given.
         seed: of the random numbers of a film of it.
     """
 
     row: str
     name: str
     motion: Motion
+    source: str = ""
     seed: int = 0
 
     @cached_property
@@ -118,14 +121,16 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
         TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; no motion that is long enough.
     """
     clips: list[Clip] = []
-    for key in motion_keys(path):
+    keys = motion_keys(path)
+    source = f"{sha256_of(path)} {fps}"
+    for key in keys:
         motion = load_motion(path, key, fps)
         stop = 1 + int(CLIP_S * motion.fps)
         motion = Motion(motion.joints[:1, 1:stop], motion.valid[:1, 1:stop], motion.fps)
         if motion.joints.shape[1] < 0.5 * motion.fps or not bool(motion.valid.all()):
             continue
         motion = place(motion, CAPTURE_RANGE_M)
-        clips.append(CapturedClip(path.stem, key or path.stem, _kept_away(motion)))
+        clips.append(CapturedClip(path.stem, key or path.stem, _kept_away(motion), source))
     if not clips:
         raise TensorsimError(f"{path}: got no motion of at least half a second, expected one")
     return clips[:count]

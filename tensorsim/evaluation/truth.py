@@ -25,6 +25,7 @@ from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
 from tensorsim.files import complete_file
 from tensorsim.radar.presets import PRESETS
+from tensorsim.registry import shipped_weights
 
 #: Trivial guesses as a baseline: an empty map; the mean of the row's other clips; another clip of the row.
 GUESSES = ("empty", "mean", "shuffled")
@@ -152,17 +153,19 @@ class TruthLoop:
         options: dict[str, Any] = {"scenes": self.scenes, "clips": 0, "fps": FPS}
         if setting in GUESSES:  # made of the other clips
             options |= {"clips": self.clips, "seed": self.seed}
+        if setting not in GUESSES:
+            options |= {"lifter": self.lifter, "weights": shipped_weights("TemporalLifter")}
         if isinstance(clip, CapturedClip):
-            options |= {"motion_fps": self.motion_fps}
+            options |= {"source": clip.source}
         if setting.startswith("c"):
             options |= {"networks": self._networks()}
-        if self.lifter is not None:
-            options |= {"lifter": self.lifter}
         return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{_key(options)}.json"
 
     def film(self, clip: Clip) -> Path:
         """File of the results of the networks on a clip."""
-        return self.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{_key(self._networks())}.npz"
+        source = clip.source if isinstance(clip, CapturedClip) else ""
+        key = _key([source, self._networks()])
+        return self.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{key}.npz"
 
     def _networks(self) -> list[tuple[str, int]]:
         """Identifies the networks, also after more training: their files and modification times."""

@@ -16,9 +16,10 @@ from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
 from tensorsim.experiments import figures
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread, shipped_weights
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
+from tensorsim.registry import shipped_weights
 from tensorsim.training.denoiser import simulate_pair
 from tensorsim.training.denoiser_scores import COLUMNS, scores
 from tensorsim.training.maps import SCENES

@@ -1,6 +1,5 @@
 """Every recogniser trained on simulation and tested on measured radar and on real films."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,9 +24,10 @@ from tensorsim.experiments.real_films import (
     film_pictures,
     titled,
 )
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread, shipped_weights
-from tensorsim.files import complete_file
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.files import complete_file, sha256_of
 from tensorsim.recognition.networks import find_classifier
+from tensorsim.registry import shipped_weights
 from tensorsim.training.everyday_maps import EverydaySettings
 
 
@@ -191,7 +191,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
 
 def _identity(data: Path, measured: MeasuredSet) -> list[Any]:
     path = data / measured.name / measured.file
-    return [measured.name, hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""]
+    return [measured.name, sha256_of(path) if path.is_file() else ""]
 
 
 def _trained_and_tested(

@@ -15,13 +15,13 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES, SimulationConfig
 from tensorsim.errors import TensorsimError, collected_warnings
 from tensorsim.evaluation.labelled_films import FilmReader, LabelledFilm, Scene, read_labels
-from tensorsim.experiments.work import Work, digest, shipped_weights
+from tensorsim.experiments.work import Work, digest
 from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.recognition.timeline import windows_of
-from tensorsim.registry import locate
+from tensorsim.registry import locate, shipped_weights
 from tensorsim.streaming import maps_of_pose, within_reach
 from tensorsim.training.classifier import RANGE_DB
 from tensorsim.training.everyday_classifier import EverydayRecipe

@@ -17,11 +17,11 @@ from tensorsim.evaluation.settings import Pipelines, Setting
 from tensorsim.evaluation.truth import pose_errors
 from tensorsim.experiments import figures
 from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
-from tensorsim.experiments.work import Report, Table, Work, shipped_weights
+from tensorsim.experiments.work import Report, Table, Work
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import VideoToPose, pretrained_pose
 from tensorsim.radar.presets import PRESETS
-from tensorsim.registry import find
+from tensorsim.registry import find, shipped_weights
 from tensorsim.render.renderer import PersonRenderer
 from tensorsim.training.maps import SCENES
 from tensorsim.vision.detection.acf import AcfDetector

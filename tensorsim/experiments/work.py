@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from tensorsim.config.documents import to_document
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
-from tensorsim.registry import shipped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,11 +21,6 @@ def digest(settings: Any) -> str:
     """Ten hexadecimal digits that tell configurations apart."""
     text = json.dumps(to_document(settings), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
-
-
-def shipped_weights(*networks: str) -> dict[str, str]:
-    """Digests of the shipped files of these networks by name: a result that they made is not that of others."""
-    return {entry.name: entry.sha256 for entry in shipped() if entry.network in networks}
 
 
 @dataclass(frozen=True)

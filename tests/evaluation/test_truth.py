@@ -389,9 +389,19 @@ def test_files_of_cells_and_films_tell_networks_and_frame_rates_apart(tmp_path: 
     assert one.film(clip) != before, "the network was trained further"
     assert one.cell("row", clip, "mean") != loop(seed=3).cell("row", clip, "mean"), "of other clips"
     np.savez(tmp_path / "walk.npz", joints_m=clip.joints(30.0).numpy(), fps=30.0)
-    (captured,) = captured_clips(tmp_path / "walk.npz", 1)
-    slow = loop(motion_fps=20.0)
-    assert one.cell("walk", captured, "a") != slow.cell("walk", captured, "a")
+    captured = captured_clips(tmp_path / "walk.npz", 1)
+    captured += captured_clips(tmp_path / "walk.npz", 1, fps=20.0)
+    np.savez(tmp_path / "walk.npz", joints_m=clip.joints(30.0).numpy() + 0.1, fps=30.0)
+    captured += captured_clips(tmp_path / "walk.npz", 1)
+    assert len({one.cell("walk", each, "a") for each in captured}) == 3
+    assert len({one.film(each) for each in captured}) == 3
+
+
+def test_cells_of_other_lifter_weights_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, clip = truth.TruthLoop(tmp_path), walk()
+    before = loop.cell("row", clip, "b")
+    monkeypatch.setattr(truth, "shipped_weights", lambda *_: {"temporal_lifter_small": "0"})
+    assert loop.cell("row", clip, "b") != before
 
 
 def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
