@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
 from tensorsim.experiments import figures
 from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.files import sha256_of
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
 from tensorsim.registry import shipped_weights
@@ -206,6 +208,8 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
     denoisers: dict[str, Callable[[Tensor], Tensor] | None] = {
         name: map_denoiser(name) for name in config.denoisers
     }
+    # A file is told by its content.
+    identities = {name: sha256_of(Path(name)) if Path(name).is_file() else "" for name in config.denoisers}
     found: dict[tuple[str, str, float, str], list[list[float]]] = {}
     jobs = [
         (scene, ratio, clip)
@@ -221,7 +225,7 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
             return _denoised(denoisers, scene, ratio, clip, config)
 
         settings = {
-            "scene": scene, "ratio": ratio, "clip": clip, "seed": config.seed, "denoisers": config.denoisers,
+            "scene": scene, "ratio": ratio, "clip": clip, "seed": config.seed, "denoisers": identities,
             "columns": config.columns, "weights": shipped_weights("DnCNN"),
         }  # fmt: skip
         for view, of_view in work.kept("denoiser", settings, make).items():

@@ -165,7 +165,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     for name, seed in tqdm(jobs, desc="films", unit="training", disable=work.quiet):
         settings = {
             "films": labelled,
-            "maps": str(maps.resolve()), "groups": config.groups, "size": config.size, "steps": config.film_steps,
+            "maps": training.digest, "size": config.size, "steps": config.film_steps,
             "network": name, "seed": seed, "weights": shipped_weights(*WATCHERS),
         }  # fmt: skip
         results[name].append(

@@ -1,5 +1,6 @@
 """Recognisers trained on simulated maps of everyday motion and asked about real films of known activity."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
@@ -77,6 +78,12 @@ class EverydayTraining:
             settings = EverydaySettings(**json.loads(described.read_text(encoding="utf-8")))
         build_everyday(self.maps, self.groups, settings, quiet=self.quiet)
         return EverydayStore(self.maps, range(self.groups))
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the content of the maps."""
+        parts = (self.store.power, self.store.activity, self.store.filmed)
+        return hashlib.sha256(b"".join(part.numpy().tobytes() for part in parts)).hexdigest()
 
 
 def described(film: LabelledFilm) -> tuple[str, int, float, float]:
@@ -157,8 +164,7 @@ def film_accuracy(
     settings = {
         "network": name,
         "seed": seed,
-        "maps": str(training.maps.resolve()),
-        "groups": training.groups,
+        "maps": training.digest,
         "size": training.size,
         "steps": training.steps,
     }

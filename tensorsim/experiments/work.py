@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
 
 
 def digest(settings: Any) -> str:
-    """Ten hexadecimal digits that tell configurations apart."""
-    text = json.dumps(to_document(settings), sort_keys=True)
+    """Ten hexadecimal digits that tell configurations, and versions of this package, apart."""
+    text = json.dumps([version("tensorsim"), to_document(settings)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 

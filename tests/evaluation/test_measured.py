@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,15 @@ def test_ablation_leaves_out_each_effect_and_keeps_its_trainings(folders, tmp_pa
     cli.main(words(folders, tmp_path, *options))
     assert trained == ["beam"]
     assert (tmp_path / "ablation_kmkim_cw24_iq.md").read_text() == text
+
+
+def test_other_test_clips_in_the_same_folder_are_told_apart(tmp_path):
+    tested = set()
+    for seed in (0, 0, 1):
+        shutil.rmtree(tmp_path / "sets", ignore_errors=True)
+        write_folder(tmp_path / "sets", 2, seed)
+        tested.add(run.Experiment(SETS[2], tmp_path / "sets", tmp_path / "sets", tmp_path).tested)
+    assert len(tested) == 2
 
 
 def test_ablation_table_by_hand(folders, tmp_path):

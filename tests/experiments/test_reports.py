@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
@@ -121,6 +121,23 @@ def test_denoisers_stand_beside_an_empty_map(tmp_path: Path, monkeypatch: pytest
     assert [map_.shape[-1] for map_ in seen] == [32, 32]
 
 
+def test_a_file_of_a_denoiser_is_told_by_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def denoised(*_: Any) -> dict[str, Any]:
+        made.append(1)
+        return {"doppler_time": {str(path): [1.0] * len(ablations.COLUMNS)}}
+
+    monkeypatch.setattr(ablations, "map_denoiser", lambda name: None)
+    monkeypatch.setattr(ablations, "_denoised", denoised)
+    path = tmp_path / "own.safetensors"
+    config = ablations.DenoiserConfig((str(path),), ("through-wall",), 1, (10.0,))
+    for content in (b"a", b"a", b"b"):
+        path.write_bytes(content)
+        ablations.denoiser_report(config, Work(tmp_path, quiet=True))
+    assert len(made) == 2
+
+
 def test_pictures_become_square_with_the_same_mean() -> None:
     x = torch.rand(2, 1, 40, 80, generator=torch.Generator().manual_seed(0))
     found = real.square(x, 32)
@@ -200,7 +217,7 @@ def test_the_first_films_of_a_folder_are_taken(tmp_path: Path, monkeypatch: pyte
     # Other weights of the shipped networks see the films anew.
     before = set((tmp_path / "work" / "results").iterdir())
     entries = [replace(entry, sha256="0" * 64) for entry in shipped()]
-    monkeypatch.setattr("tensorsim.experiments.work.shipped", lambda: tuple(entries))
+    monkeypatch.setattr("tensorsim.registry.shipped", lambda: tuple(entries))
     assert len(real_films.film_pictures(tmp_path, 32, work)) == 3
     assert len(set((tmp_path / "work" / "results").iterdir()) - before) == 1
 
@@ -219,6 +236,31 @@ def test_networks_learn_everyday_maps_and_label_films(tmp_path: Path) -> None:
     assert found["free-space films"] == 1.0
     assert found["through-wall films"] == 0.0
     assert real_films.titled({"ccln": [found, found]}) == [["CCLN", 100.0, 100.0, 100.0, 0.0]]
+
+
+def test_trainings_on_other_maps_in_the_same_folder_are_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    films = [real_films.FilmPictures(("S8 Walking",), {})]
+    trained: list[str] = []
+
+    def accuracy(name: str, *_: Any) -> dict[str, float]:
+        trained.append(name)
+        return {f"{scene} {kind}": 0.5 for scene in real_films.SCENES for kind in ("clips", "films")}
+
+    monkeypatch.setattr(real, "film_pictures", lambda *_: films)
+    monkeypatch.setattr(real, "read_labels", lambda _: [])
+    monkeypatch.setattr(real, "film_accuracy", accuracy)
+    everyday_store(tmp_path / "maps", 5)
+    config = replace(real.quick_real(), films="films", maps=str(tmp_path / "maps"), networks=("ccln",))
+    for _ in range(2):
+        real.real_report(config, Work(tmp_path / "work", quiet=True))
+    assert len(trained) == 1
+    changed = tmp_path / "maps" / "everyday-00003.safetensors"
+    parts = load_file(changed)
+    save_file(parts | {"pictures": 255 - parts["pictures"]}, changed)
+    real.real_report(config, Work(tmp_path / "work", quiet=True))
+    assert len(trained) == 2
 
 
 @pytest.mark.slow

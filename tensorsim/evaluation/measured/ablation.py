@@ -14,7 +14,7 @@ Accuracies = list[list[float]]
 def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
     """Accuracies of the simulation, whole ("") and without each effect in turn.
 
-    Every training is kept in ``out/results``; a later run with the same settings and folders does not repeat it.
+    Every training is kept in ``out/results``; a later run with the same settings and test clips does not repeat it.
 
     Args:
         experiment: one set, its folders and settings.
@@ -22,7 +22,7 @@ def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
     """
     measured, labels = experiment.measured, experiment.test_labels
     subset = [measured.classes.index(name) for name in measured.subset]
-    work = Work(experiment.out)
+    work, tested = Work(experiment.out), experiment.tested
 
     def accuracies(effect: str, seed: int) -> dict[str, Any]:
         logits = experiment.simulation_alone(seed, effect or None)
@@ -32,7 +32,7 @@ def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
     for effect in ("", *measured.effect_names):
         rows[effect] = []
         for seed in range(experiment.seed, experiment.seed + repeats):
-            settings = [effect, seed, experiment.clips, experiment.steps, experiment.tested, len(labels)]
+            settings = [effect, seed, experiment.clips, experiment.steps, tested]
             make = partial(accuracies, effect, seed)
             kept = work.kept(f"{measured.name}-{effect or 'whole'}", settings, make)
             rows[effect].append(kept["accuracies"])

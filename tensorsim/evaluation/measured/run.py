@@ -1,6 +1,7 @@
 """The experiments: simulation alone, with a few measured clips, with all of them, and their rivals."""
 
 import copy
+import hashlib
 from pathlib import Path
 
 import torch
@@ -94,7 +95,6 @@ class Experiment:
         quiet: bool = False,
     ) -> None:
         self.measured, self.out = measured, out
-        self.tested = str(train if test is None else test)
         self.clips, self.steps, self.seed, self.quiet = clips, steps, seed, quiet
         self.train, self.train_labels = measured.load(train)
         if test is None:
@@ -103,6 +103,12 @@ class Experiment:
             self.train, self.train_labels = self.train[early], self.train_labels[early]
         else:
             self.test, self.test_labels = measured.load(test)
+
+    @property
+    def tested(self) -> str:
+        """Digest of the test clips and their labels."""
+        parts = (self.test, self.test_labels)
+        return hashlib.sha256(b"".join(part.numpy().tobytes() for part in parts)).hexdigest()
 
     def quick(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips by the shipped weights."""
