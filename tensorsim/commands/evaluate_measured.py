@@ -6,7 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, write_json
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class EvaluateMeasured:
             raise TensorsimError(f"--repeats: got {self.repeats} without --ablation, expected 1")
 
         from tensorsim.evaluation.measured.ablation import ablation, ablation_table
-        from tensorsim.evaluation.measured.report import figures, table, write, write_json
+        from tensorsim.evaluation.measured.report import figures, table, write
         from tensorsim.evaluation.measured.run import Experiment
         from tensorsim.evaluation.measured.sets import SETS
 

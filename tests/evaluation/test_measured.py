@@ -207,6 +207,50 @@ def test_damaged_folders_are_refused(tmp_path):
         SETS[2].load(tmp_path)
 
 
+def changed(folder: Path, out: Path, measured, **arrays) -> Path:
+    """A folder with a measured set of which some arrays are others."""
+    with np.load(folder / measured.name / measured.file) as file:
+        content = {name: file[name] for name in file.files}
+    (out / measured.name).mkdir(parents=True, exist_ok=True)
+    np.savez(out / measured.name / measured.file, **(content | arrays))
+    return out
+
+
+@pytest.mark.parametrize("measured", SETS, ids=lambda s: s.name)
+def test_labels_are_those_of_the_classes_of_the_file(folders, tmp_path, measured):
+    expected, labels = measured.load(folders[0])
+    with np.load(folders[0] / measured.name / measured.file) as file:
+        names, label = file["classes"], file["label"]
+    turned = changed(folders[0], tmp_path, measured, classes=names[::-1], label=len(names) - 1 - label)
+    shown, found = measured.load(turned)
+    assert torch.equal(found, labels)
+    assert torch.equal(shown, expected)
+
+
+@pytest.mark.parametrize("measured", SETS, ids=lambda s: s.name)
+def test_clips_that_are_not_those_of_the_set_are_refused(folders, tmp_path, measured):
+    with np.load(folders[0] / measured.name / measured.file) as file:
+        clips, label, names = file[measured.array], file["label"], file["classes"]
+    for arrays, message in (
+        ({measured.array: clips[..., ::2]}, f"{measured.array}: got shape .* expected"),
+        ({measured.array: clips[1:]}, "a clip for each label"),
+        ({"label": label + 1}, "label: got int8 .* expected an integer from 0 to"),
+        ({"label": label.astype(float)}, "label: got float64"),
+        ({"classes": np.array([*names[:-1], "flying"])}, "classes: got 'flying', expected some of"),
+        ({"classes": names[:1]}, "label: .* from 0 to 0"),
+    ):
+        with pytest.raises(TensorsimError, match=message):
+            measured.load(changed(folders[0], tmp_path, measured, **arrays))
+
+
+def test_one_class_is_refused_before_training(folders, tmp_path, monkeypatch):
+    one = changed(folders[0], tmp_path, SETS[2], label=np.zeros(15, np.int8))
+    experiment = run.Experiment(SETS[2], one, one, tmp_path, clips=1, steps=1, quiet=True)
+    monkeypatch.setattr(run, "fit_pictures", None)
+    with pytest.raises(TensorsimError, match="radhar_points: got clips of one class"):
+        experiment.full()
+
+
 @pytest.mark.parametrize("measured", SETS, ids=lambda s: s.name)
 def test_simulation_is_seeded_and_shaped_like_the_measured(folders, measured):
     shown, labels = measured.simulate(1, 7, quiet=True)

@@ -6,9 +6,9 @@ bin, sum of bins, decibels, CFAR.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -212,12 +212,9 @@ class Glasgow:
         return self.masks(joints, duration, generator)
 
 
-def read(folder: Path) -> tuple[Tensor, Tensor]:
-    """Masks (N, 128, 256) bool and labels (N,) of a folder of measured masks."""
-    with np.load(folder / "masks.npz") as file:
-        masks = torch.from_numpy(np.unpackbits(file["dt_packed"], axis=-1).astype(bool))
-        labels = torch.from_numpy(file["label"].astype(np.int64))
-    return masks[:, ROWS], labels
+def read(packed: npt.NDArray[np.uint8]) -> Tensor:
+    """Measured masks (N, 256, 32), of which a bit is a cell, to masks (N, 128, 256) bool."""
+    return torch.from_numpy(np.unpackbits(packed, axis=-1).astype(bool))[:, ROWS]
 
 
 def pictures(masks: Tensor) -> Tensor:

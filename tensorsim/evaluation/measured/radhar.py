@@ -1,9 +1,9 @@
 """RadHAR, TI IWR1443 at 30 frames per second: what of five exercises is left in sparse point clouds."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -141,10 +141,9 @@ class RadHar:
         return self.maps(self.motion(label, count, generator), generator)
 
 
-def read(folder: Path) -> tuple[Tensor, Tensor]:
-    """Presence maps (N, 16, 60) bool and labels (N,) of a folder of measured windows."""
-    with np.load(folder / "maps.npz") as file:
-        return torch.from_numpy(file["dt"] > 0), torch.from_numpy(file["label"].astype(np.int64))
+def read(intensity: npt.NDArray[np.uint8]) -> Tensor:
+    """Measured windows (N, 16, 60) to presence maps of that shape, bool."""
+    return torch.from_numpy(intensity > 0)
 
 
 def pictures(maps: Tensor) -> Tensor:

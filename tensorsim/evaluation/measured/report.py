@@ -1,7 +1,6 @@
 """Figures, tables and files of the experiments on measured sets."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -103,9 +102,3 @@ def write(out: Path, name: str, measured: MeasuredSet, logits: dict[str, Tensor]
     ):
         csv.writer(file).writerows(rows)
     return first_error
-
-
-def write_json(path: Path, results: dict[str, dict[str, Any]]) -> None:
-    """``measured.json``."""
-    with complete_file(path) as scratch:
-        scratch.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

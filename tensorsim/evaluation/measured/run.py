@@ -116,7 +116,15 @@ class Experiment:
         return {"simulation_only": self._tested(net)}
 
     def full(self) -> dict[str, Tensor]:
-        """Logits (N, classes) of the test clips in each of ``SETTINGS``."""
+        """Logits (N, classes) of the test clips in each of ``SETTINGS``.
+
+        Raises:
+            TensorsimError: clips to learn from of one class alone.
+        """
+        if len(self.train_labels.unique()) < 2:
+            raise TensorsimError(
+                f"{self.measured.name}: got clips of one class to learn from, expected at least two classes"
+            )
         simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet)
         net = self._simulation_trained(simulated, labels, self.seed)
         path = self.out / f"{self.measured.weights.replace('-', '_')}.safetensors"

@@ -1,9 +1,9 @@
 """Infineon Sense2GoL, 24 GHz continuous wave: bursts of I/Q of people who come towards the radar in four styles."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -153,14 +153,9 @@ class Sense2Gol:
         return doppler_maps(self.iq(self.motion(label, count, generator), generator))[:, ROWS]
 
 
-def read(folder: Path) -> tuple[Tensor, Tensor]:
-    """Doppler maps (N, 64, 15) in dB and labels (N,) of a folder of measured clips; empty ones are left out."""
-    with np.load(folder / "clips.npz") as file:
-        names = [str(name) for name in file["classes"]]
-        labels = torch.tensor([CLASSES.index(names[i]) if names[i] in CLASSES else -1 for i in file["label"]])
-        iq = torch.from_numpy(file["iq"].astype(np.float32))
-    seen = labels >= 0
-    return doppler_maps(iq[seen])[:, ROWS], labels[seen]
+def read(iq: npt.NDArray[np.int16]) -> Tensor:
+    """Measured bursts of I/Q (N, 2, 1920) to Doppler maps (N, 64, 15) in dB."""
+    return doppler_maps(torch.from_numpy(iq.astype(np.float32)))[:, ROWS]
 
 
 def pictures(maps: Tensor) -> Tensor:

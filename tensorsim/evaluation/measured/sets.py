@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -25,44 +27,79 @@ class MeasuredSet:
 
     Attributes:
         name: its folder, and its name in the results.
-        file: what is read in that folder.
+        file: what is read in that folder: classes, label (N,) and an array of the clips.
+        array: name of that array.
+        shape: of each clip in it.
         classes: names in the order of the labels.
         subset: classes of the figure for a part of them.
         simulator: of some effects, makes something with ``simulate(label, count, generator)`` -> maps (count, H, W).
         effects: dataclass of what the simulation has beside bodies that move, each a bool.
-        read: folder -> maps (N, H, W) and labels (N,).
+        read: that array -> maps (N, H, W).
         pictures: maps -> pictures (N, 1, rows, columns).
         augment: changes of pictures in training.
         weights: name of the shipped weights.
         augment_measured: changes of measured pictures in training.
+        ignored: classes of the file whose clips are left out.
     """
 
     name: str
     file: str
+    array: str
+    shape: tuple[int, ...]
     classes: tuple[str, ...]
     subset: tuple[str, ...]
     simulator: Callable[[Any], "Simulator"]
     effects: type
-    read: Callable[[Path], tuple[Tensor, Tensor]]
+    read: Callable[[npt.NDArray[Any]], Tensor]
     pictures: Callable[[Tensor], Tensor]
     augment: Augment
     weights: str
     augment_measured: Augment
+    ignored: tuple[str, ...] = ()
 
     def load(self, folder: Path) -> tuple[Tensor, Tensor]:
         """Pictures (N, 1, H, W) and labels (N,) of this set in a folder of measured sets.
 
         Raises:
-            TensorsimError: the file is not there, is damaged, or holds no clips.
+            TensorsimError: the file is not there, is damaged, holds no clips, clips of another shape or class, or
+                another number of labels than clips.
         """
         path = folder / self.name / self.file
         if not path.is_file():
             raise TensorsimError(f"{path}: no such file, expected the measured clips of {self.name}")
-        with reading(path, f"the measured clips of {self.name}"):
-            maps, labels = self.read(path.parent)
-        if len(labels) == 0:
+        with (
+            reading(path, f"the measured clips of {self.name}"),
+            np.load(path) as file,
+        ):
+            clips, names, label = file[self.array], [str(name) for name in file["classes"]], file["label"]
+            labels = self._labels(path, names, label)
+        if clips.shape != (len(labels), *self.shape):
+            raise TensorsimError(
+                f"{path}: {self.array}: got shape {list(clips.shape)}, expected {[len(labels), *self.shape]}, a clip "
+                "for each label"
+            )
+        seen = labels >= 0
+        if not bool(seen.any()):
             raise TensorsimError(f"{path}: got no clips, expected at least one")
-        return self.pictures(maps), labels
+        return self.pictures(self.read(clips[seen.numpy()])), labels[seen]
+
+    def _labels(self, path: Path, names: list[str], label: npt.NDArray[Any]) -> Tensor:
+        """Labels (N,) of these names in the order of ``classes``; -1 for those that are ignored."""
+        for name in names:
+            if name not in self.classes + self.ignored:
+                known = ", ".join(self.classes + self.ignored)
+                raise TensorsimError(f"{path}: classes: got {name!r}, expected some of {known}")
+        if (
+            label.ndim != 1
+            or label.dtype.kind not in "iu"
+            or bool(((label < 0) | (label >= len(names))).any())
+        ):
+            raise TensorsimError(
+                f"{path}: label: got {label.dtype} of shape {list(label.shape)}, expected an integer from 0 to "
+                f"{len(names) - 1} for each clip"
+            )
+        order = [self.classes.index(name) if name in self.classes else -1 for name in names]
+        return torch.tensor(order)[torch.from_numpy(label.astype(np.int64))]
 
     @property
     def effect_names(self) -> tuple[str, ...]:
@@ -100,6 +137,8 @@ SETS: tuple[MeasuredSet, ...] = (
     MeasuredSet(
         "glasgow_cfar_masks",
         "masks.npz",
+        "dt_packed",
+        (256, 32),
         glasgow.CLASSES,
         ("walking", "sitting_down", "standing_up", "falling"),
         glasgow.Glasgow,
@@ -113,6 +152,8 @@ SETS: tuple[MeasuredSet, ...] = (
     MeasuredSet(
         "kmkim_cw24_iq",
         "clips.npz",
+        "iq",
+        (2, 1920),
         sense2gol.CLASSES,
         ("walk", "run", "creep"),
         sense2gol.Sense2Gol,
@@ -122,10 +163,13 @@ SETS: tuple[MeasuredSet, ...] = (
         sense2gol.augment,
         "measured-kmkim",
         sense2gol.augment,
+        ("empty",),
     ),
     MeasuredSet(
         "radhar_points",
         "maps.npz",
+        "dt",
+        (16, 60),
         radhar.CLASSES,
         ("boxing", "squats", "walk"),
         radhar.RadHar,
