@@ -177,7 +177,7 @@ def film_accuracy(
         precision="float32",  # gradients of depthwise convolutions in bfloat16 come out as NaN at times
         checkpoint_every=min(50, training.steps),
         validate_every=training.steps,
-        ema_decay=0.99 if training.steps > 500 else 0.9,
+        ema_decay=0.0,  # the last weights are asked, no mean
         quiet=work.quiet,
         events=False,
     )

@@ -18,9 +18,12 @@ from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
 from tensorsim.experiments.trials import Trial
 from tensorsim.experiments.work import Report, Table, Work
+from tensorsim.recognition.networks import find_classifier
 from tensorsim.registry import shipped
 from tensorsim.training.everyday_maps import EverydaySettings
+from tensorsim.training.loop import fit
 from tensorsim.training.maps import to_bytes
+from tensorsim.weights import load_state_dict, load_strict
 
 QUICK = replace(networks.quick_networks(), networks=("ccln", "diat-radharnet"), seeds=2, snr_db=(50.0, 10.0))
 
@@ -222,8 +225,17 @@ def test_the_first_films_of_a_folder_are_taken(tmp_path: Path, monkeypatch: pyte
     assert len(set((tmp_path / "work" / "results").iterdir()) - before) == 1
 
 
-def test_networks_learn_everyday_maps_and_label_films(tmp_path: Path) -> None:
+def test_networks_learn_everyday_maps_and_label_films(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A film whose window shows the band of walking is a walk; one without a map is wrong."""
+    fitted: list[Any] = []
+
+    def fit_and_keep(recipe: Any, loop: Any) -> dict[str, float]:
+        fitted.append(recipe)
+        return fit(recipe, loop)
+
+    monkeypatch.setattr(real_films, "fit", fit_and_keep)
     everyday_store(tmp_path / "maps", 5)
     band = torch.zeros(2, 1, 32, 32)
     band[..., 15:17] = 1.0
@@ -235,6 +247,12 @@ def test_networks_learn_everyday_maps_and_label_films(tmp_path: Path) -> None:
     assert found["free-space clips"] == found["through-wall clips"] == 1.0
     assert found["free-space films"] == 1.0
     assert found["through-wall films"] == 0.0
+    # The network that was asked is the one that is kept.
+    (kept,) = (tmp_path / "work" / "trials").rglob("best.safetensors")
+    net = find_classifier("ccln").build(12, 1, 32)
+    load_strict(net, load_state_dict(kept), kept)
+    for name, weights in fitted[0].net.state_dict().items():
+        torch.testing.assert_close(net.state_dict()[name], weights, rtol=2e-3, atol=2e-3)
     assert real_films.titled({"ccln": [found, found]}) == [["CCLN", 100.0, 100.0, 100.0, 0.0]]
 
 
