@@ -24,7 +24,7 @@ Cells = list[dict[str, Any]]
 
 
 def mean(values: Iterable[float]) -> float:
-    """Mean of the finite values; NaN if there are none, infinite if all are (equal maps)."""
+    """Mean of the finite values; NaN if there are none, infinite if all are."""
     listed = [v for v in values if not math.isnan(v)]
     finite = [v for v in listed if math.isfinite(v)]
     if finite:
@@ -53,7 +53,7 @@ def _text(value: float, figure: str) -> str:
     if math.isnan(value):
         return "-"
     if math.isinf(value):
-        return "equal"
+        return "equal" if figure.startswith("psnr") else "inf"
     return f"{value:.1f}" if figure.startswith("psnr") else f"{value:.2f}"
 
 
@@ -82,8 +82,10 @@ def markdown(cells: Cells) -> str:
     text += ["Settings: " + "; ".join(f"**{k}** {v}" for k, v in SOURCES.items()) + ".", ""]
     text += [
         "Each map is scaled by its own peak and compared with that of the true motion at every pulse, without noise, "
-        "shift or fit. Rows whose maps are equal (nobody there, nobody found) are not part of means.",
+        "shift or fit. Rows whose maps are equal (nobody there, nobody found) are not part of means, nor is an "
+        "infinite NMSE (somebody found where nobody is).",
         "",
+        *_left_out(cells, names, scenes),
     ]
     for scene in scenes:
         for name, short in MAPS.items():
@@ -123,6 +125,25 @@ def markdown(cells: Cells) -> str:
             *_pose_table(cells, rows, posed),
         ]
     return "\n".join(text)
+
+
+def _left_out(cells: Cells, names: list[str], scenes: list[str]) -> list[str]:
+    """How many clips each setting lacks: means of settings that lack different ones do not compare."""
+    counts = {
+        (name, scene): [scene not in cell["scores"] for cell in cells if cell["setting"] == name]
+        for name in names
+        for scene in scenes
+    }
+    lacking = [
+        f"{name}, {scene}: {sum(missing)} of {len(missing)}"
+        for (name, scene), missing in counts.items()
+        if any(missing)
+    ]
+    return (
+        [f"Clips left out, whose motion the radar cannot follow: {'; '.join(lacking)}.", ""]
+        if lacking
+        else []
+    )
 
 
 def _pose_table(cells: Cells, rows: list[str], settings: list[str]) -> list[str]:

@@ -18,7 +18,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.evaluation import films, report, settings, truth
 from tensorsim.evaluation.clips import ActivityClip, activity_clips, captured_clips
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, project, true_keypoints
-from tensorsim.evaluation.scores import MAPS, Maps, compare, mean_maps
+from tensorsim.evaluation.scores import FIGURES, MAPS, Maps, compare, mean_maps
 from tensorsim.evaluation.settings import STAGES, Pipelines, Setting, true_lifting
 from tensorsim.radar.presets import PRESETS
 from tensorsim.vision.lifting.metric_pose import MetricPose
@@ -301,6 +301,21 @@ def test_tables_say_what_the_cells_say(
     means = next(line for line in table if line.startswith("| **mean**"))
     assert means.split("|")[2].strip() == f"{mean:.1f}"  # the empty row is not part of it
     assert "## b with one stage replaced by the truth" in text
+
+
+def test_tables_count_what_is_left_out_and_show_the_worst_as_it_is() -> None:
+    """Somebody found in an empty room has an infinite NMSE, which is not that of equal maps."""
+    figures = dict.fromkeys(FIGURES, 1.0)
+    ghost = {name: figures | {"nmse": math.inf} for name in MAPS}
+    cells = [
+        {"row": "S1 Empty", "clip": "0", "setting": "a", "scores": {SCENE: ghost}, "pose": {}},
+        {"row": "S1 Empty", "clip": "0", "setting": "b", "scores": {}, "pose": {}},
+        {"row": "S1 Empty", "clip": "1", "setting": "b", "scores": {SCENE: ghost}, "pose": {}},
+    ]
+    text = report.markdown(cells)
+    assert "equal |" not in text
+    assert "| NMSE | inf | inf |" in text
+    assert f"Clips left out, whose motion the radar cannot follow: b, {SCENE}: 1 of 2." in text
 
 
 def test_the_picture_shows_truth_and_guess_side_by_side(
