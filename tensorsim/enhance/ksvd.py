@@ -12,13 +12,22 @@ import warnings
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_rank
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_rank,
+)
 
 
 def noise_deviation(image: Tensor) -> float:
     """Standard deviation of white noise in an image (H, W).
 
-    From the median of the finest diagonal Haar coefficients (Donoho, Johnstone, 1994).
+    From the median of the finest diagonal Haar coefficients (Donoho, Johnstone, 1994). Noise that is alike in
+    neighbouring pixels is hardly seen: in a Doppler-time map at 10 dB, whose columns overlap by 90 %, 0.0002 instead
+    of 0.03, so that :class:`KSVD` leaves such maps as they are.
     """
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     x = image[:height, :width]
@@ -128,7 +137,7 @@ class KSVD(nn.Module):
     Runs scikit-learn, so it does not script and has no gradient. Takes minutes for a map of 32 000 columns.
 
     Raises:
-        TensorsimError: scikit-learn missing; maps smaller than a patch, NaN.
+        TensorsimError: scikit-learn missing; maps smaller than a patch, empty ones, NaN or infinity.
     """
 
     def __init__(self) -> None:
@@ -140,6 +149,8 @@ class KSVD(nn.Module):
         """Maps (..., H, W) to maps of the same shape, not negative."""
         check_floating(maps, "KSVD")
         check_min_rank(maps, 2, "KSVD", "(..., H, W)")
+        check_not_empty(maps, "KSVD")
+        check_finite(maps, "KSVD")
         flat = maps.reshape(-1, maps.shape[-2], maps.shape[-1])
         return torch.stack([self._clean(one) for one in flat]).reshape(maps.shape)
 

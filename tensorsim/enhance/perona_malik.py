@@ -8,7 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_not_empty, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_positive,
+)
 
 CONDUCTANCES = ("exponential", "quadratic")
 
@@ -45,7 +52,7 @@ class PeronaMalik(nn.Module):
 
     Raises:
         TensorsimError: fewer than one iteration, a threshold that is not positive, an unknown conductance; an input
-            that is not real, has fewer than two dimensions or is empty.
+            that is not real, has fewer than two dimensions, is empty, or has NaN or infinity.
     """
 
     def __init__(self, iterations: int = 5, threshold: float = 0.1, conductance: str = "exponential") -> None:
@@ -66,6 +73,7 @@ class PeronaMalik(nn.Module):
         check_floating(images, "PeronaMalik")
         check_min_rank(images, 2, "PeronaMalik", "(..., H, W)")
         check_not_empty(images, "PeronaMalik")
+        check_finite(images, "PeronaMalik")
         x = images.reshape(-1, 1, images.shape[-2], images.shape[-1])
         for _ in range(self.reach):
             x = diffuse(x, self.threshold, self.exponential)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tensorsim.enhance.ksvd import cosine_dictionary, ksvd_denoise, noise_deviation
+from tensorsim.enhance.ksvd import KSVD, cosine_dictionary, ksvd_denoise, noise_deviation
 from tensorsim.errors import TensorsimError
 
 pytest.importorskip("sklearn")
@@ -65,3 +65,24 @@ def test_leaves_a_flat_image_alone() -> None:
 def test_refuses_bad_input(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
         ksvd_denoise(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("maps", "message"),
+    [
+        (torch.full((2, 12, 12), float("nan")), "NaN"),
+        (torch.full((2, 12, 12), float("inf")), "infinite"),
+        (torch.zeros(0, 12, 12), "got an empty tensor"),
+    ],
+)
+def test_refuses_bad_maps(maps: torch.Tensor, message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        KSVD()(maps)
+
+
+def test_noise_of_neighbouring_columns_that_are_alike_is_not_seen() -> None:
+    """That of a Doppler-time map whose frames overlap, so that it stays as it is."""
+    noise = torch.randn(120, 200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    alike = torch.nn.functional.avg_pool1d(noise, 21, 1) * 21**0.5
+    assert float(alike.std()) == pytest.approx(1.0, rel=0.1)
+    assert noise_deviation(alike) < 0.3

@@ -25,6 +25,8 @@ class TestPeronaMalik(StageTester):
         return [
             ((torch.zeros(9),), r"got shape \[9\], expected \(\.\.\., H, W\)"),
             ((torch.zeros(0, 6, 9),), "got an empty tensor"),
+            ((torch.full((6, 9), float("nan")),), "got NaN or infinite values"),
+            ((torch.full((6, 9), float("inf")),), "got NaN or infinite values"),
             ((torch.zeros(6, 9, dtype=torch.uint8),), "expected a real floating point tensor"),
         ]
 
@@ -38,9 +40,6 @@ class TestMapDenoiserOfPeronaMalik(TestPeronaMalik):
 
     def make(self) -> nn.Module:
         return MapDenoiser(PeronaMalik(iterations=3, threshold=0.2), tile=4)
-
-    def bad_inputs(self) -> list[tuple[tuple[Any, ...], str]]:
-        return [*super().bad_inputs(), ((torch.full((6, 9), float("nan")),), "got NaN or infinite values")]
 
 
 def written_out(image: np.ndarray, iterations: int, threshold: float, conductance: str) -> np.ndarray:
