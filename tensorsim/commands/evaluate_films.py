@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import sys
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,8 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateFilms(NetworkOptions):
-    """Label real films of known activity in each scene, as `tensorsim simulate` would.
+    """Label real films of known activity in each scene, as `tensorsim simulate --least-probability 0` would: every
+    film gets a label, however unsure.
 
     Prints a table and writes films.md, films.json, films.csv and a contact sheet (PNG) per film. What the networks
     find is kept in cache/.
@@ -94,11 +96,14 @@ class EvaluateFilms(NetworkOptions):
                 raise TensorsimError("--classifier: got 'none', expected weights")
             scenes[name] = Scene(PoseToDoppler.from_config(config).to(device), recognizer)
         self.out.mkdir(parents=True, exist_ok=True)
-        rows = []
+        rows, stems = [], Counter(film.path.stem for film in films)
         with torch.inference_mode():
             for film in films:
                 with collected_warnings() as messages:
-                    rows.append(self._row(film, reader, scenes, device) | {"warnings": messages})
+                    stem = film.path.stem
+                    sheet = stem if stems[stem] == 1 else f"{film.path.name}_{film.start_s:g}s"
+                    row = self._row(film, reader, scenes, device, self.out / f"{sheet}.png")
+                    rows.append(row | {"warnings": messages})
                 for message in messages:
                     print(f"tensorsim: warning: {film.path.name}: {message}", file=sys.stderr)
         text = markdown(rows)
@@ -107,7 +112,9 @@ class EvaluateFilms(NetworkOptions):
         write_csv(self.out / "films.csv", rows)
         print(text, end="")
 
-    def _row(self, film: Any, reader: Any, scenes: dict[str, Any], device: Any) -> dict[str, Any]:
+    def _row(
+        self, film: Any, reader: Any, scenes: dict[str, Any], device: Any, sheet: Path
+    ) -> dict[str, Any]:
         """Everything of one film; writes its contact sheet."""
         from tensorsim import plot, results
         from tensorsim.evaluation.film_sheet import contact_sheet
@@ -124,7 +131,7 @@ class EvaluateFilms(NetworkOptions):
             axes = None if maps is None else results.axes_of(how.stage, maps)
             shown.append((verdict, maps, axes))
         figure = contact_sheet(film, video, found, reader.stage.keypoint_threshold, shown)
-        plot.save_figure(figure, self.out / f"{film.path.stem}.png")
+        plot.save_figure(figure, sheet)
         verdicts = [verdict for verdict, _, _ in shown]
         radar = next(iter(scenes.values())).stage.simulator.radar
         people = followed(pose, video.fps, radar)
@@ -145,11 +152,24 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
     """One line per film and scene."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["file", "accept", "scene", "label", "probability", "right", "followed_s", "error"])
+        writer.writerow(
+            [
+                "file",
+                "start_s",
+                "end_s",
+                "accept",
+                "scene",
+                "label",
+                "probability",
+                "right",
+                "followed_s",
+                "error",
+            ]
+        )
         for row in rows:
             longest = max((person["followed_s"] for person in row["people"]), default=0.0)
             for verdict in row["scenes"].values():
                 writer.writerow(
-                    [row["file"], "; ".join(row["accept"]), verdict["scene"], verdict["label"],
-                     verdict["probability"], verdict["right"], longest, verdict["error"]]
+                    [row["file"], row["start_s"], row["end_s"], "; ".join(row["accept"]), verdict["scene"],
+                     verdict["label"], verdict["probability"], verdict["right"], longest, verdict["error"]]
                 )  # fmt: skip

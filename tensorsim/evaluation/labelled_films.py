@@ -7,6 +7,7 @@ happens, and the activities that count as right (``accept``).
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -88,7 +89,8 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
     """The films that ``labels.json`` of a folder lists.
 
     Raises:
-        TensorsimError: no such file, not such a list, an unknown activity, a film that is not there.
+        TensorsimError: no such file, not such a list, no films, an unknown activity or none, seconds that cannot be, a
+            film that is not there.
     """
     table = folder / "labels.json"
     try:
@@ -106,7 +108,18 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
             f"{table}: got {type(error).__name__} ({error}), expected a list of objects with file, start_s, end_s "
             "and accept"
         ) from None
+    if not films:
+        raise TensorsimError(f"{table}: got no films, expected at least one")
     for film in films:
+        if not 0 <= film.start_s < film.end_s:
+            raise TensorsimError(
+                f"{table}: {film.path.name}: got the seconds {film.start_s:g} to {film.end_s:g}, expected a start from "
+                "0 on and a later end"
+            )
+        if not film.accept:
+            raise TensorsimError(
+                f"{table}: {film.path.name}: got no activity to accept, expected at least one"
+            )
         for label in film.accept:
             if label not in ACTIVITIES:
                 raise TensorsimError(
@@ -282,6 +295,8 @@ def film_row(
     """What ``films.json`` says of a film."""
     return {
         "file": film.path.name,
+        "start_s": film.start_s,
+        "end_s": film.end_s if math.isfinite(film.end_s) else None,
         "seconds": round(frames / fps, 2),
         "accept": list(film.accept),
         "camera": camera_row(found.camera),
@@ -296,11 +311,13 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     scenes = list(rows[0]["scenes"])
     heads = ["film", "right is", *scenes, "followed"]
     lines = [heads, ["---"] * len(heads)]
+    names = Counter(row["file"] for row in rows)
     for row in rows:
+        part = f", from {row['start_s']:g} s" if names[row["file"]] > 1 else ""
         followed_s = ", ".join(f"{p['followed_s']:.1f}" for p in row["people"]) or "nobody"
         verdicts = [_said(row["scenes"][scene]) for scene in scenes]
         right = " or ".join(name.split()[0] for name in row["accept"])
-        lines.append([row["file"], right, *verdicts, f"{followed_s} of {row['seconds']:.1f} s"])
+        lines.append([row["file"] + part, right, *verdicts, f"{followed_s} of {row['seconds']:.1f} s"])
     counts = [f"**{sum(row['scenes'][scene]['right'] for row in rows)} of {len(rows)}**" for scene in scenes]
     lines.append(["right", "", *counts, ""])
     if "variants" in rows[0]:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tensorsim.exceptions import TensorsimError
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -19,11 +21,18 @@ def bars(groups: Mapping[str, Mapping[str, tuple[float, float]]], label: str, ti
             the order given, the first one on top.
         label: of the axis, with its unit.
         title: of the figure.
+
+    Raises:
+        TensorsimError: no values.
     """
     from tensorsim.plot.figure import new_figure
 
     names = list(groups)
     kinds = list(dict.fromkeys(kind for row in groups.values() for kind in row))
+    if not kinds:
+        raise TensorsimError(
+            f"bars: got no values for {', '.join(names) or 'any name'}, expected at least one"
+        )
     figure = new_figure(8.0, 1.2 + 0.32 * len(names) * max(1, len(kinds)))
     axes = figure.add_subplot()
     height = 0.8 / len(kinds)

@@ -81,6 +81,8 @@ class InputsConfig:
 
     def __post_init__(self) -> None:
         check_trainings(self.networks, self.scenes, self.seeds)
+        if not self.inputs:
+            raise TensorsimError("inputs: got none, expected at least one")
         for name in self.inputs:
             if name not in INPUTS:
                 raise TensorsimError(f"inputs: got {name!r}, expected one of {', '.join(INPUTS)}")

@@ -70,7 +70,8 @@ class RealConfig:
         for name in self.networks:
             find_classifier(name)
         for what, count, least in (
-            ("clips", self.clips, 1), ("steps", self.steps, 1), ("seeds", self.seeds, 1), ("groups", self.groups, 5),
+            ("networks", len(self.networks), 1), ("clips", self.clips, 1), ("steps", self.steps, 1),
+            ("seeds", self.seeds, 1), ("groups", self.groups, 5),
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
             if count < least:

@@ -65,6 +65,8 @@ class VideoConfig:
         for scene in self.scenes:
             if scene not in SCENES:
                 raise TensorsimError(f"scenes: got {scene!r}, expected one of {', '.join(SCENES)}")
+        if not self.scenes:
+            raise TensorsimError("scenes: got none, expected at least one")
         if self.clips < 1 or not 0.5 <= self.length_s <= 60:
             raise TensorsimError(
                 f"clips, length_s: got {self.clips} and {self.length_s}, expected at least 1 and from 0.5 to 60 s"

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,21 @@ def test_the_command_labels_films_and_runs_the_networks_once(
     assert other["scenes"] != walk["scenes"]
 
 
+def test_parts_of_one_film_have_a_sheet_each(arguments: list[str], data: Path, tmp_path: Path) -> None:
+    parts = [
+        {"file": "walk.avi", "start_s": start_s, "end_s": start_s + 1, "accept": [ACTIVITIES[7]]}
+        for start_s in (0, 0.5)
+    ]
+    (data / "labels.json").write_text(json.dumps(parts))
+    cli.main(arguments)
+    out = tmp_path / "out"
+    assert sorted(path.name for path in out.glob("*.png")) == ["walk.avi_0.5s.png", "walk.avi_0s.png"]
+    with (out / "films.csv").open() as file:
+        lines = [(line["start_s"], line["end_s"]) for line in csv.DictReader(file)]
+    assert lines == [("0.0", "1.0"), ("0.5", "1.5")]
+    assert "| walk.avi, from 0.5 s |" in (out / "films.md").read_text()
+
+
 def test_variants_of_films_are_labelled_without_the_networks(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -221,7 +237,17 @@ def test_how_the_camera_moves_is_kept_with_what_the_networks_found(tmp_path: Pat
     [
         ([{"file": "walk.avi", "start_s": 0}], r"KeyError \('end_s'\), expected a list"),
         ([{"file": "walk.avi", "start_s": 0, "end_s": 1, "accept": ["Walk"]}], "got 'Walk', expected one of"),
-        ([{"file": "run.avi", "start_s": 0, "end_s": 1, "accept": []}], "run.avi: no such file"),
+        ([{"file": "run.avi", "start_s": 0, "end_s": 1, "accept": [ACTIVITIES[7]]}], "run.avi: no such file"),
+        ([], "got no films"),
+        (
+            [{"file": "walk.avi", "start_s": 0, "end_s": 1, "accept": []}],
+            "walk.avi: got no activity to accept",
+        ),
+        (
+            [{"file": "walk.avi", "start_s": math.nan, "end_s": 1, "accept": [ACTIVITIES[7]]}],
+            "seconds nan to 1",
+        ),
+        ([{"file": "walk.avi", "start_s": 2, "end_s": 1, "accept": [ACTIVITIES[7]]}], "seconds 2 to 1"),
     ],
 )
 def test_bad_labels_are_refused(data: Path, rows: list[dict[str, Any]], why: str) -> None:

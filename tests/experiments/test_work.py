@@ -87,6 +87,9 @@ def test_settings_of_file_and_options(tmp_path: Path) -> None:
         ("denoiser-ablation", {"clips": 0}, "clips: got 0"),
         ("video-ablation", {"activities": ("flying",)}, "flying"),
         ("video-ablation", {"length_s": 0.1}, "from 0.5 to 60 s"),
+        ("real", {"networks": ()}, "networks: got 0, expected at least 1"),
+        ("inputs", {"inputs": ()}, "inputs: got none"),
+        ("video-ablation", {"scenes": ()}, "scenes: got none"),
         ("real", {"size": 40}, "size: got 40, expected a multiple of 16"),
     ):
         with pytest.raises(TensorsimError, match=message):
@@ -136,6 +139,8 @@ def test_figures_of_every_kind(tmp_path: Path) -> None:
     from tensorsim.experiments import figures
     from tensorsim.plot import save_figure
 
+    with pytest.raises(TensorsimError, match="bars: got no values for a, expected at least one"):
+        figures.bars({"a": {}}, "x", "t")
     matrices = {"a": np.eye(3, dtype=int), "b": np.ones((3, 3), dtype=int)}
     drawn = [
         figures.lines({"n": [1.0, 2.0]}, [50.0, 10.0], "x", "y", "t"),
