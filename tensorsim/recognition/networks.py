@@ -26,7 +26,7 @@ class Classifier:
         title: what tables call it.
         make: (classes, channels) -> network; with ``size`` if ``sized``.
         size: height and width of the pictures that its authors give it.
-        origin: "exact" if all layers are published, "reconstruction" otherwise.
+        origin: "exact" if all layers are published, "reconstruction" otherwise; and what is left out.
         sized: whether the size of the pictures is part of the network.
     """
 
@@ -46,7 +46,7 @@ class Classifier:
 #: By name; those of the comparison in RadHARSimulator V2 first.
 CLASSIFIERS: dict[str, Classifier] = {
     "spnet": Classifier("SPNet", SPNet, 224, "exact, with ReLU"),
-    "adfe-net": Classifier("TWR-ADFE-Net", ADFENet, 224, "exact reproduction"),
+    "adfe-net": Classifier("TWR-ADFE-Net", ADFENet, 224, "exact, without its enhanced map"),
     "mrw-cn": Classifier("MRW-CN", MRWCN, 224, "reconstruction"),
     "mc-gclu": Classifier("MC-GCLU", MCGCLU, 224, "reconstruction"),
     "diat-radharnet": Classifier("DIAT-RadHARNet", DIATRadHARNet, 224, "reconstruction"),

@@ -131,6 +131,8 @@ def test_accuracy_and_cost_of_a_network() -> None:
     assert accuracy({"confusion": {"50": counts.tolist()}}, 50.0) == 75.0
     layer = torch.nn.Conv2d(1, 4, 3, padding=1)
     assert multiply_adds(layer, 1, 10) == pytest.approx(4 * 9 * 100 / 1e6)
+    rows = torch.nn.Sequential(torch.nn.Flatten(1, 2), torch.nn.LSTM(10, 7, batch_first=True))
+    assert multiply_adds(rows, 1, 10) == pytest.approx(10 * 4 * 7 * (10 + 7) / 1e6)
 
 
 def test_figures_of_every_kind(tmp_path: Path) -> None:
