@@ -6,12 +6,11 @@ validation loss. Beyond it, accuracy is counted on people who took no part in ei
 """
 
 import io
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
@@ -81,7 +80,12 @@ class Trial:
     @property
     def name(self) -> str:
         """What its folder is called."""
-        return f"{self.network}-{self.scene}-{self.inputs}-seed{self.seed}-{digest(self)}"
+        return f"{self.network}-{self.scene}-{self.inputs}-seed{self.seed}-{self.training}"
+
+    @property
+    def training(self) -> str:
+        """Digest of what the training depends on: all but the clips of the test."""
+        return digest(replace(self, test_clips=0))
 
     def pictures(self, work: Work) -> PictureSet:
         """The pictures that it needs."""
@@ -101,7 +105,7 @@ class PaperRecipe(Recipe):
         self.training, self.validation, self.seed = training, validation, trial.seed
         net.get_buffer("mean").copy_(training[0].mean((0, 2, 3)))
         stated = {"network": type(net).__name__, "size": str(trial.size), "inputs": trial.inputs}
-        super().__init__(net, {"trial": digest(trial)}, stated)
+        super().__init__(net, {"trial": trial.training}, stated)
 
     def sample(self, index: int) -> dict[str, Any]:
         """Picture and label; the clips in a new order in each epoch."""
@@ -149,7 +153,8 @@ def run_trial(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, 
     """Train (or go on), test at every ratio in dB, and keep the result; what is kept is not computed again.
 
     Returns:
-        ``validation`` (accuracy), ``training_s``, ``epoch`` of the weights, and ``confusion``: by ratio, the counts.
+        ``validation`` (accuracy), ``training_s`` (processor time), ``epoch`` of the weights, and ``confusion``: by
+        ratio, the counts.
     """
     folder = work.cache / "trials" / trial.name
     path = folder / "result.json"
@@ -159,16 +164,17 @@ def run_trial(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, 
         result = _train(trial, folder, work)
         write_result(path, result)
         (folder / "last.pt").unlink(missing_ok=True)
-    missing = [ratio for ratio in ratios if f"{ratio:g}" not in result["confusion"]]
+    counts = result["confusion"].setdefault(str(trial.test_clips), {})
+    missing = [ratio for ratio in ratios if f"{ratio:g}" not in counts]
     if missing:
         net = trial.network_module().eval()
         load_strict(net, load_state_dict(weights), weights)
         people = range(trial.clips, trial.clips + trial.test_clips)
         for ratio in missing:
             pictures, labels = trial.pictures(work).get(people, trial.inputs, ratio)
-            result["confusion"][f"{ratio:g}"] = confusion(logits_of(net, pictures), labels).tolist()
+            counts[f"{ratio:g}"] = confusion(logits_of(net, pictures), labels).tolist()
         write_result(path, result)
-    return result
+    return result | {"confusion": counts}
 
 
 def _train(trial: Trial, folder: Path, work: Work) -> dict[str, Any]:
@@ -195,11 +201,10 @@ def _train(trial: Trial, folder: Path, work: Work) -> dict[str, Any]:
         quiet=True,
         events=False,
     )
-    began = time.process_time()
     figures = fit(recipe, config)
     return {
         "validation": figures["accuracy"],
-        "training_s": time.process_time() - began,
+        "training_s": recipe.processor_s,
         "epoch": round(figures["step"] / epoch),
         "confusion": {},
     }
@@ -256,5 +261,6 @@ def _kept(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, Any]
     """The result of a trial if all of it is there."""
     path = work.cache / "trials" / trial.name / "result.json"
     result = read_result(path) if path.is_file() else {}
-    complete = {f"{ratio:g}" for ratio in ratios} <= set(result.get("confusion", ()))
-    return result if complete else None
+    counts = result.get("confusion", {}).get(str(trial.test_clips), {})
+    complete = {f"{ratio:g}" for ratio in ratios} <= set(counts)
+    return result | {"confusion": counts} if complete else None

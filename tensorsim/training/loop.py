@@ -37,11 +37,13 @@ class Recipe:
         net: the network to train.
         settings: everything that must be equal for a run to go on from a checkpoint; the name of the recipe is added.
         metadata: strings stored in the weight file, for those who load it.
+        processor_s: processor time of the training so far, as far as a checkpoint has it.
     """
 
     net: nn.Module
     settings: dict[str, Any]
     metadata: dict[str, str]
+    processor_s: float = 0.0
 
     def __init__(self, net: nn.Module, settings: dict[str, Any], metadata: dict[str, str]) -> None:
         self.net = net
@@ -216,6 +218,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     first, best = 0, {"score": float("-inf"), "step": -1.0}
     if last.is_file():
         first, best = _resume(last, recipe, config, averaged, optimiser)
+    started = time.process_time() - recipe.processor_s
     wrapped: nn.Module = recipe.net
     if processes > 1:
         ids = [device.index] if device.type == "cuda" else None
@@ -264,6 +267,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
             if processes > 1:
                 distributed.barrier()
         if log and (done % config.checkpoint_every == 0 or done == config.steps):
+            recipe.processor_s = time.process_time() - started
             _save(last, done, best, recipe, config, averaged, optimiser)
     bar.close()
     if log:
@@ -353,6 +357,7 @@ def _save(
         "best": best,
         "loop": config.fingerprint(),
         "recipe": recipe.settings,
+        "processor_s": recipe.processor_s,
         "net": recipe.net.state_dict(),
         "averaged": averaged.state_dict(),
         "optimiser": optimiser.state_dict(),
@@ -404,6 +409,7 @@ def _resume(
             raise TensorsimError(
                 f"{path}: it belongs to another run ({reason}); choose another folder, or the same settings"
             )
+    recipe.processor_s = float(state.get("processor_s", 0.0))
     recipe.net.load_state_dict(state["net"])
     averaged.load_state_dict(state["averaged"])
     optimiser.load_state_dict(state["optimiser"])
