@@ -61,9 +61,12 @@ class EvaluateClassifier:
             self._on_films(labelled_poses(self.poses))
 
     def _on_maps(self) -> None:
+        import torch
+
         from tensorsim import plot
         from tensorsim.config import ACTIVITIES
-        from tensorsim.training.classifier import clips_of, confusion, load_classifier, logits_of
+        from tensorsim.recognition.confusion import confusion
+        from tensorsim.training.classifier import clips_of, load_classifier, logits_of
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         assert self.maps is not None
@@ -75,9 +78,9 @@ class EvaluateClassifier:
         matrices = {}
         for scene in self.scenes:
             clips = clips_of(store, (scene,), self.people, validation=True if self.held_out else None)
-            row = []
+            row, labels = [], torch.tensor([clip.activity for clip in clips])
             for ratio in self.snr:
-                counts = confusion(logits_of(network, store, clips, (ratio, ratio), size), clips)
+                counts = confusion(logits_of(network, store, clips, (ratio, ratio), size), labels)
                 row.append(float(counts.diagonal().sum()) / len(clips))
                 matrices[scene, ratio] = counts.numpy()
             print(f"{scene:14s}" + "".join(f"{100 * a:9.1f} %" for a in row) + f"{len(clips):8d}", flush=True)

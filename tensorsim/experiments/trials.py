@@ -24,6 +24,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.experiments.pictures import INPUTS, SNR_DB, PictureSet
 from tensorsim.experiments.work import Work, digest, read_result, write_result
+from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.training.classifier import held_out
 from tensorsim.training.loop import Batch, LoopConfig, Recipe, fit
@@ -141,12 +142,6 @@ class PaperRecipe(Recipe):
 def logits_of(net: nn.Module, pictures: Tensor, batch: int = 64) -> Tensor:
     """Logits (N, classes) of pictures (N, C, H, W)."""
     return torch.cat([net(part) for part in pictures.split(batch)])
-
-
-def confusion(logits: Tensor, labels: Tensor) -> Tensor:
-    """Counts (classes, classes): row the true activity, column the predicted one."""
-    classes = logits.shape[1]
-    return torch.bincount(labels * classes + logits.argmax(1), minlength=classes**2).reshape(classes, classes)
 
 
 def run_trial(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, Any]:

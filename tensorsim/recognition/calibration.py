@@ -1,5 +1,7 @@
 """Calibration of probabilities: the temperature that fits held-out logits, and how far confidence is from accuracy."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -15,6 +17,11 @@ def _check(logits: Tensor, labels: Tensor) -> None:
             "with N at least 1"
         )
     check_finite(logits, "logits")
+    classes = logits.shape[1]
+    if labels.dtype != torch.int64 or bool(((labels < 0) | (labels >= classes)).any()):
+        raise TensorsimError(
+            f"labels: got {labels.dtype} from {labels.min()} to {labels.max()}, expected int64 from 0 to {classes - 1}"
+        )
 
 
 def fit_temperature(logits: Tensor, labels: Tensor) -> float:
@@ -29,7 +36,7 @@ def fit_temperature(logits: Tensor, labels: Tensor) -> float:
         labels: (N,) int64.
 
     Raises:
-        TensorsimError: shapes that do not go together, no samples, or logits that are not finite.
+        TensorsimError: shapes that do not go together, no samples, logits that are not finite, or labels out of range.
     """
     _check(logits, labels)
     logits = logits.detach().double()
@@ -53,22 +60,48 @@ def fit_temperature(logits: Tensor, labels: Tensor) -> float:
     return float(torch.tensor((low + high) / 2).double().exp())
 
 
-def expected_calibration_error(probabilities: Tensor, labels: Tensor, bins: int = 10) -> float:
-    """Mean distance of confidence from accuracy, over bins of equal width of the confidence (Guo et al., 2017).
+class Reliability(NamedTuple):
+    """Bins of equal width of the confidence, from 0 to 1; empty ones are 0.
+
+    Attributes:
+        samples: (bins,) their number.
+        confidence, accuracy: (bins,) float64, means over them.
+    """
+
+    samples: Tensor
+    confidence: Tensor
+    accuracy: Tensor
+
+
+def reliability(probabilities: Tensor, labels: Tensor, bins: int = 10) -> Reliability:
+    """How often the most probable class is right, by how probable it is (Guo et al., 2017).
 
     Args:
-        probabilities: (N, classes).
+        probabilities: (N, classes), from 0 to 1.
         labels: (N,) int64.
         bins: their number.
 
     Raises:
-        TensorsimError: shapes that do not go together, no samples, or fewer than one bin.
+        TensorsimError: shapes that do not go together, no samples, probabilities or labels out of their range, or fewer
+            than one bin.
     """
     _check(probabilities, labels)
     if bins < 1:
         raise TensorsimError(f"bins: got {bins}, expected at least 1")
-    confidence, best = probabilities.double().max(-1)
-    right = (best == labels).double()
+    if bool(((probabilities < 0) | (probabilities > 1 + 1e-5)).any()):
+        raise TensorsimError(
+            f"probabilities: got {float(probabilities.min()):.4g} to {float(probabilities.max()):.4g}, expected 0 to 1"
+        )
+    confidence, best = probabilities.detach().double().max(-1)
     place = (confidence * bins).long().clamp(max=bins - 1)
-    gap = torch.zeros(bins, dtype=torch.float64).index_add_(0, place, confidence - right)
-    return float(gap.abs().sum() / len(labels))
+    count = torch.bincount(place, minlength=bins)
+    sums = torch.zeros(2, bins, dtype=torch.float64)
+    sums.index_add_(1, place, torch.stack([confidence, (best == labels).double()]))
+    means = sums / count.clamp(min=1)
+    return Reliability(count, means[0], means[1])
+
+
+def expected_calibration_error(probabilities: Tensor, labels: Tensor, bins: int = 10) -> float:
+    """Mean distance of confidence from accuracy over the bins of :func:`reliability`, with its arguments and errors."""
+    found = reliability(probabilities, labels, bins)
+    return float((found.samples * (found.confidence - found.accuracy).abs()).sum() / len(labels))

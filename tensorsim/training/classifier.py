@@ -266,12 +266,3 @@ def load_classifier(path: Path) -> Classifier:
         )
     network = kinds[stated["network"]].from_pretrained(path)  # type: ignore[attr-defined]
     return Classifier(network, int(stated["size"]))
-
-
-def confusion(logits: Tensor, clips: Sequence[Clip]) -> Tensor:
-    """Counts (classes, classes): row the true activity, column the predicted one."""
-    labels = torch.tensor([clip.activity for clip in clips])
-    classes = logits.shape[-1]
-    return torch.bincount(labels * classes + logits.argmax(-1), minlength=classes**2).reshape(
-        classes, classes
-    )

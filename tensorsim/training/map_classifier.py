@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from tensorsim.data.sets.reading import MapDataset, collate_maps
 from tensorsim.data.sets.transforms import RandomShift, SpecAugment
 from tensorsim.errors import TensorsimError
+from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.training.classifier import LEARNING_RATE, NETWORKS
 from tensorsim.training.loop import Batch, Recipe
@@ -172,14 +173,6 @@ def logits_of(net: nn.Module, maps: MapDataset, batch: int = 64) -> Tensor:
     return torch.cat([net(part["map"].to(device)).float().cpu() for part in loader])
 
 
-def confusion_table(logits: Tensor, maps: MapDataset) -> Tensor:
-    """Counts (classes, classes): row the true class, column the predicted one."""
-    classes = len(maps.labels)
-    return torch.bincount(maps.targets * classes + logits.argmax(-1), minlength=classes**2).view(
-        classes, classes
-    )
-
-
 def confusion_markdown(table: Tensor, labels: Sequence[str]) -> str:
     """A confusion matrix as a table: rows are true, columns predicted."""
     lines = ["| true \\ predicted | " + " | ".join(labels) + " |", "|---|" + "---|" * len(labels)]
@@ -203,7 +196,7 @@ def write_outcome(recipe: MapRecipe, best: Path) -> None:
     load_strict(net, load_state_dict(best), best)
     net = net.cpu().eval()
     maps = recipe.validation
-    table = confusion_markdown(confusion_table(logits_of(net, maps), maps), list(recipe.labels))
+    table = confusion_markdown(confusion(logits_of(net, maps), maps.targets), list(recipe.labels))
     with complete_file(folder / "confusion.md") as scratch:
         scratch.write_text(f"Part validation, {len(maps)} samples.\n\n{table}", encoding="utf-8")
     print(table, end="")

@@ -18,6 +18,7 @@ from tensorsim.evaluation.measured.sets import SETS
 from tensorsim.evaluation.measured.training import fit_pictures, predict, shift
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 from tensorsim.recognition import DIATRadHARNet
+from tensorsim.recognition.confusion import confusion
 
 
 def write_folder(folder: Path, clips: int, seed: int) -> Path:
@@ -305,11 +306,7 @@ def test_figures_by_hand():
     assert report.accuracy(logits, labels) == 0.75
     # Among classes 0 and 1 all three are right.
     assert report.subset_accuracy(logits, labels, [0, 1]) == 1.0
-    assert report.confusion(logits, labels).tolist() == [[1, 0, 0], [0, 1, 1], [0, 0, 1]]
-    sure = torch.tensor([[50.0, 0.0]]).repeat(10, 1)
-    error, rows = report.calibration(sure, torch.tensor([0] * 7 + [1] * 3))
-    assert error == pytest.approx(0.3, abs=1e-6)
-    assert rows[-1] == (10, pytest.approx(1.0), pytest.approx(0.7))
+    assert confusion(logits, labels).tolist() == [[1, 0, 0], [0, 1, 1], [0, 0, 1]]
 
 
 def test_lda_separates_what_is_linear():

@@ -14,11 +14,11 @@ from tensorsim.data.sets.reading import MapDataset
 from tensorsim.data.sets.recipe import RadarView
 from tensorsim.errors import TensorsimError
 from tensorsim.recognition import ActivityRecognizer, SPGNet
+from tensorsim.recognition.confusion import confusion
 from tensorsim.training.map_classifier import (
     MapRecipe,
     PictureToLabel,
     confusion_markdown,
-    confusion_table,
     logits_of,
     transfer,
 )
@@ -70,7 +70,7 @@ def test_weights_for_other_classes_keep_all_but_the_last_layer() -> None:
 def test_confusion_counts_true_by_row(folder: Path) -> None:
     maps = MapDataset(folder)
     logits = torch.nn.functional.one_hot(torch.tensor([0] * len(maps)), 2).float()
-    table = confusion_table(logits, maps)
+    table = confusion(logits, maps.targets)
     assert table.tolist() == [[2, 0], [2, 0]]
     assert "| S5 Sitting Down | 2 | 0 |" in confusion_markdown(table, maps.labels)
 

@@ -10,9 +10,8 @@ from torch import Tensor
 from tensorsim.evaluation.measured.run import SETTINGS
 from tensorsim.evaluation.measured.sets import MeasuredSet
 from tensorsim.files import complete_file
-
-#: Bins of the confidence for the calibration error.
-BINS = 10
+from tensorsim.recognition.calibration import expected_calibration_error, reliability
+from tensorsim.recognition.confusion import confusion
 
 
 def accuracy(logits: Tensor, labels: Tensor) -> float:
@@ -26,27 +25,6 @@ def subset_accuracy(logits: Tensor, labels: Tensor, subset: list[int]) -> float:
     among = torch.full_like(logits, float("-inf"))
     among[:, subset] = logits[:, subset]
     return accuracy(among[of], labels[of])
-
-
-def confusion(logits: Tensor, labels: Tensor) -> Tensor:
-    """Counts (classes, classes): row the true class, column the one found."""
-    classes = logits.shape[-1]
-    return torch.bincount(labels * classes + logits.argmax(-1), minlength=classes**2).view(classes, classes)
-
-
-def calibration(logits: Tensor, labels: Tensor) -> tuple[float, list[tuple[int, float, float]]]:
-    """Expected calibration error, and for each bin of confidence: clips, mean confidence, accuracy."""
-    confidence, found = logits.softmax(-1).max(-1)
-    right = (found == labels).double()
-    place = (confidence * BINS).long().clamp(max=BINS - 1)
-    rows, error = [], 0.0
-    for k in range(BINS):
-        here = place == k
-        count = int(here.sum())
-        mean, share = (float(x[here].mean()) if count else 0.0 for x in (confidence.double(), right))
-        rows.append((count, mean, share))
-        error += count / len(labels) * abs(mean - share)
-    return error, rows
 
 
 def figures(measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> dict[str, Any]:
@@ -91,10 +69,12 @@ def write(out: Path, name: str, measured: MeasuredSet, logits: dict[str, Tensor]
             writer.writerow(["true \\ found", *measured.classes])
             for cls, counts in zip(measured.classes, confusion(values, labels).tolist(), strict=True):
                 writer.writerow([cls, *counts])
-        error, bins = calibration(values, labels)
+        probabilities = values.softmax(-1)
+        error = expected_calibration_error(probabilities, labels)
+        bins = torch.stack(reliability(probabilities, labels), dim=-1).tolist()
         if setting == "simulation_only":
             first_error = error
-        rows += [[setting, k / BINS, n, f"{c:.4f}", f"{a:.4f}"] for k, (n, c, a) in enumerate(bins)]
+        rows += [[setting, k / len(bins), int(n), f"{c:.4f}", f"{a:.4f}"] for k, (n, c, a) in enumerate(bins)]
         rows.append([setting, "expected calibration error", len(labels), f"{error:.4f}", ""])
     with (
         complete_file(out / f"calibration_{name}.csv") as path,
