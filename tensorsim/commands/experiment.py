@@ -62,6 +62,8 @@ class RunExperiment:
     """Length of a clip in seconds."""
     seeds: int | None = None
     """Trainings with different weights."""
+    film_seeds: int | None = None
+    """Trainings with different weights on the maps of everyday motion."""
     snr_db: tuple[float, ...] | None = None
     """Signal-to-noise ratios of the tests."""
     seed: int | None = None
@@ -104,7 +106,7 @@ class RunExperiment:
     def _settings(self) -> dict[str, Any]:
         names = (
             "networks", "scenes", "inputs", "denoisers", "activities", "data", "films", "maps", "groups", "clips",
-            "test_clips", "size", "epochs", "steps", "film_steps", "length_s", "seeds", "snr_db", "seed",
-            "settings",
+            "test_clips", "size", "epochs", "steps", "film_steps", "length_s", "seeds", "film_seeds",
+            "snr_db", "seed", "settings",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}

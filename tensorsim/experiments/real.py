@@ -49,6 +49,7 @@ class RealConfig:
         size: height and width of the pictures.
         steps: batches of 64 of each training.
         seeds: trainings with different weights and order.
+        film_seeds: the same for films.
         seed: of the simulated clips.
     """
 
@@ -64,6 +65,7 @@ class RealConfig:
     size: int = 64
     steps: int = 600
     seeds: int = 3
+    film_seeds: int = 3
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -71,7 +73,7 @@ class RealConfig:
             find_classifier(name)
         for what, count, least in (
             ("networks", len(self.networks), 1), ("clips", self.clips, 1), ("steps", self.steps, 1),
-            ("seeds", self.seeds, 1), ("groups", self.groups, 5),
+            ("seeds", self.seeds, 1), ("film_seeds", self.film_seeds, 1), ("groups", self.groups, 5),
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
             if count < least:
@@ -161,7 +163,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     maps = Path(config.maps) if config.maps else work.cache / f"everyday-maps-{filmed}-{true}"
     made = EverydaySettings(filmed=filmed, true=true)
     training = EverydayTraining(maps, config.groups, config.size, config.film_steps, made, work.quiet)
-    jobs = [(name, seed) for seed in range(config.seeds) for name in config.networks]
+    jobs = [(name, seed) for seed in range(config.film_seeds) for name in config.networks]
     results: dict[str, list[dict[str, float]]] = {name: [] for name in config.networks}
     for name, seed in tqdm(jobs, desc="films", unit="training", disable=work.quiet):
         settings = {
@@ -176,8 +178,8 @@ def _on_films(config: RealConfig, work: Work) -> Report:
     columns = ["network", *(f"{scene} {kind} %" for kind in ("clips", "films") for scene in SCENES)]
     notes = [
         f"Films: trained on {config.groups} groups of simulated maps of everyday motion in {config.size}x{config.size} "
-        f"pixels, {config.film_steps} batches of 64 (AdamW, cosine), {counted(config.seeds, 'training')} each. `clips` "
-        f"are held-out ones of the same kind, as the pipeline finds them in films, `films` the {len(films)} of "
+        f"pixels, {config.film_steps} batches of 64 (AdamW, cosine), {counted(config.film_seeds, 'training')} each. "
+        f"`clips` are held-out ones of the same kind, as the pipeline finds them in films, `films` the {len(films)} of "
         f"{config.films}: people found by the shipped networks, camera estimated. One film is {100 / len(films):.0f} "
         "points; chance is 8 %."
     ]
@@ -229,5 +231,5 @@ def quick_real() -> RealConfig:
     """Two small networks on a few clips and three films; the folders of sets or films have still to be given."""
     return RealConfig(
         groups=5, group_clips=(1, 1), film_count=3, film_steps=20, networks=("ccln", "diat-radharnet"), clips=4,
-        size=32, steps=4, seeds=1,
+        size=32, steps=4, seeds=1, film_seeds=1,
     )  # fmt: skip

@@ -279,6 +279,9 @@ def test_trainings_on_other_maps_in_the_same_folder_are_not_taken(
     save_file(parts | {"pictures": 255 - parts["pictures"]}, changed)
     real.real_report(config, Work(tmp_path / "work", quiet=True))
     assert len(trained) == 2
+    report = real.real_report(replace(config, seeds=5, film_seeds=2), Work(tmp_path / "work", quiet=True))
+    assert len(trained) == 3, "one more"
+    assert "2 trainings each" in report.notes[0]
 
 
 @pytest.mark.slow

@@ -87,6 +87,7 @@ def test_settings_of_file_and_options(tmp_path: Path) -> None:
         ("denoiser-ablation", {"clips": 0}, "clips: got 0"),
         ("video-ablation", {"activities": ("flying",)}, "flying"),
         ("video-ablation", {"length_s": 0.1}, "from 0.5 to 60 s"),
+        ("real", {"film_seeds": 0}, "film_seeds: got 0, expected at least 1"),
         ("real", {"networks": ()}, "networks: got 0, expected at least 1"),
         ("inputs", {"inputs": ()}, "inputs: got none"),
         ("video-ablation", {"scenes": ()}, "scenes: got none"),
