@@ -41,7 +41,9 @@ _DISPLAY_HZ = 256.0
 
 
 def simulate_pair(scene: str, activity: int, seed: int, snr_db: float) -> tuple[RadarMaps, RadarMaps]:
-    """Maps of one clip at ``snr_db``, and free of noise; ``seed`` determines person and noise."""
+    """Maps of one clip at ``snr_db``, and at :data:`CLEAN_DB` with the same noise, only weaker; ``seed`` determines
+    person and noise.
+    """
     radar, wall = PRESETS[scene].radar, PRESETS[scene].wall
     people = one_person_many_ways(1, torch.Generator().manual_seed(seed))
     motion = ActivityGenerator().generate(activity, people=people, rate_hz=_MOTION_HZ)
