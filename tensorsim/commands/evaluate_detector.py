@@ -16,6 +16,7 @@ class EvaluateDetector:
         data: folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out pictures are looked at.
         coco: folder with one COCO annotation file (*.json) and its pictures in images/.
         films: videos to follow people in.
+        quiet: no progress bars.
     """
 
     weights: Path | None = None
@@ -23,10 +24,12 @@ class EvaluateDetector:
     data: Path | None = None
     coco: Path | None = None
     films: tuple[Path, ...] = ()
+    quiet: bool = False
 
     def run(self) -> None:
         """Do it."""
         import torch
+        from tqdm import tqdm
 
         from tensorsim.pipeline.networks import pretrained_detector
         from tensorsim.training.detector_metrics import compare_tracks, measure, tracks_of_film
@@ -50,11 +53,13 @@ class EvaluateDetector:
         with torch.inference_mode():
             for name, samples in groups.items():
                 for source, detector in detectors:
-                    figures = measure(detector, samples)
+                    bar = tqdm(samples, desc=f"{name}, {source}", unit="picture", disable=self.quiet)
+                    figures = measure(detector, bar)
                     told = ", ".join(f"{key} {value:.3g}" for key, value in figures.items())
                     print(f"{name}, {source}: {told}")
             for film in self.films:
-                tracks = [tracks_of_film(detector, film) for _, detector in detectors]
+                bar = tqdm(detectors, desc=film.name, unit="detector", disable=self.quiet)
+                tracks = [tracks_of_film(detector, film) for _, detector in bar]
                 followed = compare_tracks(*tracks)
                 share = followed.shared / max(followed.reference_frames, 1)
                 print(

@@ -38,6 +38,8 @@ class EvaluateLifter:
         if self.films is not None and not self.films.is_dir():
             raise TensorsimError(f"--films: got {self.films}, expected a folder")
 
+        from tqdm import tqdm
+
         from tensorsim.training import lifter_scores as scores
         from tensorsim.training.lifter_motion import build_pool
         from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -63,10 +65,15 @@ class EvaluateLifter:
         print(header.replace("_", " ") + "\n| --- | --- |" + " ---: |" * len(scores.LiftErrors._fields))
         for name, (kinds, errors) in rows.items():
             for lifter, make in lifters.items():
-                self._print(name, lifter, scores.judge(make, scores.views(pool, kinds, errors, self.seed)))
+                views = scores.views(pool, kinds, errors, self.seed)
+                bar = tqdm(
+                    views, lifter, total=len(scores.CAMERAS), unit="camera", leave=False, disable=self.quiet
+                )
+                self._print(name, lifter, scores.judge(make, bar))
         if self.films is not None:
             for lifter, make in lifters.items():
-                self._print("rendered films", lifter, scores.judge(make, scores.watched(self.films)))
+                bar = tqdm(scores.watched(self.films), lifter, unit="film", leave=False, disable=self.quiet)
+                self._print("rendered films", lifter, scores.judge(make, bar))
 
     @staticmethod
     def _print(people: str, lifter: str, errors: tuple[float, ...]) -> None:

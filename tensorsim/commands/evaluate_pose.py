@@ -24,6 +24,7 @@ class EvaluatePose:
         coco: folder with one COCO annotation file (*.json) and its pictures in images/.
         flip_test: average with the mirror image.
         engine: what runs the network, as in `tensorsim simulate`.
+        quiet: no progress bars.
     """
 
     weights: Path | None = None
@@ -31,6 +32,7 @@ class EvaluatePose:
     coco: Path | None = None
     flip_test: bool = True
     engine: Engine = "torch"
+    quiet: bool = False
 
     def run(self) -> None:
         """Do it."""
@@ -60,7 +62,7 @@ class EvaluatePose:
         heads = "".join(f"{head:>8s}" for head in ("body", "pairs", "seen", "ghosts"))
         print(f"{'people':40s} {'n':>5s} {'OKS':>7s} {'PCK@0.1':>8s}{heads}")
         for name, persons in groups.items():
-            figure = evaluate_pose(pose, persons) | evaluate_cut(pose, persons)
+            figure = evaluate_pose(pose, persons, self.quiet) | evaluate_cut(pose, persons, quiet=self.quiet)
             row = f"{figure['oks']:7.3f} {figure['pck']:8.3f} {figure['pck_body']:7.3f}"
             row += f" {figure['pck_pairs']:7.3f} {figure['seen']:7.3f} {figure['ghosts']:7.3f}"
             print(f"{name:40s} {len(persons):5d} {row}")

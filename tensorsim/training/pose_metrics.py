@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from tensorsim.errors import TensorsimError
 from tensorsim.training.pose_data import Person, Picture, cut_picture
@@ -73,13 +74,14 @@ def pck_either_way(found: Tensor, points: Tensor, known: Tensor, side: Tensor, s
     return (torch.maximum(right_of(left, right), right_of(right, left)) * both).sum() / (2 * both.sum())
 
 
-def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, float]:
+def evaluate_pose(network: nn.Module, persons: Sequence[Person], quiet: bool = True) -> dict[str, float]:
     """Find the keypoints of people in their boxes, as the pipeline does, and compare with the labels.
 
     Args:
         network: a :class:`~tensorsim.vision.TopDownPose`, or crops to heat maps, as
             :class:`~tensorsim.vision.HRNet`; in evaluation mode.
         persons: whom to look for.
+        quiet: no progress bar.
 
     Returns:
         ``oks``, the mean over people; ``pck``, PCK@0.1 over all keypoints; ``pck_body``, without the face;
@@ -91,7 +93,8 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, fl
     if not persons:
         raise TensorsimError("evaluate_pose: got no people, expected some with labelled keypoints")
     pose = _stage(network)
-    found = [_find(pose, person.sample.image(), person.box)[0] for person in persons]
+    bar = tqdm(persons, desc="whole", unit="person", disable=quiet)
+    found = [_find(pose, person.sample.image(), person.box)[0] for person in bar]
     labels = torch.from_numpy(np.stack([person.keypoints[:17] for person in persons]))
     points, known = labels[..., :2], labels[..., 2] > 0
     boxes = torch.from_numpy(np.stack([person.box for person in persons]))
@@ -107,7 +110,7 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person]) -> dict[str, fl
 
 
 def evaluate_cut(
-    network: nn.Module, persons: Sequence[Person], threshold: float = 0.3, seed: int = 0
+    network: nn.Module, persons: Sequence[Person], threshold: float = 0.3, seed: int = 0, quiet: bool = True
 ) -> dict[str, float]:
     """Let pictures end within the people, and see whether the scores tell what is out of sight.
 
@@ -116,6 +119,7 @@ def evaluate_cut(
         persons: whom to cut (:func:`~tensorsim.training.pose_data.cut_picture`).
         threshold: score from which a keypoint counts as seen.
         seed: of the cuts.
+        quiet: no progress bar.
 
     Returns:
         Shares of labelled keypoints with such a score: ``seen`` of those in the picture, ``ghosts`` of those beyond
@@ -123,7 +127,7 @@ def evaluate_cut(
     """
     pose = _stage(network)
     inside, beyond = [torch.zeros(0)], [torch.zeros(0)]
-    for index, person in enumerate(persons):
+    for index, person in enumerate(tqdm(persons, desc="cut", unit="person", disable=quiet)):
         generator = np.random.default_rng((seed, index))
         image, box, keypoints = cut_picture(person.sample.image(), person.box, person.keypoints, generator)
         v = torch.from_numpy(keypoints[:17, 2])

@@ -319,7 +319,7 @@ def test_lda_separates_what_is_linear():
     assert bool((logits[:, 3] == -100).all())
 
 
-def test_training_learns_and_repeats():
+def test_training_learns_and_repeats(capsys):
     generator = torch.Generator().manual_seed(0)
     shown, labels = torch.rand(40, 1, 8, 16, generator=generator), torch.arange(40) % 2
     shown[labels == 1, :, 2:4] += 1.0
@@ -328,7 +328,11 @@ def test_training_learns_and_repeats():
         torch.manual_seed(1)
         layers = torch.nn.Conv2d(1, 4, 3, padding=1), torch.nn.ReLU(), torch.nn.Flatten()
         net = torch.nn.Sequential(*layers, torch.nn.Linear(4 * 8 * 16, 2))
-        fit_pictures(net, shown, labels, steps=30, augment=lambda x, g: shift(x, 2, -1, g), batch=16)
+        fit_pictures(
+            net, shown, labels, steps=30, augment=lambda x, g: shift(x, 2, -1, g), batch=16,
+            quiet=len(logits) == 0,
+        )  # fmt: skip
+        assert ("30/30" in capsys.readouterr().err) == (len(logits) == 1)
         logits.append(predict(net, shown))
     assert torch.equal(*logits)
     assert report.accuracy(logits[0], labels) > 0.95

@@ -437,9 +437,13 @@ def test_evaluation_prints_a_line_per_detector(
     path = tmp_path / "w.safetensors"
     save_weights(TrainedRTMDet("small-person"), path, {})
     EvaluateDetector(weights=path, coco=tmp_path).run()
-    lines = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr()
+    assert "1/1" in printed.err, "a progress bar"
+    lines = printed.out.splitlines()
     assert len(lines) == 1
     assert "ap50" in lines[0]
     assert "people 1" in lines[0]
-    EvaluateDetector(weights=path, against=path, coco=tmp_path).run()
-    assert len(capsys.readouterr().out.splitlines()) == 2, "also beside itself"
+    EvaluateDetector(weights=path, against=path, coco=tmp_path, quiet=True).run()
+    printed = capsys.readouterr()
+    assert len(printed.out.splitlines()) == 2, "also beside itself"
+    assert "1/1" not in printed.err

@@ -41,7 +41,9 @@ def test_train_then_evaluate(network: str, data: Path, capsys: pytest.CaptureFix
     assert str(weights) in capsys.readouterr().out
 
     EvaluatePose(weights, data=data).run()
-    rows = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr()
+    assert "cut: 100%" in printed.err, "a progress bar"
+    rows = printed.out.splitlines()
     held_out = {name: len(persons) for name, persons in held_out_people(data).items()}
     assert min(held_out.values()) > 0
     assert len(rows) == 1 + len(held_out)

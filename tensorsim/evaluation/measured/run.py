@@ -157,7 +157,13 @@ class Experiment:
     def _simulation_trained(self, simulated: Tensor, labels: Tensor, seed: int) -> DIATRadHARNet:
         net = self._new(simulated, seed)
         fit_pictures(
-            net, simulated, labels, steps=self.steps, augment=_seen(self.measured.augment), seed=seed
+            net,
+            simulated,
+            labels,
+            steps=self.steps,
+            augment=_seen(self.measured.augment),
+            seed=seed,
+            quiet=self.quiet,
         )
         return net
 
@@ -169,6 +175,7 @@ class Experiment:
         fit_pictures(
             learner, self.train[chosen], self.train_labels[chosen], steps=steps,
             augment=_seen(self.measured.augment_measured), learning_rate=learning_rate, seed=self.seed,
+            quiet=self.quiet,
         )  # fmt: skip
         return self._tested(learner)
 

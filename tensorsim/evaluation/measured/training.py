@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from tqdm import trange
 
 #: A change of pictures (B, C, H, W) that keeps their labels.
 Augment = Callable[[Tensor, torch.Generator], Tensor]
@@ -56,6 +57,7 @@ def fit_pictures(
     weights: Tensor | None = None,
     batch: int = 64,
     seed: int = 0,
+    quiet: bool = True,
 ) -> None:
     """Train a network in place: AdamW, one cycle of the learning rate, cross-entropy with smoothed labels.
 
@@ -68,6 +70,7 @@ def fit_pictures(
         weights: (N,) how often each picture is drawn relative to the others; None is alike.
         batch: pictures per step, drawn with replacement.
         seed: of order, augmentation and dropout.
+        quiet: no progress bar.
     """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
@@ -75,7 +78,7 @@ def fit_pictures(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1)
     chance = torch.ones(len(labels)) if weights is None else weights
     net.train().to(memory_format=torch.channels_last)
-    for _ in range(steps):
+    for _ in trange(steps, desc="training", unit="step", disable=quiet):
         chosen = torch.multinomial(chance, batch, replacement=True, generator=generator)
         shown = augment(pictures[chosen], generator).contiguous(memory_format=torch.channels_last)
         # In float32: gradients of depthwise convolutions in bfloat16 come out as NaN at times (torch 2.14).
