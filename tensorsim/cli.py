@@ -8,7 +8,7 @@ from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
-from tensorsim import process
+from tensorsim import __version__, process
 from tensorsim.commands.app import App
 from tensorsim.commands.check import Check
 from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample
@@ -180,6 +180,9 @@ def main(arguments: list[str] | None = None) -> None:
     130 interrupted, 141 output pipe closed.
     """
     with process.ending_cleanly(), _one_line_errors():
+        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+            print(f"tensorsim {__version__}")
+            return
         command = parse(arguments)
         process.load_torch()
         command.run()

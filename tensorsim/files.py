@@ -90,27 +90,43 @@ def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
 
 
 @contextmanager
-def complete_or_nothing(out: Path) -> Iterator[Path]:
+def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]:
     """A scratch folder whose files are moved to ``out`` when the block succeeds; otherwise ``out`` is unchanged.
 
     Other files in ``out`` stay, except those that its ``summary.json`` lists under ``files``: they are from an earlier
     run. ``summary.json`` is removed first and written last, so that a folder that has one holds the files of one run,
     even after a crash.
 
+    Args:
+        out: a folder, made if it is not there.
+        source: what the files are made from.
+
     Raises:
-        TensorsimError: another process is writing into ``out``, or there is a folder where a file should be.
+        TensorsimError: another process is writing into ``out``, there is a folder where a file should be, or
+            ``source`` would be replaced or removed.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
+        _keep(source, out, _listed(out))
         scratch = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
         try:
             new, old = scratch / "new", scratch / "old"
             new.mkdir()
             old.mkdir()
             yield new
+            _keep(source, out, [file.name for file in new.iterdir()])
             _exchange(out, new, old)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _keep(source: Path | None, out: Path, names: list[str]) -> None:
+    """Refuse to replace or remove the source."""
+    if source is None:
+        return
+    for file in (out / name for name in names):
+        if file.exists() and source.exists() and file.samefile(source):
+            raise TensorsimError(f"--out: got {out}, whose {file.name} is the source and would be replaced")
 
 
 def _exchange(out: Path, new: Path, old: Path) -> None:

@@ -99,6 +99,28 @@ def test_results_appear_together_or_not_at_all(tmp_path: Path, monkeypatch: pyte
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+def test_the_source_of_a_run_is_neither_replaced_nor_removed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write_run(out, "first", "film", "maps")
+    # It would be removed with the earlier run, of whatever name the new files are.
+    with (
+        pytest.raises(TensorsimError, match="whose film is the source"),
+        complete_or_nothing(out, out / "film"),
+    ):
+        pytest.fail("the work has begun")
+    (out / "mine").write_text("mine")
+    os.symlink(out / "mine", tmp_path / "link")
+    with (
+        pytest.raises(TensorsimError, match="whose mine is the source"),
+        complete_or_nothing(out, tmp_path / "link") as folder,
+    ):
+        (folder / "mine").write_text("second")
+    assert {"film": "first", "maps": "first", "mine": "mine"}.items() <= files_in(out).items()
+    with complete_or_nothing(out, out / "mine") as folder:
+        (folder / "maps").write_text("third")
+    assert files_in(out)["mine"] == "mine"
+
+
 def test_a_second_run_into_a_folder_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with complete_or_nothing(out) as folder:

@@ -11,6 +11,7 @@ from tensorsim.commands.options import (
     Run,
     at_display_rate,
     check_drawable,
+    described_label,
     load_recognizer,
     number_of_people,
 )
@@ -118,8 +119,11 @@ class Demo(NetworkOptions, RadarOptions):
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
-        found = f"{ACTIVITIES[activity]}, {number_of_people(int(pose.valid[0].any(1).sum()))} found"
-        print(f"{self.out}: {found}; {described_likeness(likeness, empty_likeness)}")
+        people = number_of_people(int(pose.valid[0].any(1).sum()))
+        found = f"{people} found, {described_label(label)}"
+        print(
+            f"{self.out}: film of {ACTIVITIES[activity]}: {found}; {described_likeness(likeness, empty_likeness)}"
+        )
 
     def _film_configuration(self, detector: Path, pose_network: Path) -> "SimulationConfig":
         """The configuration for a film of the demonstration, with its networks."""
@@ -212,8 +216,8 @@ def described_likeness(likeness: dict[str, Any], empty: dict[str, Any]) -> str:
         return "the Doppler-time map from the film is that of the true motion"
     return (
         "Doppler-time map from the film against that of the true motion: "
-        f"PSNR {figures['psnr_linear_db']} dB, SSIM {figures['ssim_linear']} "
-        f"(an empty map: PSNR {empty['doppler_time']['psnr_linear_db']} dB)"
+        f"PSNR {figures['psnr_linear_db']:.1f} dB, SSIM {figures['ssim_linear']:.2f} "
+        f"(an empty map: PSNR {empty['doppler_time']['psnr_linear_db']:.1f} dB)"
     )
 
 

@@ -160,3 +160,11 @@ class Live(NetworkOptions, RadarOptions):
             raise TensorsimError(f"--port: got {self.port}, expected a number from 0 to 65535")
         if self.record is not None and self.record.suffix.lower() not in (".mp4", ".webm"):
             raise TensorsimError(f"--record: got {self.record}, expected a name ending in .mp4 or .webm")
+        camera = Path(self.camera)
+        if (
+            self.record is not None
+            and self.record.exists()
+            and camera.exists()
+            and self.record.samefile(camera)
+        ):
+            raise TensorsimError(f"--record: got {self.record}, which is --camera, expected another file")

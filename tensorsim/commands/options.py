@@ -63,9 +63,9 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath. Default: free-space."""
     radar: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
-    infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall) or
-    a YAML file with fields of RadarConfig; a wall that it comes with replaces the scene's, a floor adds its
-    reflections."""
+    infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall, and
+    the arrays ti-awr1843-array, infineon-bgt60tr13c-array) or a YAML file with fields of RadarConfig; a wall that it
+    comes with replaces the scene's, a floor adds its reflections."""
     people: Annotated[str | None, tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
     """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
     body: Literal["joints", "limbs", "version1", "surface"] | None = None
@@ -299,6 +299,13 @@ def check_drawable(stage: "PoseToDoppler") -> None:
 def number_of_people(count: int) -> str:
     """``1 person``, ``2 people``."""
     return f"{count} {'person' if count == 1 else 'people'}"
+
+
+def described_label(label: dict[str, Any]) -> str:
+    """``S8 Walking (0.98)``: the label and its probability, of what :func:`tensorsim.results.label_of` says."""
+    name = label["label"]
+    probabilities = label["probabilities"] or {}
+    return f"{name} ({probabilities[name]:.2f})" if name in probabilities else name or "no label"
 
 
 def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "SimulationConfig":

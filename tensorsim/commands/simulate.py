@@ -15,6 +15,7 @@ from tensorsim.commands.options import (
     Run,
     at_display_rate,
     check_drawable,
+    described_label,
     load_recognizer,
     number_of_people,
 )
@@ -133,7 +134,7 @@ class Simulate(NetworkOptions, RadarOptions):
             stage = PoseToDoppler.from_config(config).to(device)
             check_drawable(stage)
             self._check_length(source, stage)
-            with complete_or_nothing(self.out) as folder:
+            with complete_or_nothing(self.out, self.source) as folder:
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)
                 with simulated as (found, maps, strip):
                     pose = found.pose
@@ -153,9 +154,8 @@ class Simulate(NetworkOptions, RadarOptions):
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
-        shown = f", {label['label']}" if label["label"] else ""
         people = number_of_people(int(pose.valid[0].any(1).sum()))
-        print(f"{self.out}: {people} in {pose.valid.shape[2]} frames{shown}")
+        print(f"{self.out}: {people} in {pose.valid.shape[2]} frames, {described_label(label)}")
 
     def _check_length(self, source: "Source", stage: "PoseToDoppler") -> None:
         """Refuse what is shorter than a Doppler window before anybody is looked for."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from tensorsim.config.camera import CameraConfig
-from tensorsim.config.checks import require_choices, require_counts, require_positive
+from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
 from tensorsim.errors import TensorsimError
 
 Position = Literal["camera", "paper"]
@@ -133,7 +133,10 @@ class PoseConfig:
             raise TensorsimError(
                 f"PoseConfig.people: got {self.people!r}, expected 'all', 'moving', 'nearest' or a number from 1"
             )
-        require_positive("PoseConfig", keypoint_threshold=self.keypoint_threshold)
+        if not (is_finite(self.keypoint_threshold) and 0 < self.keypoint_threshold < 1):
+            raise TensorsimError(
+                f"PoseConfig.keypoint_threshold: got {self.keypoint_threshold!r}, expected a score in (0, 1)"
+            )
         for name in ("person_height_m", "person_weight_kg", "initial_distance_m"):
             values = getattr(self, name)
             if values is None:

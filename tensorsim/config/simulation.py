@@ -166,7 +166,7 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
     known = list(config.__dataclass_fields__) if hasattr(config, "__dataclass_fields__") else []
     if config is None:
         raise TensorsimError(
-            f"got {path[0]!r} of what this scene does not have, such as a wall in free space"
+            f"got {path[0]!r} of a part that this scene does not have (--scene through-wall has a wall)"
         )
     if path[0] not in known:
         raise TensorsimError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,4 +37,7 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise TensorsimError(f"{path}: got the suffix {path.suffix!r}, expected one of {expected}")
     # Without the date the same run writes the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    figure.savefig(path, dpi=120, metadata=dated.get(suffix))
+    with warnings.catch_warnings():
+        # Names of films may have letters that the font lacks: a box is drawn in their place.
+        warnings.filterwarnings("ignore", "Glyph .* missing from")
+        figure.savefig(path, dpi=120, metadata=dated.get(suffix))

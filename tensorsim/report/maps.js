@@ -97,7 +97,8 @@ class MapView {
   drawAxes(context, x, y, inner) {
     const { map, duration } = this;
     const right = MARGIN.left + inner.width;
-    context.fillStyle = getComputedStyle(document.body).color;
+    const ink = getComputedStyle(document.body).color;
+    context.fillStyle = ink;
     context.font = "12px system-ui, sans-serif";
     context.textAlign = "right";
     context.textBaseline = "middle";
@@ -109,8 +110,11 @@ class MapView {
     if (map.second_axis) {
       const factor = map.second_axis.per_unit;
       for (const [value, text] of ticksBetween(map.low * factor, map.high * factor, 6)) {
-        context.fillRect(right, y(value / factor), 4, 1);
-        context.fillText(text, right + 7, y(value / factor));
+        // Ticks within the map: beside the numbers they look like minus signs.
+        context.fillStyle = "white";
+        context.fillRect(right - 5, y(value / factor), 5, 1);
+        context.fillStyle = ink;
+        context.fillText(text, right + 5, y(value / factor));
       }
       this.drawUpright(context, map.second_axis.label, right + 43, inner);
     }

@@ -76,7 +76,8 @@ def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: P
     ("change", "message"),
     [
         ({"scene__snr": 3.0}, "'snr'.*perhaps 'snr_db'"),
-        ({"scene__wall__loss_tangent": 0.1}, "got 'loss_tangent' of what this scene does not have"),
+        ({"pose__keypoint_threshold": 1.5}, "keypoint_threshold: got 1.5, expected a score in"),
+        ({"scene__wall__loss_tangent": 0.1}, "got 'loss_tangent' of a part that this scene does not have"),
         ({"scene": 3}, "SimulationConfig.scene: got 3, expected a SceneConfig"),
         ({"pose__person_weight_kg": ()}, "person_weight_kg: got no values"),
         ({"scene__paths": ("direct",), "scene__leakage": True}, "got names of paths and leakage"),
@@ -121,7 +122,7 @@ def test_options_change_the_configuration_of_a_file(tmp_path: Path) -> None:
     assert paper == ts.SimulationConfig.paper(ts.SimulationConfig.through_wall())
     with pytest.raises(
         TensorsimError,
-        match="--wall-permittivity: got 'relative_permittivity' of what this scene",
+        match="--wall-permittivity: got 'relative_permittivity' of a part that this scene",
     ):
         RadarOptions(wall_permittivity=4.0).configuration()
 

@@ -518,3 +518,8 @@ def test_command(
     with pytest.raises(SystemExit):
         cli.main([*arguments, "--sound"])
     assert "--sound: got it for live" in capsys.readouterr().err
+
+
+def test_a_film_is_not_recorded_onto_itself(clip: Path) -> None:
+    with pytest.raises(TensorsimError, match="which is --camera, expected another file"):
+        live_command.Live(str(clip), record=clip).run()

@@ -42,7 +42,8 @@ def select_people(pose: Pose, mode: str, fps: float) -> Pose:
         chosen = torch.arange(people, device=valid.device) == int(mode) - 1
     else:
         raise TensorsimError(
-            f"people: got {mode!r}, expected 'all', 'moving', 'nearest' or a number from 1 to {people}"
+            f"people: got {mode!r}, expected 'all', 'moving', 'nearest' or the number of one of the "
+            f"{people} found"
         )
     return pose._replace(valid=pose.valid & chosen[None, :, None])
 

@@ -40,7 +40,7 @@ def test_who_counts(scene: Pose, mode: str, people: set[int]) -> None:
 
 def test_what_is_refused(scene: Pose) -> None:
     for mode in ("5", "0", "nobody", "-1"):
-        with pytest.raises(TensorsimError, match=r"'moving', 'nearest' or a number from 1 to 4"):
+        with pytest.raises(TensorsimError, match=r"'moving', 'nearest' or the number of one of the 4 found"):
             select_people(scene, mode, FPS)
     twice = Pose(*(torch.cat([part, part]) for part in scene))
     with pytest.raises(TensorsimError, match="got 2 clips"):
