@@ -119,8 +119,8 @@ class Demo(NetworkOptions, RadarOptions):
                 results.write_summary(folder, summary)
         for message in messages:
             print(f"tensorsim: warning: {message}", file=sys.stderr)
-        people = number_of_people(int(pose.valid[0].any(1).sum()))
-        found = f"{people} found, {described_label(label)}"
+        count = int(pose.valid[0].any(1).sum())
+        found = f"{number_of_people(count)} found, {described_label(label)}"
         print(
             f"{self.out}: film of {ACTIVITIES[activity]}: {found}; {described_likeness(likeness, empty_likeness)}"
         )

@@ -60,7 +60,7 @@ class LiveView:
             )
         small = cv2.resize(image, (WIDTH, round(image.shape[0] * WIDTH / image.shape[1])))
         text = f"{new.time_s:.1f} s   delay {new.delay_s:.2f} s   dropped {dropped}"
-        small[:26] //= 4  # a dark bar behind the text
+        small[:26] = small[:26] // 4  # a dark bar behind the text
         cv2.putText(small, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         return small
 
