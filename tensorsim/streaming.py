@@ -215,7 +215,9 @@ def calibrated(
     heights = stage.metric_pose.heights
     assert isinstance(heights, Tensor)
     calibrator = CameraCalibrator(tuple(heights.tolist()))
-    found = with_reserve(calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps))
+    found = with_reserve(
+        calibrator.to(keypoints.device)(keypoints[0], scores[0], valid[0], *size, fps), *size
+    )
     return stage.seen_by(camera_config(found), known=False), found
 
 

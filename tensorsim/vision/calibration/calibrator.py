@@ -51,21 +51,39 @@ class CameraEstimate(NamedTuple):
     frames: Tensor
 
 
-def with_reserve(found: CameraEstimate, good_rad: float = math.radians(5.0)) -> CameraEstimate:
+#: Field of view of most cameras along the longer side of their pictures.
+USUAL_FOV_RAD = math.radians(60.0)
+
+
+def horizontal_fov(along_longer_rad: Tensor, height: int, width: int) -> Tensor:
+    """Horizontal field of view in radians of pictures with this one along their longer side."""
+    return 2 * torch.atan(torch.tan(along_longer_rad / 2) * width / max(width, height))
+
+
+def with_reserve(
+    found: CameraEstimate, height: int, width: int, good_rad: float = math.radians(5.0)
+) -> CameraEstimate:
     """Estimates drawn towards a level camera 1.5 m above the floor, the more the less is known of its tilt.
 
     A few steps may fit a camera that looks steeply down as well as one that is level. A tilt with a standard deviation
     of ``good_rad`` or less stays as it is; beyond, tilt and roll shrink by ``(good_rad / deviation)^2``, and so do the
-    logarithm of the height against 1.5 m and the field of view against 60 degrees.
+    logarithm of the height against 1.5 m and the field of view against 60 degrees along the longer side of pictures of
+    ``height`` and ``width`` pixels.
     """
     share = (good_rad / found.pitch_sd_rad).square().clamp(max=1.0)
-    usual_fov = math.pi / 3
+    usual_fov = horizontal_fov(found.pitch_rad.new_tensor(USUAL_FOV_RAD), height, width)
     return found._replace(
         pitch_rad=share * found.pitch_rad,
         roll_rad=share * found.roll_rad,
         height_m=1.5 * (found.height_m / 1.5) ** share,
         horizontal_fov_rad=usual_fov + share * (found.horizontal_fov_rad - usual_fov),
     )
+
+
+def _across(cameras: Tensor, height: int, width: int) -> Tensor:
+    """Cameras (..., 4) whose last element is the field of view along the longer side, to the horizontal one."""
+    fov = horizontal_fov(cameras[..., 3:], height, width)
+    return torch.cat([cameras[..., :3], fov], dim=-1)
 
 
 def camera_config(found: CameraEstimate, radar_ahead_m: float = 0.0) -> CameraConfig:
@@ -103,10 +121,11 @@ class CameraCalibrator(nn.Module):
 
     People are upright bodies of known or typical height on a level floor (see
     :mod:`tensorsim.vision.calibration.camera_fit`). Where they tell little, the estimate stays near what is assumed
-    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15
-    degrees); somebody who walks through the scene tells everything. The height of the camera goes with that of the
-    people. However long somebody stays at one place, that is one observation: errors of key points there do not average
-    out. Who does not move at all while somebody else does may be a thing that looks like a person, and tells nothing.
+    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15 degrees
+    along the longer side of the picture); somebody who walks through the scene tells everything. The height of the
+    camera goes with that of the people. However long somebody stays at one place, that is one observation: errors of
+    key points there do not average out. Who does not move at all while somebody else does may be a thing that looks
+    like a person, and tells nothing.
 
     Args:
         person_height_m: standing heights by order of person; the last one serves all further people.
@@ -160,7 +179,8 @@ class CameraCalibrator(nn.Module):
         self.smoothing_s = 0.25
         self.most_people = 12  # with the most independent observations; more tell hardly more of the camera
         self.path = 0.25  # body heights in the image after which somebody is seen anew
-        mean = [0.0, 0.0, math.log(1.5), 60 * degree]
+        # Pitch, roll, logarithm of the height, field of view along the longer side.
+        mean = [0.0, 0.0, math.log(1.5), USUAL_FOV_RAD]
         deviation = [20 * degree, 3 * degree, 0.45, 15 * degree]
         self.register_buffer("standing", torch.tensor(STANDING, dtype=torch.float64), persistent=False)
         self.register_buffer("walking", torch.tensor(WALKING, dtype=torch.float64), persistent=False)
@@ -205,7 +225,8 @@ class CameraCalibrator(nn.Module):
                     )
                 )
         if clips == 0:
-            table = self._row(self.mean, self.deviation, self.mean.new_zeros(1))
+            mean = _across(self.mean, image_height, image_width)
+            table = self._row(mean, self.deviation, self.mean.new_zeros(1))
             table = table.expand(list(shape) + [9])  # noqa: RUF005  # TorchScript has no stars
         else:
             table = torch.stack(found).reshape(list(shape) + [9])  # noqa: RUF005
@@ -257,14 +278,19 @@ class CameraCalibrator(nn.Module):
         nothing = torch.zeros_like(stature)
         stepping = rhythm >= self.least_rhythm
         pace = (torch.where(stepping, self.walk_ratio * cycles_hz.square(), self.pace) * stature).log()
-        mean = torch.cat([self.mean, nothing, pace, self.lean * stature])
+        mean = torch.cat([_across(self.mean, height, width), nothing, pace, self.lean * stature])
         pace_sd = torch.where(stepping, self.walk_ratio_spread, nothing + self.pace_spread)
         deviation = torch.cat(
             [self.deviation, self.height_sd_m / stature, pace_sd, self.lean_spread * stature]
         )
         rest = torch.cat([nothing, pace, self.lean * stature]).expand(self.starts.shape[0], -1)
         at, covariance, cost = fit_camera(
-            torch.cat([self.starts, rest], dim=-1), mean, deviation, bodies, fps / every, independent
+            torch.cat([_across(self.starts, height, width), rest], dim=-1),
+            mean,
+            deviation,
+            bodies,
+            fps / every,
+            independent,
         )
         best = int(cost.argmin())
         return self._row(at[best, :4], torch.diagonal(covariance[best])[:4].sqrt(), count)

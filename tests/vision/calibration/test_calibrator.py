@@ -321,12 +321,23 @@ def test_a_tilt_that_is_hardly_known_is_drawn_towards_level() -> None:
     found = CameraEstimate(
         value, value, 3 * value / 0.5, 2 * value, deviation, deviation, value, value, frames
     )
-    kept = with_reserve(found)
+    kept = with_reserve(found, HEIGHT, WIDTH)
     assert kept.pitch_rad.tolist() == pytest.approx([0.5, 0.125])
     assert kept.roll_rad.tolist() == pytest.approx([0.5, 0.125])
     assert kept.height_m.tolist() == pytest.approx([3.0, 1.5 * 2**0.25])
     assert kept.horizontal_fov_rad.tolist() == pytest.approx([1.0, math.pi / 3 + (1 - math.pi / 3) / 4])
     assert torch.equal(kept.pitch_sd_rad, deviation)
+
+
+def test_pictures_taken_upright_are_as_wide_along_their_longer_side() -> None:
+    nobody = torch.zeros(1, 30, dtype=torch.bool)
+    key_points, scores = torch.zeros(1, 30, 17, 2), torch.zeros(1, 30, 17)
+    for height, width, fov in ((360, 640, 60.0), (640, 360, 35.98), (500, 500, 60.0)):
+        found = CameraCalibrator()(key_points, scores, nobody, height, width, FPS)
+        assert math.degrees(float(found.horizontal_fov_rad)) == pytest.approx(fov, abs=0.01)
+        unsure = found._replace(pitch_sd_rad=torch.tensor(1e6), horizontal_fov_rad=torch.tensor(1.5))
+        kept = with_reserve(unsure, height, width)
+        assert math.degrees(float(kept.horizontal_fov_rad)) == pytest.approx(fov, abs=0.01)
 
 
 # ---- the fit, in closed form -------------------------------------------------------------------------------
