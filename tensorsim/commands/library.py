@@ -73,7 +73,7 @@ class BuildLibrary:
 
         with complete_file(self.out) as scratch:
             save_file({"poses": poses.half().contiguous()}, scratch)
-        print(f"{self.out}: kept {len(poses)} of {given} poses ({different} that differ)")
+        print(f"{self.out}: kept {len(poses)} of {given} poses ({different} differ)")
 
 
 def _files(sources: tuple[Path, ...]) -> list[Path]:

@@ -331,9 +331,10 @@ def test_coco_results_by_image(tmp_path: Path) -> None:
     path.write_text(json.dumps([entry(5, image_id=12), entry(1, image_id=7), entry(2, image_id=7)]))
     people = load_coco_keypoints(path)
     assert people.keypoints.shape == (2, 2, 17, 2)
-    assert people.valid.tolist() == [[True, True], [True, False]]
+    # The one of image 12 is nearest to the second of image 7.
+    assert people.valid.tolist() == [[True, True], [False, True]]
     assert people.keypoints[0, 1, 3].tolist() == [5.0, -1.0]
-    assert people.keypoints[1, 0, 0].tolist() == [5.0, 5.0]
+    assert people.keypoints[1, 1, 0].tolist() == [5.0, 5.0]
     assert float(people.scores[0, 0, 0]) == 0.5
 
 

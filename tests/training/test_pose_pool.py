@@ -71,15 +71,14 @@ def test_generated_poses_are_bodies_of_many_proportions_on_both_sides() -> None:
 
 
 def test_the_shipped_pool_has_a_pose_near_those_of_other_people_who_move_near_the_floor() -> None:
-    # Root mean square over the joints, in body heights. Without everyday poses in the pool: 0.048 and 0.184; it was
-    # built when falls ended on the arms, not flat.
+    # Root mean square over the joints, in body heights. Of a pool whose falls ended on the arms: 0.030 and 0.141.
     poses = everyday_poses(400, seed=77)
     torch.testing.assert_close(body_height(poses), torch.ones(400, dtype=torch.float64))
     assert torch.equal(poses, everyday_poses(400, seed=77))
     pool = load_pose_library().double()
     away = torch.cdist(poses.flatten(1), pool.flatten(1)).amin(dim=1) / math.sqrt(14)
-    assert float(away.mean()) < 0.035
-    assert float(away.quantile(0.95)) < 0.15
+    assert float(away.mean()) < 0.028
+    assert float(away.quantile(0.95)) < 0.1
 
 
 def test_reads_all_clips_of_a_file_and_leaves_out_who_is_not_there(tmp_path: Path) -> None:
