@@ -101,6 +101,8 @@ def _draw_person(
     axes: Any, person: int, joints: np.ndarray, frames: np.ndarray, chosen: np.ndarray, fps: float
 ) -> None:
     """Poses of ``chosen`` frames, the later the stronger, and the way of the hips on the floor in all ``frames``."""
+    from matplotlib.patheffects import withStroke
+
     colour = np.array(PERSON_COLOURS[person % len(PERSON_COLOURS)]) / 255
     labelled = np.full((1, 3), np.inf)
     for k, frame in enumerate(chosen):
@@ -111,7 +113,8 @@ def _draw_person(
         top = joints[frame, 0] + (0, 0, 0.15)
         # Somebody who stays in place has the times of all poses in the legend only.
         if (np.linalg.norm(labelled - top, axis=1) > 0.4).all():
-            axes.text(*top, f"{frame / fps:.1f} s", color=colour, fontsize=7)
+            outline = [withStroke(linewidth=2.0, foreground="white")]
+            axes.text(*top, f"{frame / fps:.1f} s", color=colour, fontsize=7, zorder=10, path_effects=outline)
             labelled = np.concatenate([labelled, top[None]])
     track = mid_hips(torch.from_numpy(joints[frames])).numpy()
     label = f"person {person + 1}, {frames[0] / fps:.1f} to {frames[-1] / fps:.1f} s"

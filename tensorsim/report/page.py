@@ -148,15 +148,15 @@ def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = 
     }
     contents = [doppler]
     for name, title in (
-        ("range_time_mti", "Range-time map, moving targets"),
-        ("range_time", "Range-time map"),
+        ("range_time_mti", f"Range-time map{of}, moving targets"),
+        ("range_time", f"Range-time map{of}"),
     ):
         columns = getattr(maps, name).shape[1]
         late_s = (maps.range_time.shape[1] - columns) / 2 / axes.range_time_rate_hz
         contents.append(
             {
                 **_content(name, maps, axes.range_m, np.ones(len(axes.range_m), bool), pictures),
-                "title": title + of,
+                "title": title,
                 "axis": "range in m",
                 "start_s": late_s,
                 "end_s": late_s + columns / axes.range_time_rate_hz,
