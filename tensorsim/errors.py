@@ -218,7 +218,7 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
     return rcs.expand(per_pulse)
 
 
-def check_range(value: object, least: float, most: float, name: str) -> None:
+def check_interval(value: object, least: float, most: float, name: str) -> None:
     """Refuse what is no pair of finite numbers, the first not above the second, from ``least`` to ``most``."""
     pair = value if isinstance(value, tuple | list) and len(value) == 2 else ()
     numbers = [float(x) for x in pair if isinstance(x, Real) and math.isfinite(x)]

@@ -10,9 +10,12 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from tensorsim.exceptions import TensorsimError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 #: The file that identifies the run that a results folder is from.
 SUMMARY = "summary.json"
@@ -70,6 +73,11 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+def sha256_of_arrays(*arrays: "npt.NDArray[Any]") -> str:
+    """Hexadecimal SHA-256 of the content of arrays, one after the other."""
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
 def keep_settings(folder: Path, settings: dict[str, Any]) -> None:

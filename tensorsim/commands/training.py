@@ -1,6 +1,5 @@
 """Options that all training commands share, and the run that they describe."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -86,9 +85,10 @@ class TrainOptions:
 
 def digest(weights: Path | None) -> str | None:
     """Of the content of a weight file: another file of the same path is another start."""
+    from tensorsim.files import sha256_of
     from tensorsim.registry import locate
 
-    return None if weights is None else hashlib.sha256(locate(weights).read_bytes()).hexdigest()[:16]
+    return None if weights is None else sha256_of(locate(weights))
 
 
 @dataclass(frozen=True, kw_only=True)

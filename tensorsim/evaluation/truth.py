@@ -153,7 +153,7 @@ class TruthLoop:
         options: dict[str, Any] = {"scenes": self.scenes, "clips": 0, "fps": FPS}
         if setting in GUESSES:  # made of the other clips
             options |= {"clips": self.clips, "seed": self.seed}
-        if setting not in GUESSES:
+        else:
             options |= {"lifter": self.lifter, "weights": shipped_weights("TemporalLifter")}
         if isinstance(clip, CapturedClip):
             options |= {"source": clip.source}

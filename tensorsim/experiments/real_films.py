@@ -1,6 +1,5 @@
 """Recognisers trained on simulated maps of everyday motion and asked about real films of known activity."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,7 +16,7 @@ from tensorsim.config import ACTIVITIES, SimulationConfig
 from tensorsim.errors import TensorsimError, collected_warnings
 from tensorsim.evaluation.labelled_films import FilmReader, LabelledFilm, Scene, read_labels
 from tensorsim.experiments.work import Work, digest
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, sha256_of_arrays
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.recognition.networks import find_classifier
@@ -82,8 +81,8 @@ class EverydayTraining:
     @cached_property
     def digest(self) -> str:
         """Of the content of the maps."""
-        parts = (self.store.power, self.store.activity, self.store.filmed)
-        return hashlib.sha256(b"".join(part.numpy().tobytes() for part in parts)).hexdigest()
+        store = self.store
+        return sha256_of_arrays(store.power.numpy(), store.activity.numpy(), store.filmed.numpy())
 
 
 def described(film: LabelledFilm) -> tuple[str, int, float, float]:

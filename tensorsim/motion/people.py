@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.proportions import Proportions
-from tensorsim.errors import TensorsimError, check_positive, check_range
+from tensorsim.errors import TensorsimError, check_interval, check_positive
 
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
 VARIED_NUMBERS = 24
@@ -68,7 +68,7 @@ class PeopleConfig:
             ("start_range_m", 0.0, FARTHEST_M),
             ("keep_range_m", 0.0, FARTHEST_M),
         ):
-            check_range(getattr(self, name), least, most, f"PeopleConfig.{name}")
+            check_interval(getattr(self, name), least, most, f"PeopleConfig.{name}")
         index = self.body_mass_index
         pair = index if isinstance(index, tuple | list) and len(index) == 2 else ()
         numbers = [x for x in pair if isinstance(x, int | float)]

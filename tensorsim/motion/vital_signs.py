@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import JOINTS
-from tensorsim.errors import TensorsimError, check_floating, check_points, check_positive, check_range
+from tensorsim.errors import TensorsimError, check_floating, check_interval, check_points, check_positive
 from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
@@ -61,7 +61,7 @@ class VitalSigns(nn.Module):
         check_positive(rate_hz, "rate_hz")
         ranges = {"breath_m": breath_m, "breath_hz": breath_hz, "heart_m": heart_m, "heart_hz": heart_hz}
         for name, bounds in ranges.items():
-            check_range(bounds, 0, math.inf, name)
+            check_interval(bounds, 0, math.inf, name)
         if people < 1:
             raise TensorsimError(f"people: got {people}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,7 +19,7 @@ from tensorsim.data.sets.recipe import SourceConfig
 from tensorsim.data.skeletons import Motion
 from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, sha256_of
 from tensorsim.pipeline import VideoToPose
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
@@ -154,11 +155,10 @@ class PeopleFinder:
     @cached_property
     def of_networks(self) -> bytes:
         """Hash of the networks, and the version of the package."""
-        from tensorsim import __version__
         from tensorsim.registry import locate
 
         files = [locate(None, "RTMDet"), locate(None, "HRNet", "CPM"), locate(None, "TemporalLifter")]
-        return __version__.encode() + b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
+        return "".join([version("tensorsim"), *map(sha256_of, files)]).encode()
 
     def _digest(self, file: Path) -> str:
         content = hashlib.sha256(self.of_networks)

@@ -1,7 +1,6 @@
 """The experiments: simulation alone, with a few measured clips, with all of them, and their rivals."""
 
 import copy
-import hashlib
 from pathlib import Path
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.sets import MeasuredSet
 from tensorsim.evaluation.measured.training import Augment, fit_pictures, predict, square
+from tensorsim.files import sha256_of_arrays
 from tensorsim.recognition.diat_radharnet import DIATRadHARNet
 from tensorsim.weights import save_weights
 
@@ -107,8 +107,7 @@ class Experiment:
     @property
     def tested(self) -> str:
         """Digest of the test clips and their labels."""
-        parts = (self.test, self.test_labels)
-        return hashlib.sha256(b"".join(part.numpy().tobytes() for part in parts)).hexdigest()
+        return sha256_of_arrays(self.test.numpy(), self.test_labels.numpy())
 
     def quick(self) -> dict[str, Tensor]:
         """Logits (N, classes) of the test clips by the shipped weights."""
