@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import InterferenceConfig, RadarConfig, SceneConfig
+from tensorsim.errors import TensorsimError
 from tensorsim.ops import safe_sqrt
 from tensorsim.radar.synthesis.interference import Interference
 from tensorsim.radar.synthesis.noise import ReceiverNoise, energy
@@ -27,11 +28,20 @@ class Levels(NamedTuple):
 
 
 def interfering_radar(radar: RadarConfig, other: InterferenceConfig) -> RadarConfig:
-    """A radar of the same band at another place, with slower sweeps that follow one another almost without a pause."""
+    """A radar of the same band at another place, whose sweeps follow one another almost without a pause.
+
+    Raises:
+        TensorsimError: sweeps that are too short or too long for a radar.
+    """
     chirp_s = radar.chirp_s * other.chirp_ratio
-    return replace(
-        radar, tx_m=other.position_m, rx_m=other.position_m, chirp_s=chirp_s, prf_hz=0.99 / chirp_s
-    )
+    try:
+        return replace(
+            radar, tx_m=other.position_m, rx_m=other.position_m, chirp_s=chirp_s, prf_hz=0.99 / chirp_s
+        )
+    except TensorsimError as error:
+        raise TensorsimError(
+            f"InterferenceConfig.chirp_ratio: got {other.chirp_ratio:g}, expected sweeps of a radar ({error})"
+        ) from error
 
 
 def oscillator(radar: RadarConfig, level_dbc_hz: float, seed: int) -> PhaseNoise:

@@ -256,6 +256,10 @@ def test_effects_need_the_engine_that_makes_samples() -> None:
         (lambda: ClutterConfig(jitter_m=-1.0), "jitter_m: got -1.0"),
         (lambda: InterferenceConfig((1.0, 2.0)), "position_m: got"),  # type: ignore[arg-type]
         (lambda: InterferenceConfig(chirp_ratio=0.0), "chirp_ratio: got 0.0"),
+        (
+            lambda: RadarSimulator(SceneConfig(interference=InterferenceConfig(chirp_ratio=300.0))),
+            r"InterferenceConfig.chirp_ratio: got 300, expected .* samples per chirp",
+        ),
         (lambda: InterferenceConfig(delay_s=math.inf), "delay_s: got inf"),
         (lambda: SceneConfig(receiver=None), "SceneConfig.receiver: got None"),  # type: ignore[arg-type]
     ],
