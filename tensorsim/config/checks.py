@@ -1,7 +1,7 @@
 """Checks that the configurations share."""
 
 import math
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, get_args
 
 from tensorsim.errors import TensorsimError
@@ -74,10 +74,11 @@ def require_choices(config: Any, **choices: Any) -> None:
 
 
 def require_counts(config: Any, *names: str) -> None:
-    """Refuse fields of a configuration that are not integers of at least 1."""
+    """Refuse fields of a configuration that are not integers of at least 1; those of NumPy become Python's."""
     for name in names:
         value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
             raise TensorsimError(
                 f"{type(config).__name__}.{name}: got {value!r}, expected an integer of at least 1"
             )
+        object.__setattr__(config, name, int(value))

@@ -67,7 +67,7 @@ class ProcessingConfig:
             require_choices(self, range_window=RangeWindow)
         if self.engine not in ("time", "range-bins"):
             raise TensorsimError(f"engine: got {self.engine!r}, expected 'time' or 'range-bins'")
-        require_counts(self, "pulse_chunk", "energy_stride")
+        require_counts(self, "ridge_count", "pulse_chunk", "energy_stride")
         check_count(self.ridge_count, 1, 6, "ProcessingConfig.ridge_count")
         require_positive("ProcessingConfig", window_s=self.window_s)
         if not (is_finite(self.overlap) and 0 <= self.overlap < 1):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.proportions import Proportions
+from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_interval, check_positive
 
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
@@ -71,8 +72,8 @@ class PeopleConfig:
             check_interval(getattr(self, name), least, most, f"PeopleConfig.{name}")
         index = self.body_mass_index
         pair = index if isinstance(index, tuple | list) and len(index) == 2 else ()
-        numbers = [x for x in pair if isinstance(x, int | float)]
-        if len(numbers) != 2 or not 0 <= 3 * numbers[1] < numbers[0] < math.inf:
+        numbers = [x for x in pair if is_finite(x)]
+        if len(numbers) != 2 or not 0 <= 3 * numbers[1] < numbers[0]:
             raise TensorsimError(
                 f"PeopleConfig.body_mass_index: got {index!r}, expected a mean above 3 deviations"
             )
@@ -86,7 +87,7 @@ class PeopleConfig:
             ("start_side_m", FARTHEST_M),
         ):
             value = getattr(self, name)
-            if not isinstance(value, int | float) or not 0 <= value <= most:
+            if not (is_finite(value) and 0 <= value <= most):
                 raise TensorsimError(
                     f"PeopleConfig.{name}: got {value!r}, expected a number from 0 to {most}"
                 )

@@ -41,9 +41,12 @@ def test_a_yaml_file_holds_everything(tmp_path: Path) -> None:
         "scene__radar__carrier_hz": np.float64(60e9),
         "scene__radar__tx_m": np.zeros(3, dtype=np.float32),
         "scene__snr_db": np.float32(20.5),
+        "scene__bounces": np.int32(2),
         "processing__display_rate_hz": np.int64(30),
+        "processing__ridge_count": np.int64(2),
     }
     config = ts.SimulationConfig().replace(**numpy)
+    assert type(config.scene.bounces) is type(config.processing.ridge_count) is int
     config.to_yaml(tmp_path / "run.yaml")
     assert ts.SimulationConfig.from_yaml(tmp_path / "run.yaml") == config
     (tmp_path / "some.yaml").write_text("scene: {radar: {prf_hz: 4e3}}\nseed: 3\n")

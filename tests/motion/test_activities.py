@@ -424,6 +424,14 @@ def test_people_config_refuses(arguments: dict[str, Any], message: str) -> None:
         PeopleConfig(**arguments)
 
 
+def test_people_config_takes_numbers_of_numpy() -> None:
+    numbers: dict[str, Any] = {
+        "body_mass_index": (np.float32(22.0), np.int64(2)),
+        "female_share": np.float32(0.5),
+    }
+    assert PeopleConfig(**numbers) == PeopleConfig(body_mass_index=(22.0, 2.0), female_share=0.5)
+
+
 @pytest.mark.parametrize(
     ("name", "least", "most"),
     [
