@@ -318,7 +318,9 @@ class RadarSimulator(nn.Module):
     def advance(self, positions: Tensor, rcs: Tensor, first: int, pending: Pending | None) -> Piece:
         """Maps of the next pulses of a scene without end.
 
-        The noise is that of an empty scene, see the class, as the power of what is still to come is not known.
+        The noise is that of an empty scene, see the class, as the power of what is still to come is not known. Not for
+        several transmitters, effects of the receiver, or a moving target indicator that needs the whole clip, which are
+        not refused here.
 
         Args:
             positions: (B, m, S, 3) metres; of the first piece, m is above the ``lost_pulses`` of the moving target
