@@ -225,8 +225,8 @@ class CameraCalibrator(nn.Module):
                     )
                 )
         if clips == 0:
-            mean = _across(self.mean, image_height, image_width)
-            table = self._row(mean, self.deviation, self.mean.new_zeros(1))
+            mean, deviation = self._expected(image_height, image_width)
+            table = self._row(mean, deviation, self.mean.new_zeros(1))
             table = table.expand(list(shape) + [9])  # noqa: RUF005  # TorchScript has no stars
         else:
             table = torch.stack(found).reshape(list(shape) + [9])  # noqa: RUF005
@@ -278,11 +278,10 @@ class CameraCalibrator(nn.Module):
         nothing = torch.zeros_like(stature)
         stepping = rhythm >= self.least_rhythm
         pace = (torch.where(stepping, self.walk_ratio * cycles_hz.square(), self.pace) * stature).log()
-        mean = torch.cat([_across(self.mean, height, width), nothing, pace, self.lean * stature])
+        of_camera, camera_sd = self._expected(height, width)
+        mean = torch.cat([of_camera, nothing, pace, self.lean * stature])
         pace_sd = torch.where(stepping, self.walk_ratio_spread, nothing + self.pace_spread)
-        deviation = torch.cat(
-            [self.deviation, self.height_sd_m / stature, pace_sd, self.lean_spread * stature]
-        )
+        deviation = torch.cat([camera_sd, self.height_sd_m / stature, pace_sd, self.lean_spread * stature])
         rest = torch.cat([nothing, pace, self.lean * stature]).expand(self.starts.shape[0], -1)
         at, covariance, cost = fit_camera(
             torch.cat([_across(self.starts, height, width), rest], dim=-1),
@@ -294,6 +293,13 @@ class CameraCalibrator(nn.Module):
         )
         best = int(cost.argmin())
         return self._row(at[best, :4], torch.diagonal(covariance[best])[:4].sqrt(), count)
+
+    def _expected(self, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """What is assumed beforehand of a camera with this picture, mean and deviation (4,), as the fit has it."""
+        mean = _across(self.mean, height, width)
+        # The slope of the horizontal field of view by that along the longer side.
+        slope = mean[3:].sin() / self.mean[3:].sin()
+        return mean, torch.cat([self.deviation[:3], slope * self.deviation[3:]])
 
     def _looked_at(self, upright: Tensor, fps: float) -> tuple[Tensor, Tensor, int]:
         """Frames to fit, of those in which somebody is upright and half a second about them.

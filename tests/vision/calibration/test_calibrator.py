@@ -17,7 +17,12 @@ from tensorsim.evaluation.camera import (
     walk_before,
 )
 from tensorsim.vision.calibration import calibrator
-from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, with_reserve
+from tensorsim.vision.calibration.calibrator import (
+    CameraCalibrator,
+    CameraEstimate,
+    horizontal_fov,
+    with_reserve,
+)
 from tensorsim.vision.calibration.camera_fit import (
     Bodies,
     camera_axes,
@@ -338,6 +343,10 @@ def test_pictures_taken_upright_are_as_wide_along_their_longer_side() -> None:
         unsure = found._replace(pitch_sd_rad=torch.tensor(1e6), horizontal_fov_rad=torch.tensor(1.5))
         kept = with_reserve(unsure, height, width)
         assert math.degrees(float(kept.horizontal_fov_rad)) == pytest.approx(fov, abs=0.01)
+        # 15 degrees along the longer side are as many as the slope has them in the width.
+        degrees = torch.deg2rad(torch.tensor([59.99, 60.01], dtype=torch.float64))
+        slope = float(horizontal_fov(degrees, height, width).diff() / degrees.diff())
+        assert math.degrees(float(found.horizontal_fov_sd_rad)) == pytest.approx(15 * slope, rel=1e-5)
 
 
 # ---- the fit, in closed form -------------------------------------------------------------------------------
