@@ -118,7 +118,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
                 valid[t, place] = True
     check_finite(data, str(path))
     if not tracked:
-        data, valid = _told_apart(data, valid)
+        data, valid = told_apart(data, valid)
     # Annotations flag visibility by 0, 1 or 2; networks write scores.
     scores = data[..., 2]
     if float(scores.max()) > 2:
@@ -129,7 +129,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
     return Keypoints2D(data[..., :2], scores, valid, size)
 
 
-def _told_apart(data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def told_apart(data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """People (T, P, 17, 3), the first ones of each frame ``valid`` (T, P), each in the place of the nearest before."""
     ordered, there = torch.zeros_like(data), torch.zeros_like(valid)
     last = torch.zeros_like(data[0])

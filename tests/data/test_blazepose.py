@@ -87,6 +87,15 @@ def test_the_size_may_be_in_the_file_and_visibility_missing(tmp_path: Path) -> N
     assert people.scores.min() == 1.0
 
 
+def test_people_keep_their_places_when_another_leaves_or_their_order_changes(tmp_path: Path) -> None:
+    path = tmp_path / "people.json"
+    path.write_text(json.dumps([[person(), person(0.3)], [person(0.3)], [person(0.3), person()]]))
+    people = load_keypoints(path, SIZE)
+    assert people.valid.tolist() == [[True, True], [False, True], [True, True]]
+    torch.testing.assert_close(people.keypoints[2], people.keypoints[0])
+    torch.testing.assert_close(people.keypoints[1, 1], people.keypoints[0, 1])
+
+
 def test_coco_is_still_coco(tmp_path: Path) -> None:
     path = tmp_path / "coco.json"
     numbers = [1 if k % 3 == 2 else k for k in range(51)]
