@@ -22,9 +22,8 @@ def viterbi_two_states(stay: Tensor, change: Tensor, second: float) -> Tensor:
         (N, T) bool, true where the path is in the second state.
     """
     steps = stay.shape[1]
-    usual, other = torch.zeros_like(stay[:, 0:1]), torch.full_like(stay[:, 0:1], second)
-    if steps == 0:
-        return other < usual
+    usual = stay.new_zeros(stay.shape[0], 1)
+    other = usual + second
     from_usual: list[Tensor] = []
     from_other: list[Tensor] = []
     for t in range(steps):

@@ -122,6 +122,17 @@ def test_legs_below_the_picture_step() -> None:
     assert top_speed(found) == pytest.approx(top_speed(walk), rel=0.2)
 
 
+def test_a_clip_of_one_frame_is_lifted_beside_a_longer_one() -> None:
+    keypoints, scores, boxes, valid, *_ = keypoints_to_lift(20)
+    tracks = Tracks(*(part[None].repeat(2, *[1] * part.dim()) for part in (boxes, valid, valid)))
+    tracks.valid[1, :, 1:] = False
+    twice = torch.stack([keypoints] * 2), torch.stack([scores] * 2)
+    with torch.no_grad():
+        pose = stage_with(lifter()).lift_each_length(tracks, *twice, torch.tensor([20, 1]), 360, 640, 30.0)
+    assert pose.valid[1].sum(dim=-1).tolist() == [1] * len(keypoints)
+    assert pose.joints.isfinite().all()
+
+
 def test_nobody_is_lifted() -> None:
     """A film in which the tracker finds no one: joints of no person, in every layout of clips."""
     lifter = TemporalLifter(TemporalNet(8)).eval()

@@ -118,6 +118,14 @@ def test_scores_go_with_their_points() -> None:
     torch.testing.assert_close(steady_scores, scores)
 
 
+def test_a_single_frame_stays() -> None:
+    keypoints = seen("S8 Walking", 0.0)[:1]
+    scores = torch.full(keypoints.shape[:-1], 0.8, dtype=torch.float64)
+    steady, steady_scores = SteadySides()(keypoints, scores, scores[:, 0] > 0, FPS)
+    torch.testing.assert_close(steady, keypoints, atol=0, rtol=0)
+    torch.testing.assert_close(steady_scores, scores, atol=0, rtol=0)
+
+
 def test_refuses_costs_that_are_not_positive() -> None:
     with pytest.raises(TensorsimError, match="change"):
         SteadySides(change=0.0)
