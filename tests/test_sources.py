@@ -249,6 +249,27 @@ def test_people_without_track_id_are_told_apart_by_where_they_are(
         torch.testing.assert_close(found.keypoints[there, p], torch.tensor(both[p]).float()[there])
 
 
+def test_people_without_track_id_have_the_numbers_in_which_they_come(tmp_path: Path) -> None:
+    body = np.random.default_rng(0).uniform(0, 100, (17, 2))
+    keypoints = np.stack([np.stack([body + 200.0 * p] * 3) for p in range(5)])
+    write_results(
+        tmp_path / "five.json", keypoints, np.full((5, 3, 17), 0.9), [(0, 1, 2), (1, 3, 0), (4, 3, 2, 1, 0)]
+    )
+    found = load_coco_keypoints(tmp_path / "five.json")
+    left = found.keypoints[..., 0].mean(dim=-1)[2] - float(body[:, 0].mean())
+    assert left.tolist() == pytest.approx([0.0, 200.0, 400.0, 600.0, 800.0], abs=1e-3)
+
+
+def test_somebody_of_whom_one_key_point_is_seen_keeps_the_place(tmp_path: Path) -> None:
+    body = np.random.default_rng(0).uniform(0, 100, (17, 2))
+    keypoints = np.stack([np.stack([body + (200.0 * p + 8.0 * t) for t in range(3)]) for p in range(3)])
+    scores = np.full((3, 3, 17), 0.9)
+    scores[1, 1, 1:] = 0.0
+    write_results(tmp_path / "three.json", keypoints, scores, [(0, 1), (0, 1), (0, 1, 2)])
+    found = load_coco_keypoints(tmp_path / "three.json")
+    assert found.valid.tolist() == [[True, True, False]] * 2 + [[True] * 3]
+
+
 def test_scores_above_one_count_as_one_and_percents_are_refused(
     filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:

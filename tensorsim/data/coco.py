@@ -40,8 +40,9 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
 
     Frames are in ascending order of their image ids, or of the names of the files in a folder. Results do not list
     images in which nobody was found: numbers that are left out between others, in even steps, are such frames. People
-    are told apart by ``track_id`` where there is one, else by where they were last seen. ``keypoints`` are 51 numbers:
-    x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a little above 1 count as 1.
+    are told apart by ``track_id`` where there is one, else by where they were last seen, in the order in which they
+    come. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a little
+    above 1 count as 1.
 
     Raises:
         TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, scores
@@ -130,25 +131,39 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
 
 
 def told_apart(data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """People (T, P, 17, 3), the first ones of each frame ``valid`` (T, P), each in the place of the nearest before."""
+    """People (T, P, 17, 3), the first ones of each frame ``valid`` (T, P), each in the place of the nearest before.
+
+    Places are in the order in which people come, those of one frame as they are listed.
+    """
     ordered, there = torch.zeros_like(data), torch.zeros_like(valid)
-    last = torch.zeros_like(data[0])
+    last, known = torch.zeros_like(data[0]), 0
     for t in range(len(data)):
         people = data[t, valid[t]]
         place = assign(_apart(people, last), torch.ones(len(people), len(last), dtype=torch.bool), 1e9)
+        new = place >= known
+        place[new] = torch.arange(known, known + int(new.sum()))
+        known += int(new.sum())
         ordered[t, place], there[t, place], last[place] = people, True, people
     return ordered, there
 
 
 def _apart(people: Tensor, others: Tensor) -> Tensor:
-    """Mean distances (n, m) of the key points (..., 17, 3) that both have, in sizes of the former."""
+    """Mean distances (n, m) of the key points (..., 17, 3) that both have, in sizes of the larger one."""
     here, other = people[:, None, :, :2].double(), others[None, :, :, :2].double()
-    seen = people[:, None, :, 2:] > 0
-    high, low = torch.where(seen, here, -math.inf).amax(dim=2), torch.where(seen, here, math.inf).amin(dim=2)
-    size = (high - low).amax(dim=-1).clamp(min=1.0)
-    both = (seen & (others[None, :, :, 2:] > 0))[..., 0]
+    both = (people[:, None, :, 2] > 0) & (others[None, :, :, 2] > 0)
+    size = torch.maximum(_size(people)[:, None], _size(others)[None])
     apart = ((here - other).norm(dim=-1) * both).sum(dim=-1) / both.sum(dim=-1).clamp(min=1) / size
     return torch.where(both.any(dim=-1), apart, _NEW)
+
+
+def _size(people: Tensor) -> Tensor:
+    """Width or height (n,) of key points (n, 17, 3), whichever is larger, at least a pixel."""
+    seen, place = people[..., 2:] > 0, people[..., :2].double()
+    high, low = (
+        torch.where(seen, place, -math.inf).amax(dim=1),
+        torch.where(seen, place, math.inf).amin(dim=1),
+    )
+    return (high - low).amax(dim=-1).clamp(min=1.0)
 
 
 def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:
