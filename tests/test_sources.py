@@ -290,6 +290,23 @@ def test_shares_of_the_picture_are_no_pixels(
         keypoint_source(tmp_path / "walk.json", lifter(camera, 1.75), FPS, CANVAS)
 
 
+def test_names_of_pictures_and_files_go_by_their_numbers(tmp_path: Path) -> None:
+    """Results of AlphaPose have the names of pictures as image ids, without those in which nobody is."""
+    numbers = [0, 1, 2, 3, 8, 9, 10, 11]
+    results = [
+        {"image_id": f"{n}.jpg", "keypoints": [float(n), 2.0, 0.9] * 17} for n in sorted(numbers, key=str)
+    ]
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    found = load_coco_keypoints(tmp_path / "results.json")
+    assert torch.nonzero(found.valid[:, 0]).flatten().tolist() == numbers
+    assert found.keypoints[numbers, 0, 0, 0].tolist() == numbers
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for n in (9, 10, 11):
+        (folder / f"clip2_{n}.json").write_text(json.dumps([{"keypoints": [float(n), 2.0, 0.9] * 17}]))
+    assert load_coco_keypoints(folder).keypoints[:, 0, 0, 0].tolist() == [9.0, 10.0, 11.0]
+
+
 @pytest.mark.parametrize("step", [1, 5])
 def test_frames_without_anybody_are_not_left_out_of_results(step: int, tmp_path: Path) -> None:
     person = {"keypoints": [1.0, 2.0, 0.9] * 17, "score": 1.0, "category_id": 1}

@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,11 +39,11 @@ class Keypoints2D(NamedTuple):
 def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     """Read COCO keypoints of a video: annotations or results in one JSON file, or a folder with one file per frame.
 
-    Frames are in ascending order of their image ids, or of the names of the files in a folder. Results do not list
-    images in which nobody was found: numbers that are left out between others, in even steps, are such frames. People
-    are told apart by ``track_id`` where there is one, else by where they were last seen, in the order in which they
-    come. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a little
-    above 1 count as 1.
+    Frames are in ascending order of their image ids, or of the names of the files in a folder; names go by the numbers
+    in them, ``2.jpg`` before ``10.jpg``. Results do not list images in which nobody was found: numbers that are left
+    out between others, in even steps, are such frames. People are told apart by ``track_id`` where there is one, else
+    by where they were last seen, in the order in which they come. ``keypoints`` are 51 numbers: x, y, and visibility
+    (0, 1 or 2) or score (0 to 1) of each; scores a little above 1 count as 1.
 
     Raises:
         TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, scores
@@ -53,7 +54,7 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
 
 
 def json_files(path: Path) -> list[tuple[Path, Any]]:
-    """The JSON of a file, or of all files of a folder in the order of their names, each with its path.
+    """The JSON of a file, or of all files of a folder in the order of the numbers in their names, each with its path.
 
     Raises:
         TensorsimError: no such file, or one that is no JSON.
@@ -61,7 +62,8 @@ def json_files(path: Path) -> list[tuple[Path, Any]]:
     if not path.exists():
         raise TensorsimError(f"{path}: no such file, expected keypoints (.json)")
     contents = []
-    for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
+    files = sorted(path.glob("*.json"), key=lambda file: _by_number(file.name)) if path.is_dir() else [path]
+    for file in files:
         with reading(file, "JSON of keypoints"):
             check_range(file.stat().st_size, "size of a file", str(file))
             contents.append((file, json.loads(file.read_text(encoding="utf-8"))))
@@ -105,7 +107,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
         )
 
     with reading(path, "JSON of COCO keypoints"):
-        frames = [people[frame] for frame in (sorted(people) if listed else _numbered(people))]
+        frames = [people.get(frame, []) for frame in (sorted(people) if listed else _numbered(people))]
         tracks = sorted({person["track_id"] for person in everybody if tracked})
         count = len(tracks) or max(len(frame) for frame in frames)
         check_range(max(len(frame) for frame in frames), "people in a frame", str(path))
@@ -167,15 +169,20 @@ def _size(people: Tensor) -> Tensor:
 
 
 def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:
-    """The image ids of results in order; frames without anybody are added to ``people`` where ids number the frames."""
-    ids = sorted(people)
-    if len(ids) < 3 or not all(isinstance(id_, int) for id_ in ids):
+    """The image ids of results in order, with None for frames without anybody where ids number the frames."""
+    ids = sorted(people, key=_by_number)
+    names = [name for id_ in ids if (name := re.fullmatch(r"([^\d-]*)(\d+)(\D*)", str(id_)))]
+    id_of = {int(name[2]): id_ for name, id_ in zip(names, ids, strict=False)}
+    if len(id_of) < max(len(ids), 3) or len({(name[1], name[3]) for name in names}) > 1:
         return ids
-    step = math.gcd(*(after - before for before, after in itertools.pairwise(ids)))
-    every = range(ids[0], ids[-1] + step, step)
+    step = math.gcd(*(after - before for before, after in itertools.pairwise(id_of)))
+    every = range(min(id_of), max(id_of) + step, step)
     # Numbers of a data set's pictures are far apart and count nothing.
-    if len(every) > 4 * len(ids):
-        return ids
-    for id_ in every:
-        people.setdefault(id_, [])
-    return list(every)
+    return ids if len(every) > 4 * len(ids) else [id_of.get(number) for number in every]
+
+
+def _by_number(name: Any) -> Any:
+    """What names are sorted by so that ``2.jpg`` comes before ``10.jpg``; numbers by themselves."""
+    if not isinstance(name, str):
+        return name
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
