@@ -102,14 +102,16 @@ def read_npz(
     candidates = motions_in(arrays)
     if key is None:
         key = candidates[0] if len(candidates) == 1 else preferred(candidates)
+    if not candidates:
+        shown = ", ".join(f"{name} {list(arrays.shape(name))}" for name in arrays.files[:12])
+        raise TensorsimError(f"{path}: got the arrays {shown or 'none'}, expected one of shape (T, J, 3)")
     if key not in candidates:
-        shown = ", ".join(candidates) or "arrays (T, J, 3), but there are none"
-        got = "several motions" if key is None and candidates else f"the motion {key!r}"
-        raise TensorsimError(f"{path}: got {got}, expected one of {shown} (--clip)")
+        got = "several motions" if key is None else f"the motion {key!r}"
+        raise TensorsimError(f"{path}: got {got}, expected one of {', '.join(candidates)} (--clip)")
     for name in (f"{key}_fps", "fps", "mocap_framerate", "mocap_frame_rate"):
         if fps is None and name in arrays.files:
-            fps = float(arrays[name])
-    positions = torch.from_numpy(arrays[key].astype(np.float64)) * (1.0 if unit_m is None else unit_m)
+            fps = float(arrays[name].item())  # also of one element, as MATLAB has them
+    positions = torch.from_numpy(arrays[key].astype(np.float64))
     count = positions.shape[-2]
     if names is None and "joint_names" in arrays.files:
         names = tuple(str(name) for name in arrays["joint_names"])
@@ -129,4 +131,4 @@ def read_npz(
     if names == JOINTS:  # the head of our own skeleton is the nose
         names = ("nose", *JOINTS[1:])
     valid = torch.from_numpy(arrays["valid"].astype(bool)) if "valid" in arrays.files else None
-    return motion_of(path, positions, names, fps, valid)
+    return motion_of(path, positions, names, fps, valid, unit_m=1.0 if unit_m is None else unit_m)

@@ -3,6 +3,7 @@
 File formats differ in their joints and in how they name them; joints are found by their names.
 """
 
+import math
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -11,9 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tensorsim.body.skeleton import body_height
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, check_finite, check_positive
-from tensorsim.limits import check_range
+from tensorsim.limits import RANGES, check_range
 
 #: Names of each joint in files, without the side, the most specific first. Mixamo and CMU name a bone's start.
 _ALIASES = {
@@ -24,6 +26,9 @@ _ALIASES = {
     "knee": ("knee", "lowleg", "lowerleg", "leg", "shin", "calf"),
     "ankle": ("ankle", "foot"),
 }
+#: Units of capture files in metres: metre, centimetre, inch, millimetre, unit of CMU's ASF files.
+_UNITS_M = (1.0, 0.01, 0.0254, 0.001, 0.0254 / 0.45)
+_TYPICAL_HEIGHT_M = 1.75
 
 
 class Motion(NamedTuple):
@@ -99,20 +104,22 @@ def plain_name(name: str) -> str:
 
 def motion_of(
     path: Path, positions: Tensor, names: tuple[str, ...], fps: float | None, valid: Tensor | None = None,
-    top: Tensor | None = None,
+    top: Tensor | None = None, unit_m: float | None = 1.0,
 ) -> Motion:  # fmt: skip
     """The motion in a file, checked.
 
     Args:
         path: the file, for messages.
-        positions: (..., T, J, 3) world metres.
+        positions: (..., T, J, 3) in the world.
         names: of the J joints.
         fps: frames per second.
         valid: (P, T) bool; None: everybody is there in all frames.
         top: (..., T, 3) top of the head.
+        unit_m: of positions and top in metres; None: the usual unit that gives a body nearest to the size of an adult.
 
     Raises:
-        TensorsimError: no frame rate, no frames, NaN, joints that are missing, ``valid`` of another shape.
+        TensorsimError: no frame rate, no frames, NaN, joints that are missing, ``valid`` of another shape, bodies that
+            are too small or too large for people.
     """
     if fps is None:
         raise TensorsimError(f"{path}: got no frame rate in the file, expected one as fps")
@@ -122,7 +129,9 @@ def motion_of(
         raise TensorsimError(f"{path}: got no frames, expected at least one")
     check_finite(positions, str(path))
     try:
-        joints = body_joints(positions, names, top)
+        if unit_m is None:
+            unit_m = _likely_unit_m(body_joints(positions, names))
+        joints = body_joints(positions * unit_m, names, None if top is None else top * unit_m)
     except TensorsimError as error:
         raise TensorsimError(f"{path}: {error}") from error
     if joints.dim() == 3:
@@ -134,4 +143,23 @@ def motion_of(
         raise TensorsimError(
             f"{path}: got valid of shape {list(valid.shape)}, expected {list(joints.shape[:2])}"
         )
+    for person, there in zip(joints, valid, strict=True):
+        if bool(there.any()):
+            _check_height(float(body_height(person[there]).median()), path)
     return Motion(joints.float(), valid, float(fps))
+
+
+def _likely_unit_m(joints: Tensor) -> float:
+    """The unit in which bodies (..., T, 14, 3) are nearest to the size of an adult."""
+    tall = float(body_height(joints).median())
+    return min(_UNITS_M, key=lambda unit: abs(math.log(max(tall * unit, 1e-9) / _TYPICAL_HEIGHT_M)))
+
+
+def _check_height(height_m: float, path: Path) -> None:
+    """Refuse a body that is too small or too large for a person; most often the unit is another one."""
+    low, high, _ = RANGES["body height"]
+    if not low <= height_m <= high:
+        raise TensorsimError(
+            f"{path}: got a person {height_m:.4g} m tall, expected {low:g} to {high:g} m: positions have to be in "
+            "metres (load_motion takes other units as unit_m)"
+        )

@@ -164,9 +164,14 @@ def test_keypoints_give_what_a_video_gives(
     ],
 )
 def test_bad_options_are_refused_before_work_starts(
-    name: str, options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    options: list[str],
+    message: str,
+    walk: np.ndarray,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    np.savez(tmp_path / "walk.npz", joints=np.ones((30, 14, 3)), fps=FPS)
+    np.savez(tmp_path / "walk.npz", joints=walk[:30], fps=FPS)
     (tmp_path / "walk.json").write_text("no JSON")
     (tmp_path / "one_bin.yaml").write_text("processing: {range_gate_m: [2.99, 3.0]}")
     options = [str(tmp_path / option) if option.endswith(".yaml") else option for option in options]

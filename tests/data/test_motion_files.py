@@ -113,7 +113,7 @@ def test_unit_of_a_bvh_is_guessed_or_given(unit: float, tmp_path: Path) -> None:
     path = tmp_path / "clip.bvh"
     path.write_text(bvh("cmu", unit))
     assert float(load_motion(path).joints[0, 0, 1, 2]) == pytest.approx(1.42, rel=1e-3)
-    assert float(load_motion(path, unit_m=2 / unit).joints[0, 0, 1, 2]) == pytest.approx(2.84, rel=1e-3)
+    assert float(load_motion(path, unit_m=0.5 / unit).joints[0, 0, 1, 2]) == pytest.approx(0.71, rel=1e-3)
 
 
 def test_bad_bvh_is_refused(tmp_path: Path) -> None:
@@ -149,6 +149,33 @@ def test_named_joints_in_any_order(tmp_path: Path) -> None:
     np.savez(tmp_path / "b.npz", poses=joints[:, order])
     again = load_motion(tmp_path / "b.npz", fps=30, joint_names=tuple(names))
     np.testing.assert_allclose(again.joints[0], joints, atol=1e-5)
+
+
+@pytest.mark.parametrize(("scale", "height"), [(1000.0, "1750"), (0.0, "0")])
+def test_people_of_impossible_size_are_refused(scale: float, height: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", joints=walker() * scale, fps=30)
+    with pytest.raises(TensorsimError, match=rf"a person {height} m tall, expected 0\.3 to 3 m: .* metres"):
+        load_motion(tmp_path / "a.npz")
+    if scale:
+        assert float(load_motion(tmp_path / "a.npz", unit_m=1 / scale).joints.abs().max()) < 5
+
+
+def test_those_who_are_not_there_have_any_size(tmp_path: Path) -> None:
+    joints = np.stack([walker(), np.zeros((5, 14, 3))])
+    valid = np.array([[True] * 5, [False] * 5])
+    np.savez(tmp_path / "a.npz", joints=joints, valid=valid, fps=30)
+    assert load_motion(tmp_path / "a.npz").valid.tolist() == valid.tolist()
+
+
+def test_frame_rate_as_an_array_of_one_number(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", joints=walker(), fps=np.array([[120.0]]))
+    assert load_motion(tmp_path / "a.npz").fps == 120.0
+
+
+def test_npz_without_motion_says_what_it_has(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", poses=np.zeros((5, 156)), trans=np.zeros((5, 3)))
+    with pytest.raises(TensorsimError, match=r"poses \[5, 156\], trans \[5, 3\], expected one of shape"):
+        load_motion(tmp_path / "a.npz")
 
 
 def test_neck_is_the_middle_of_the_shoulders_and_coco_joints_fit() -> None:
@@ -438,7 +465,7 @@ def test_files_that_are_not_motion_are_refused(tmp_path: Path) -> None:
         "hold no dictionary": {"positions_3d": np.array({"S1": 5}, dtype=object)},
         "NaN": {"joints_m": np.full((2, 14, 3), np.nan), "fps": 30.0},
         "no frames": {"joints_m": np.zeros((0, 14, 3)), "fps": 30.0},
-        "there are none": {"other": np.zeros(3)},
+        r"other \[3\], expected one of shape": {"other": np.zeros(3)},
         "joint names, expected 14": {"joints_m": walker(), "fps": 30.0, "joint_names": np.array(["a"])},
         "valid of shape": {"joints_m": walker(), "fps": 30.0, "valid": np.ones((2, 5), bool)},
     }
