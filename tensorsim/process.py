@@ -85,6 +85,24 @@ def load_torch() -> None:
         signal.signal(signal.SIGINT, before)
 
 
+def end_with_parent() -> None:
+    """Let this process, a worker of ``multiprocessing``, end when the one that started it does, also if that is killed.
+
+    Workers of a pool would wait for ever for its next job.
+    """
+    import multiprocessing
+    import threading
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     signal.signal(number, signal.SIG_IGN)  # once: what follows is the cleaning up
     sys.exit(128 + number)

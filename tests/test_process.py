@@ -1,6 +1,7 @@
 """The process of the command: how it starts and how it ends."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -136,3 +137,30 @@ except AttributeError as error:
     for program, loaded in (("tensorsim", "False False\n"), ("my_program.py", "True True\n")):
         done = run_python(code.format(program=program))
         assert done.stdout == loaded + nothing, done.stderr
+
+
+#: A pool with one worker, whose number it prints.
+POOL = """
+import multiprocessing, os, sys, time
+from concurrent.futures import ProcessPoolExecutor
+from process import end_with_parent  # a copy of the module: it is imported without torch
+if __name__ == "__main__":
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent)
+    print(pool.submit(os.getpid).result(), flush=True)
+    time.sleep(60)
+"""
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "pool.py").write_text(POOL)
+    shutil.copy(process.__file__, tmp_path / "process.py")
+    command = [sys.executable, str(tmp_path / "pool.py")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        parent.kill()
+        try:
+            parent.communicate(timeout=10)  # to the end of all who have its output
+        except subprocess.TimeoutExpired:
+            os.kill(worker, signal.SIGKILL)
+            raise

@@ -24,6 +24,7 @@ from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
 from tensorsim.files import complete_file
+from tensorsim.process import end_with_parent
 from tensorsim.radar.presets import PRESETS
 from tensorsim.registry import shipped_weights
 
@@ -117,7 +118,7 @@ class TruthLoop:
 
     def _in_processes(self, bar: tqdm) -> None:
         start = time.time()
-        with ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn")) as pool:
+        with ProcessPoolExecutor(self.jobs, get_context("spawn"), end_with_parent) as pool:
             futures: set[Future[None]] = {pool.submit(_one_thread_row, self, row) for row in self.rows()}
             while futures:
                 done, futures = wait(futures, timeout=2.0, return_when="FIRST_EXCEPTION")

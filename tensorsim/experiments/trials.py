@@ -24,6 +24,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.experiments.pictures import INPUTS, SNR_DB, PictureSet
 from tensorsim.experiments.work import Work, digest, read_result, write_result
+from tensorsim.process import end_with_parent
 from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.training.classifier import held_out
@@ -232,7 +233,7 @@ def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -
     found = {k: result for k, result in enumerate(kept) if result is not None}
     for k in waiting:
         trials[k].pictures(work).prepare(trials[k].clips + trials[k].test_clips, trials[k].inputs)
-    pool = ProcessPoolExecutor(work.jobs, mp_context=get_context("spawn"), max_tasks_per_child=1)
+    pool = ProcessPoolExecutor(work.jobs, get_context("spawn"), end_with_parent, max_tasks_per_child=1)
     with tqdm(total=len(waiting), desc="trainings", unit="training", disable=work.quiet) as bar:
         try:
             futures = {pool.submit(_one_thread, trials[k], ratios, work): k for k in waiting}

@@ -10,6 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
 from tensorsim.errors import TensorsimError
+from tensorsim.process import end_with_parent
 
 Work = Callable[[Any], int]
 
@@ -54,7 +55,7 @@ class Processes:
         deaths = 0
         while waiting:
             context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(min(self.workers, len(waiting)), context, _one_thread)
+            pool = ProcessPoolExecutor(min(self.workers, len(waiting)), context, _begin)
             running: dict[Future[int], Any] = {}
             try:
                 while waiting or running:
@@ -76,6 +77,11 @@ class Processes:
                     ) from None
             finally:
                 _end(pool)
+
+
+def _begin() -> None:
+    end_with_parent()
+    _one_thread()
 
 
 def _one_thread() -> None:
