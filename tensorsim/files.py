@@ -6,7 +6,6 @@ import math
 import os
 import pickletools
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -116,10 +115,11 @@ def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]
     out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
         _keep(source, out, _listed(out))
-        scratch = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
+        scratch = out.parent / f".{out.name}.scratch"
+        shutil.rmtree(scratch, ignore_errors=True)  # of a run that was killed; the lock is ours
         try:
             new, old = scratch / "new", scratch / "old"
-            new.mkdir()
+            new.mkdir(parents=True)
             old.mkdir()
             yield new
             _keep(source, out, [file.name for file in new.iterdir()])

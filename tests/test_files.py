@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,19 @@ def test_the_source_of_a_run_is_neither_replaced_nor_removed(tmp_path: Path) -> 
     with complete_or_nothing(out, out / "mine") as folder:
         (folder / "maps").write_text("third")
     assert files_in(out)["mine"] == "mine"
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with complete_or_nothing(out) as folder:
+        (folder / "half").touch()
+        scratch = folder.parent
+        shutil.copytree(scratch, tmp_path / "copy")
+    shutil.rmtree(out)
+    (tmp_path / "copy").rename(scratch)
+    write_run(out, "next", "a")
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    assert set(files_in(out)) == {"a", "summary.json"}
 
 
 def test_a_second_run_into_a_folder_is_refused(tmp_path: Path) -> None:
