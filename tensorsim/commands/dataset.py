@@ -33,6 +33,8 @@ class DatasetBuild:
     """Folder for the people found in films, which several data sets can share. Default: OUT/.people."""
     strict: bool = False
     """Stop at the first clip that fails, in place of a line in failures.csv."""
+    retry: bool = False
+    """Try samples that failed in an earlier run again."""
     quiet: bool = False
     """No progress bars."""
 
@@ -48,9 +50,13 @@ class DatasetBuild:
         from tensorsim.data.sets.recipe import DatasetRecipe
 
         recipe = DatasetRecipe.from_yaml(self.recipe)
-        built = build_dataset(recipe, self.out, self._engine(), self.cache, self.strict, self.quiet)
-        failed = f", {built.failures} clips failed (failures.csv)" if built.failures else ""
-        print(f"{self.out}: {built.samples} samples, {built.made} of them made now{failed}")
+        built = build_dataset(
+            recipe, self.out, self._engine(), self.cache, self.strict, self.quiet, self.retry
+        )
+        print(f"{self.out}: {built.samples} samples, {built.made} of them made now")
+        if built.failures:
+            clips = "1 clip" if built.failures == 1 else f"{built.failures} clips"
+            print(f"Samples of {clips} failed, see failures.csv; --retry tries them again.")
 
     def _engine(self) -> "Engine":
         from tensorsim.data.sets.engines import Processes, RayCluster, Serial

@@ -14,14 +14,19 @@ def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample
     Films and captured motion are needed where the recipe names them.
 
     Raises:
-        TensorsimError: no such data set or sample, or arrays that differ from those that were stored: another version
-            of tensorsim, torch or the films, or a processor of another kind.
+        TensorsimError: no such data set or sample, sources with other clips, or arrays that differ from those that were
+            stored: another version of tensorsim, torch or the films, or a processor of another kind.
     """
     row = next(rows_of(folder, id=sample), None)
     if row is None:
         last = max(row["id"] for row in rows_of(folder))
         raise TensorsimError(f"{folder}: got no sample {sample!r}, expected an id such as {last}")
     plan = Plan(recipe_of(folder), str(folder / ".people" if cache is None else cache))
+    index, clip = row["clip_index"], row["clip"]
+    if index >= plan.clips or plan.clip(index)[1].name != clip:
+        raise TensorsimError(
+            f"{folder}: got sources in which {clip} is missing or has another place, expected those of the data set"
+        )
     made = sample_of_row(plan, row)
     if made.row["sha256"] != row["sha256"]:
         raise TensorsimError(

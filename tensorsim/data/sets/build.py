@@ -11,16 +11,18 @@ from tqdm import tqdm
 
 from tensorsim.config.documents import to_document
 from tensorsim.data.sets.engines import Engine, Serial
-from tensorsim.data.sets.manifest import finish
+from tensorsim.data.sets.manifest import finish, rows_of_shard
 from tensorsim.data.sets.plan import Plan, Shard
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError
-from tensorsim.files import locked, write_json
+from tensorsim.files import complete_file, locked, write_json
 
 #: The recipe of the data set of a folder, the folder of finished shards' rows, and the file that is written last.
 RECIPE, ROWS, DONE = "recipe.yaml", ".rows", "dataset.json"
+#: In the folder of the rows: what :attr:`~tensorsim.data.sets.plan.Plan.listing` was when the data set was begun.
+LISTING = "clips.sha256"
 
 
 class Job(NamedTuple):
@@ -45,7 +47,8 @@ class Built(NamedTuple):
     """What a call of :func:`build_dataset` leaves.
 
     Attributes:
-        samples, failures: numbers of samples stored and of clips that failed.
+        samples: number of samples stored.
+        failures: number of clips of which some or all samples failed.
         made: number of samples that this call made.
     """
 
@@ -104,11 +107,13 @@ def build_dataset(
     cache: Path | None = None,
     strict: bool = False,
     quiet: bool = False,
+    retry: bool = False,
 ) -> Built:
     """Build the data set of a recipe, or what is missing of it.
 
     The files depend on the recipe (and the films that it names) alone: not on the engine, the number of workers, or
-    interruptions. A shard is complete or not there; one that was finished is not made again.
+    interruptions. A shard is complete or not there; one that was finished is not made again, unless some of its samples
+    failed and ``retry`` or ``strict`` asks for it.
 
     Args:
         recipe: what to make.
@@ -117,22 +122,33 @@ def build_dataset(
         cache: folder of the people found in films; None: ``.people`` in ``out``.
         strict: the first clip that fails ends the work, in place of a line in ``failures.csv``.
         quiet: no progress bar.
+        retry: make shards again in which samples failed.
 
     Raises:
-        TensorsimError: another data set or other files in the folder, another run that is writing there, a source that
-            is not there, every sample failed, or, if ``strict``, a clip that fails.
+        TensorsimError: another data set or other files in the folder, sources with other clips than when it was begun,
+            another run that is writing there, a source that is not there, every sample failed, or, if ``strict``, a
+            clip that fails.
     """
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        if _starts_or_goes_on(out, recipe):
-            done = json.loads((out / DONE).read_text(encoding="utf-8"))
-            return Built(done["samples"], done["failures"], 0)
+        begun = _is_begun(out, recipe)
         engine = Serial() if engine is None else engine
         people = out / ".people" if cache is None else cache
         document, kept = json.dumps(recipe.to_document(), sort_keys=True), str(people.resolve())
         plan_of.cache_clear()  # files may have changed since the last build
         plan = plan_of(document, kept)
+        if begun:
+            _check_listing(out, plan)
+        else:
+            recipe.to_yaml(out / RECIPE)
+            with complete_file(out / ROWS / LISTING) as scratch:
+                scratch.write_text(plan.listing, encoding="ascii")
+        if retry or strict:
+            _forget_failures(out, plan)
+        if (out / DONE).is_file():
+            done = json.loads((out / DONE).read_text(encoding="utf-8"))
+            return Built(done["samples"], done["failures"], 0)
 
         def job(number: int) -> Job:
             return Job(document, str(out.resolve()), kept, number, strict)
@@ -143,7 +159,8 @@ def build_dataset(
         count = sum(plan.shards[k].stop - plan.shards[k].first for k in missing)
         _run(engine, "samples", "sample", count, engine.run(build_shard, map(job, missing)), quiet)
         samples, failures = finish(out, plan, [rows_path(out, shard) for shard in plan.shards])
-        return Built(samples, failures, count)
+        made = sum(len(rows_of_shard(rows_path(out, plan.shards[k]))["rows"]) for k in missing)
+        return Built(samples, failures, made)
 
 
 def _run(engine: Engine, name: str, unit: str, total: int, done: Iterator[int], quiet: bool) -> None:
@@ -165,27 +182,49 @@ def _films(plan: Plan) -> list[int]:
     return list(first.values())
 
 
-def _starts_or_goes_on(out: Path, recipe: DatasetRecipe) -> bool:
-    """Make the folder ready; true if it holds the whole data set already.
+def _is_begun(out: Path, recipe: DatasetRecipe) -> bool:
+    """Whether the folder has a data set of the recipe, finished or not; what an interrupted run left is removed.
 
     Raises:
         TensorsimError: another data set, or other files.
     """
     described = out / RECIPE
-    if described.is_file():
-        there = DatasetRecipe.from_yaml(described)
-        if there != recipe:
-            raise TensorsimError(
-                f"{out}: got a data set of another recipe (first difference: {_difference(there, recipe)}), expected "
-                "the same or a new folder"
-            )
-        for left in (*out.rglob(".*.tmp"),):
-            left.unlink(missing_ok=True)
-    else:
+    if not described.is_file():
         if out.exists() and any(out.iterdir()):
             raise TensorsimError(f"{out}: got a folder with other files, expected a new or an empty one")
-        recipe.to_yaml(described)
-    return (out / DONE).is_file()
+        return False
+    there = DatasetRecipe.from_yaml(described)
+    if there != recipe:
+        raise TensorsimError(
+            f"{out}: got a data set of another recipe (first difference: {_difference(there, recipe)}), expected "
+            "the same or a new folder"
+        )
+    for left in out.rglob(".*.tmp"):
+        left.unlink(missing_ok=True)
+    return True
+
+
+def _check_listing(out: Path, plan: Plan) -> None:
+    """Refuse sources with other clips than when a data set was begun: samples would change their numbers and parts.
+
+    Raises:
+        TensorsimError: such sources.
+    """
+    path = out / ROWS / LISTING
+    if path.is_file() and path.read_text(encoding="ascii") != plan.listing:
+        raise TensorsimError(
+            f"{out}: got sources with other clips, people or labels than when this data set was begun, expected the "
+            "same or a new folder"
+        )
+
+
+def _forget_failures(out: Path, plan: Plan) -> None:
+    """Shards with samples that failed count as missing."""
+    for shard in plan.shards:
+        path = rows_path(out, shard)
+        if path.is_file() and rows_of_shard(path)["failures"]:
+            (out / DONE).unlink(missing_ok=True)
+            path.unlink()
 
 
 def _difference(there: Any, here: Any, name: str = "") -> str:

@@ -26,7 +26,7 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
     Args:
         plan: of the recipe.
         counts: samples by part and class.
-        failures: number of clips that failed.
+        failures: number of clips of which samples failed.
         size: bytes of all shards.
     """
     recipe = plan.recipe
@@ -35,7 +35,7 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
         f"# {recipe.name}",
         "",
         f"{total} labelled samples of {recipe.duration_s:g} s, {size / 1e6:.1f} MB, simulated by tensorsim from "
-        f"`recipe.yaml` (seed {recipe.seed}). {failures} clips failed, see `failures.csv`.",
+        f"`recipe.yaml` (seed {recipe.seed}). Clips of which samples failed: {failures}, see `failures.csv`.",
         "",
         f"| class | {' | '.join(PARTS)} |",
         f"|---|{'---|' * len(PARTS)}",

@@ -27,7 +27,7 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
         finished: the rows of each shard, in order.
 
     Returns:
-        Numbers of samples and of failed clips.
+        Numbers of samples, and of clips of which samples failed.
 
     Raises:
         TensorsimError: every sample failed.
@@ -36,7 +36,7 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
     counts: Counter[tuple[str, str]] = Counter()
     files: dict[str, str] = {}
     for path in finished:
-        content = _read(path)
+        content = rows_of_shard(path)
         counts.update((row["part"], row["label"]) for row in content["rows"])
         files |= content["files"]
     _write_failures(out / "failures.csv", failures)
@@ -64,24 +64,30 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
     return samples, len(failures)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def rows_of_shard(path: Path) -> dict[str, Any]:
+    """What is kept of a finished shard: ``rows`` of the manifest, ``failures``, and the SHA-256 of ``files``.
+
+    Raises:
+        TensorsimError: a damaged file.
+    """
     with reading(path, "rows of a shard"):
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return content
 
 
-def _failures(finished: Sequence[Path]) -> list[dict[str, str]]:
-    """Every clip that failed, once for each reason."""
-    found: dict[tuple[str, ...], dict[str, str]] = {}
+def _failures(finished: Sequence[Path]) -> list[dict[str, Any]]:
+    """Every clip of which samples failed, with their number and the first reason."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
     for path in finished:
-        for failure in _read(path)["failures"]:
-            found.setdefault(tuple(failure.values()), failure)
-    return sorted(found.values(), key=lambda failure: (failure["clip"], failure["reason"]))
+        for failure in rows_of_shard(path)["failures"]:
+            clip = found.setdefault((failure["clip"], failure["path"]), failure | {"samples": 0})
+            clip["samples"] += 1
+    return [found[key] for key in sorted(found)]
 
 
-def _write_failures(path: Path, failures: Sequence[dict[str, str]]) -> None:
+def _write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
     with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, ["clip", "path", "reason"])
+        writer = csv.DictWriter(file, ["clip", "path", "samples", "reason"])
         writer.writeheader()
         writer.writerows(failures)
 
@@ -106,7 +112,7 @@ def _write_manifest(out: Path, recipe: DatasetRecipe, finished: Sequence[Path]) 
         lines = csv.DictWriter(file, list(names))
         lines.writeheader()
         for path in finished:
-            rows = _read(path)["rows"]
+            rows = rows_of_shard(path)["rows"]
             if rows:
                 writer.write_table(pa.Table.from_pylist(rows, schema))
                 lines.writerows(rows)

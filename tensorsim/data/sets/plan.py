@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tensorsim.data.sets.clips import Clip, ClipSource
+from tensorsim.data.sets.files import FileClips
 from tensorsim.data.sets.open_sources import open_source
 from tensorsim.data.sets.recipe import PARTS, DatasetRecipe
 from tensorsim.data.sets.scene import Scene, beside_each_other, kept_inside
@@ -75,6 +76,15 @@ class Plan:
         number = int(np.searchsorted(self.starts, index, side="right")) - 1
         source = self.sources[number]
         return source, source.clip(index - int(self.starts[number]))
+
+    @cached_property
+    def listing(self) -> str:
+        """SHA-256 of the clips that files hold; those of generated people follow from the recipe."""
+        digest = hashlib.sha256()
+        for source in self.sources:
+            for clip in source.clips if isinstance(source, FileClips) else ():
+                digest.update(repr(replace(clip, path="")).encode())  # wherever the files are
+        return digest.hexdigest()
 
     @cached_property
     def parts(self) -> dict[str, Indices]:

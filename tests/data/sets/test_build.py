@@ -154,6 +154,68 @@ def test_files_that_were_changed_are_read_again(tmp_path: Path) -> None:
     assert [row["label"] for row in rows_of(tmp_path / "other")] == ["walk"]
 
 
+@pytest.fixture
+def captured(tmp_path: Path) -> DatasetRecipe:
+    """Two captured walks in one class and a file that is no motion in another, each in a shard of its own."""
+    for seed, name in enumerate(("a", "b")):
+        joints = ActivityGenerator().generate("walking", seed=seed, duration_s=1.0, rate_hz=30.0).joints[0]
+        (tmp_path / "motion" / "walk").mkdir(parents=True, exist_ok=True)
+        np.savez(tmp_path / "motion" / "walk" / f"{name}.npz", joints_m=joints.numpy(), fps=30.0)
+    (tmp_path / "motion" / "run").mkdir()
+    (tmp_path / "motion" / "run" / "c.npz").write_text("nothing")
+    return small_recipe(
+        sources=(SourceConfig("motion", str(tmp_path / "motion")),),
+        split=SplitConfig(shares=(1.0, 0.0, 0.0)),
+        variations=VariationConfig(count=2),
+        storage=StorageConfig(shard_samples=1),
+    )
+
+
+def test_samples_that_failed_are_tried_again_when_asked(captured: DatasetRecipe, tmp_path: Path) -> None:
+    out, mended = tmp_path / "set", tmp_path / "motion" / "run" / "c.npz"
+    assert build_dataset(captured, out, quiet=True) == (4, 1, 4)
+    with (out / "failures.csv").open(newline="") as file:
+        (failure,) = csv.DictReader(file)
+    assert (failure["clip"], failure["samples"]) == ("run/c.npz", "2")
+    mended.write_bytes((tmp_path / "motion" / "walk" / "a.npz").read_bytes())
+    assert build_dataset(captured, out, quiet=True) == (4, 1, 0)
+    with pytest.raises(KeyboardInterrupt):
+        build_dataset(captured, out, Interrupted(1), quiet=True, retry=True)
+    assert not (out / "dataset.json").exists()
+    assert build_dataset(captured, out, quiet=True, retry=True) == (6, 0, 1)
+    build_dataset(captured, tmp_path / "whole", quiet=True)
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_strict_does_not_pass_over_earlier_failures(captured: DatasetRecipe, tmp_path: Path) -> None:
+    build_dataset(captured, tmp_path / "set", quiet=True)
+    with pytest.raises(TensorsimError, match=r"run/c\.npz"):
+        build_dataset(captured, tmp_path / "set", strict=True, quiet=True)
+
+
+def test_other_clips_than_at_the_start_are_refused(captured: DatasetRecipe, tmp_path: Path) -> None:
+    """Parts and numbers of samples would change, and a person would be in two parts."""
+    out, walks = tmp_path / "set", tmp_path / "motion" / "walk"
+    with pytest.raises(KeyboardInterrupt):
+        build_dataset(captured, out, Interrupted(1), quiet=True)
+    (walks / "b.npz").rename(walks / "d.npz")
+    with pytest.raises(TensorsimError, match="set: got sources with other clips, people or labels"):
+        build_dataset(captured, out, quiet=True)
+    (walks / "d.npz").rename(walks / "b.npz")
+    assert build_dataset(captured, out, quiet=True).samples == 4
+    (walks / "b.npz").unlink()
+    sample = next(rows_of(out, clip="walk/b.npz"))["id"]
+    with pytest.raises(TensorsimError, match=r"walk/b\.npz is missing"):
+        sample_again(out, sample)
+
+
+def test_a_source_that_is_not_there_leaves_no_folder(tmp_path: Path) -> None:
+    recipe = small_recipe(sources=(SourceConfig("motion", str(tmp_path / "nothing")),))
+    with pytest.raises(TensorsimError, match="got no such folder"):
+        build_dataset(recipe, tmp_path / "set", quiet=True)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_interrupted_run_goes_on_to_the_same_files(
     built: Path, recipe: DatasetRecipe, tmp_path: Path
 ) -> None:
