@@ -172,14 +172,12 @@ def ntu(source: SourceConfig) -> list[Clip]:
     return _some(clips, folder, "files such as S001C001P001R001A001.skeleton")
 
 
-def _film(folder: Path, *names: str) -> Path:
-    """The film of one of these names (without suffix) in a folder or its folders; else a path that is not there."""
-    for name in names:
-        for suffix in FILMS:
-            for place in (folder / f"{name}{suffix}", *folder.glob(f"*/{name}{suffix}")):
-                if place.is_file():
-                    return place
-    return folder / f"{names[0]}.mp4"
+def _films(folder: Path) -> dict[str, Path]:
+    """The films of a folder and its folders by their name without suffix; of equal names the first in ``FILMS``."""
+    files = (path for pattern in ("*", "*/*") for path in folder.glob(pattern))
+    films = [path for path in files if path.suffix.lower() in FILMS]
+    films.sort(key=lambda path: (FILMS.index(path.suffix.lower()), len(path.parts), path))
+    return {path.stem: path for path in reversed(films)}
 
 
 def kinetics(source: SourceConfig) -> list[Clip]:
@@ -195,6 +193,7 @@ def kinetics(source: SourceConfig) -> list[Clip]:
     folder, path = _folder(source), Path(source.table or "")
     rows = read_table(path)
     _columns(path, rows, ("label", "youtube_id", "time_start", "time_end"))
+    films = _films(folder)
     parts = {"train": "train", "val": "validation", "validate": "validation", "test": "test"}
     clips = []
     for number, row in enumerate(rows):
@@ -202,7 +201,7 @@ def kinetics(source: SourceConfig) -> list[Clip]:
         start, end = _seconds(row["time_start"], where), _seconds(row["time_end"], where)
         name = str(row["youtube_id"])
         short = f"{name}_{int(start or 0):06d}_{int(end or 0):06d}"
-        film = _film(folder, short, name)
+        film = films.get(short) or films.get(name) or folder / f"{short}.mp4"
         times = (None, None) if film.stem == short else (start, end)
         part = parts.get(str(row.get("split") or ""), "")
         clips.append(Clip(short, str(row["label"]), name, name, part, str(film), "", *times))
@@ -221,6 +220,7 @@ def charades(source: SourceConfig) -> list[Clip]:
     folder, path = _folder(source), Path(source.table or "")
     rows = read_table(path)
     _columns(path, rows, ("id", "subject", "actions"))
+    films = _films(folder)
     clips = []
     for row in rows:
         name = str(row["id"])
@@ -231,7 +231,7 @@ def charades(source: SourceConfig) -> list[Clip]:
                     f"{path}: {name}: got the action {action!r}, expected one such as c092 11.9 21.2"
                 )
             start, end = (_seconds(word, f"{path}: {name}") for word in words[1:])
-            film = str(_film(folder, name))
+            film = str(films.get(name, folder / f"{name}.mp4"))
             clips.append(
                 Clip(f"{name}#{number}", words[0], str(row["subject"]), name, "", film, "", start, end)
             )

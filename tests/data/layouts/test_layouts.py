@@ -139,6 +139,19 @@ def test_kinetics(tmp_path: Path) -> None:
     assert not Path(gone.path).exists()
 
 
+def test_films_are_looked_for_once_however_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "id3.avi").touch()
+    (tmp_path / "id3.mp4").touch()
+    rows: list[dict[str, object]] = [
+        {"label": "squat", "youtube_id": f"id{k}", "time_start": 0, "time_end": 10} for k in range(20)
+    ]
+    write_csv(tmp_path / "k.csv", rows)
+    searches, glob = [], Path.glob
+    monkeypatch.setattr(Path, "glob", lambda self, pattern: searches.append(pattern) or glob(self, pattern))
+    clips = listing.kinetics(SourceConfig("kinetics", str(tmp_path), str(tmp_path / "k.csv")))
+    assert (len(clips), clips[3].path, len(searches)) == (20, str(tmp_path / "id3.mp4"), 2)
+
+
 def test_charades(tmp_path: Path) -> None:
     (tmp_path / "46GP8.mp4").touch()
     rows: list[dict[str, object]] = [
