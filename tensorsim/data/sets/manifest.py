@@ -7,6 +7,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from tensorsim.data.sets.card import card
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import DatasetRecipe
@@ -155,3 +158,17 @@ def rows_of(out: Path, **wanted: str) -> Iterator[Row]:
             for row in file.read_row_group(group).to_pylist():
                 if all(row[name] == value for name, value in wanted.items()):
                     yield row
+
+
+def columns_of(out: Path, *names: str) -> list[npt.NDArray[Any]]:
+    """Columns of the manifest, in the order of the samples.
+
+    Raises:
+        TensorsimError: no manifest there, or a damaged one.
+    """
+    import pyarrow.parquet as pq
+
+    path = _finished(out)
+    with reading(path, "a manifest"):
+        table = pq.read_table(path, columns=list(names))
+        return [np.array(table[name].to_pylist()) for name in names]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from tensorsim.data.sets.batches import Arrays, synthesize_batch
-from tensorsim.data.sets.manifest import recipe_of, rows_of
+from tensorsim.data.sets.manifest import columns_of, recipe_of
 from tensorsim.data.sets.outputs import MAPS, OutputConfig
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import PARTS, DatasetRecipe
@@ -99,23 +99,23 @@ class MapDataset(Dataset[dict[str, Any]]):
         if split not in (None, *PARTS):
             raise TensorsimError(f"MapDataset.split: got {split!r}, expected one of {', '.join(PARTS)}")
         self.names = chosen_names(self.recipe, output, radars)
-        rows = list(rows_of(self.folder, **({} if split is None else {"part": split})))
-        there = {row["class_index"]: row["label"] for row in rows_of(self.folder)}
-        known = [there[k] for k in sorted(there)]
+        ids, shards, parts, numbers, names = columns_of(
+            self.folder, "id", "shard", "part", "class_index", "label"
+        )
+        known = [str(names[place]) for place in np.unique(numbers, return_index=True)[1]]
         unknown = [label for label in labels or () if label not in known]
         if unknown:
             raise TensorsimError(
                 f"MapDataset.labels: got {unknown[0]!r}, expected some of {', '.join(known)}"
             )
         self.labels = tuple(labels or known)
-        # Columns in place of rows: a million samples fit in memory.
-        kept = [row for row in rows if row["label"] in self.labels]
-        if not kept:
+        kept = np.isin(names, self.labels) & ((parts == split) | (split is None))
+        if not kept.any():
             raise TensorsimError(f"{self.folder}: got no samples of the part {split}, expected some")
-        self.ids = [row["id"] for row in kept]
-        self.shards = np.array([row["shard"] for row in kept])
-        self.parts = np.array([row["part"] for row in kept])
-        self.targets = torch.tensor([self.labels.index(row["label"]) for row in kept])
+        self.ids = ids[kept].tolist()
+        self.shards, self.parts = shards[kept], parts[kept]
+        place = {label: k for k, label in enumerate(self.labels)}
+        self.targets = torch.tensor([place[label] for label in names[kept].tolist()])
         self._read = StoredArrays(self.folder, self.recipe)
 
     def __len__(self) -> int:
