@@ -172,14 +172,15 @@ class MapStream(IterableDataset[dict[str, Any]]):
     """
 
     def __init__(self, maps: MapDataset, shuffle: bool = True, seed: int = 0) -> None:
-        self.maps, self.shuffle, self.seed, self.epoch = maps, shuffle, seed, 0
+        self.maps, self.shuffle, self.seed = maps, shuffle, seed
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # with workers that persist
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the order; call it before every epoch."""
-        self.epoch = epoch
+        self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        generator = np.random.Generator(np.random.PCG64([self.seed, self.epoch]))
+        generator = np.random.Generator(np.random.PCG64([self.seed, int(self._epoch)]))
         shards = np.unique(self.maps.shards)
         if self.shuffle:
             shards = generator.permutation(shards)

@@ -105,6 +105,14 @@ def test_ranks_and_workers_share_the_shards(folder: Path, monkeypatch: pytest.Mo
     assert [len(batch["label"]) for batch in loader] == [3, 1]
 
 
+def test_workers_that_persist_see_the_epoch(folder: Path) -> None:
+    stream = ts.data.MapStream(ts.data.MapDataset(folder), seed=3)
+    loader = DataLoader(stream, None, num_workers=1, persistent_workers=True)
+    for epoch in range(4):
+        stream.set_epoch(epoch)
+        assert [sample["id"] for sample in loader] == [sample["id"] for sample in stream]
+
+
 def test_simulated_maps_are_those_of_the_data_set_and_then_others(folder: Path) -> None:
     maps = ts.data.MapDataset(folder, "train")
     simulated = ts.data.SimulatedMaps(maps.recipe, "train", rounds=2)
