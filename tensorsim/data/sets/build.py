@@ -17,12 +17,12 @@ from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file, locked, write_json
+from tensorsim.files import locked, reading, write_json
 
-#: The recipe of the data set of a folder, the folder of finished shards' rows, and the file that is written last.
-RECIPE, ROWS, DONE = "recipe.yaml", ".rows", "dataset.json"
-#: In the folder of the rows: what :attr:`~tensorsim.data.sets.plan.Plan.listing` was when the data set was begun.
-LISTING = "clips.sha256"
+#: The folder of finished shards' rows, in it the file that is written first: the recipe and the listing of the clips.
+ROWS, BEGUN = ".rows", "begun.json"
+#: The recipe for people to read, and the file that is written last.
+RECIPE, DONE = "recipe.yaml", "dataset.json"
 
 
 class Job(NamedTuple):
@@ -132,18 +132,22 @@ def build_dataset(
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        begun = _is_begun(out, recipe)
+        begun = _begun(out, recipe)
         engine = Serial() if engine is None else engine
         people = out / ".people" if cache is None else cache
         document, kept = json.dumps(recipe.to_document(), sort_keys=True), str(people.resolve())
         plan_of.cache_clear()  # files may have changed since the last build
         plan = plan_of(document, kept)
-        if begun:
-            _check_listing(out, plan)
-        else:
+        if begun is None:
+            write_json(out / ROWS / BEGUN, {"recipe": recipe.to_document(), "clips": plan.listing})
+        elif begun != plan.listing:
+            # Samples would change their numbers, and people would come into two parts.
+            raise TensorsimError(
+                f"{out}: got sources with other clips, people or labels than when this data set was begun, expected "
+                "the same or a new folder"
+            )
+        if not (out / RECIPE).is_file():
             recipe.to_yaml(out / RECIPE)
-            with complete_file(out / ROWS / LISTING) as scratch:
-                scratch.write_text(plan.listing, encoding="ascii")
         if retry or strict:
             _forget_failures(out, plan)
         if (out / DONE).is_file():
@@ -182,18 +186,22 @@ def _films(plan: Plan) -> list[int]:
     return list(first.values())
 
 
-def _is_begun(out: Path, recipe: DatasetRecipe) -> bool:
-    """Whether the folder has a data set of the recipe, finished or not; what an interrupted run left is removed.
+def _begun(out: Path, recipe: DatasetRecipe) -> str | None:
+    """The listing of the clips with which the data set of the folder was begun; None of a new one.
+
+    What an interrupted run left half written is removed.
 
     Raises:
         TensorsimError: another data set, or other files.
     """
-    described = out / RECIPE
-    if not described.is_file():
-        if out.exists() and any(out.iterdir()):
+    path = out / ROWS / BEGUN
+    if not path.is_file():
+        if any(file.is_file() and file.suffix != ".tmp" for file in out.rglob("*")):
             raise TensorsimError(f"{out}: got a folder with other files, expected a new or an empty one")
-        return False
-    there = DatasetRecipe.from_yaml(described)
+        return None
+    with reading(path, "the beginning of a data set"):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        there, listing = DatasetRecipe.from_document(content["recipe"], str(path)), str(content["clips"])
     if there != recipe:
         raise TensorsimError(
             f"{out}: got a data set of another recipe (first difference: {_difference(there, recipe)}), expected "
@@ -201,21 +209,7 @@ def _is_begun(out: Path, recipe: DatasetRecipe) -> bool:
         )
     for left in out.rglob(".*.tmp"):
         left.unlink(missing_ok=True)
-    return True
-
-
-def _check_listing(out: Path, plan: Plan) -> None:
-    """Refuse sources with other clips than when a data set was begun: samples would change their numbers and parts.
-
-    Raises:
-        TensorsimError: such sources.
-    """
-    path = out / ROWS / LISTING
-    if path.is_file() and path.read_text(encoding="ascii") != plan.listing:
-        raise TensorsimError(
-            f"{out}: got sources with other clips, people or labels than when this data set was begun, expected the "
-            "same or a new folder"
-        )
+    return listing
 
 
 def _forget_failures(out: Path, plan: Plan) -> None:

@@ -238,6 +238,22 @@ def test_what_is_there_is_not_overwritten(built: Path, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+def test_a_recipe_in_the_folder_does_not_pass_for_that_of_the_data_set(tmp_path: Path) -> None:
+    """Who edits it there would get samples of both."""
+    recipe = small_recipe()
+    recipe.to_yaml(tmp_path / "recipe.yaml")
+    (tmp_path / ".other.tmp").write_text("mine")
+    with pytest.raises(TensorsimError, match="a folder with other files"):
+        build_dataset(recipe, tmp_path, quiet=True)
+    assert (tmp_path / ".other.tmp").exists()
+    with pytest.raises(KeyboardInterrupt):
+        build_dataset(recipe, tmp_path / "set", Interrupted(1), quiet=True)
+    edited = small_recipe(seed=5)
+    edited.to_yaml(tmp_path / "set" / "recipe.yaml")
+    with pytest.raises(TensorsimError, match=r"first difference: seed 0 there, 5 here"):
+        build_dataset(edited, tmp_path / "set", quiet=True)
+
+
 def test_the_manifest_alone_makes_a_sample_again(
     built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
