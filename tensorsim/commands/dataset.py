@@ -1,12 +1,13 @@
 """``tensorsim dataset``: labelled data sets of radar maps from a recipe."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, collected_warnings
 
 if TYPE_CHECKING:
     from tensorsim.data.sets.engines import Engine
@@ -50,9 +51,11 @@ class DatasetBuild:
         from tensorsim.data.sets.recipe import DatasetRecipe
 
         recipe = DatasetRecipe.from_yaml(self.recipe)
-        built = build_dataset(
-            recipe, self.out, self._engine(), self.cache, self.strict, self.quiet, self.retry
-        )
+        with collected_warnings() as messages:
+            engine = self._engine()
+            built = build_dataset(recipe, self.out, engine, self.cache, self.strict, self.quiet, self.retry)
+        for message in messages:
+            print(f"tensorsim: warning: {message}", file=sys.stderr)
         print(f"{self.out}: {built.samples} samples, {built.made} of them made now")
         if built.failures:
             clips = "1 clip" if built.failures == 1 else f"{built.failures} clips"

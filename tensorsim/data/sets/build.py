@@ -2,6 +2,7 @@
 
 import json
 import os
+import warnings
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from tensorsim.data.sets.plan import Plan, Shard
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
 from tensorsim.data.sets.shards import write_shard
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.files import locked, reading, write_json
 
 #: The folder of finished shards' rows, in it the file that is written first: the recipe and the listing of the clips.
@@ -124,11 +125,20 @@ def build_dataset(
         quiet: no progress bar.
         retry: make shards again in which samples failed.
 
+    Warns:
+        TensorsimWarning: settings of walls in the recipe, and no radar with a wall.
+
     Raises:
         TensorsimError: another data set or other files in the folder, sources with other clips than when it was begun,
             another run that is writing there, a source that is not there, every sample failed, or, if ``strict``, a
             clip that fails.
     """
+    if recipe.without_effect:
+        warnings.warn(
+            f"recipe: got {', '.join(recipe.without_effect)}, which change nothing: no radar has a wall",
+            TensorsimWarning,
+            stacklevel=2,
+        )
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):

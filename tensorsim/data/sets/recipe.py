@@ -181,6 +181,10 @@ _PROCESSING = ProcessingConfig(
 )
 
 
+#: Fields of a scene that change nothing without a wall.
+_OF_WALLS = ("multipath", "wall_echo", "wall_paths", "incidence", "bounces")
+
+
 def matlab_name(array: str) -> str:
     """The variable of an array ``RADAR.OUTPUT`` in a ``.mat`` file: MATLAB's names have letters, digits and ``_``."""
     return re.sub(r"\W", "_", array)[:31]
@@ -283,6 +287,21 @@ class DatasetRecipe:
         floor = self.scene.floor if preset.floor is None else preset.floor
         scene = replace(self.scene, radar=preset.radar, wall=preset.wall, floor=floor)
         return SimulationConfig(scene=scene, processing=self.processing, seed=self.seed)
+
+    @property
+    def without_effect(self) -> list[str]:
+        """Settings of walls that the recipe changes although none of its radars has a wall."""
+        if any(radar_scene(view.preset).wall is not None for view in self.radars):
+            return []
+        of_scene, of_variations = SceneConfig(), VariationConfig()
+        changed = [
+            f"scene.{name}" for name in _OF_WALLS if getattr(self.scene, name) != getattr(of_scene, name)
+        ]
+        return changed + [
+            f"variations.{name}"
+            for name in ("wall_permittivity", "wall_thickness_m")
+            if getattr(self.variations, name) != getattr(of_variations, name)
+        ]
 
     @property
     def digest(self) -> str:

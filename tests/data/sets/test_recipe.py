@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from tensorsim import cli
 from tensorsim.config import SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
+from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.plan import Plan, shared_out
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig
@@ -17,7 +19,7 @@ from tensorsim.data.sets.scene import Scene, kept_inside, part_of, seen_from, va
 from tensorsim.data.sets.synthesis import people_gate, synthesize, view_config
 from tensorsim.data.sets.variations import Variation, VariationConfig, draw
 from tensorsim.data.skeletons import Motion
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.motion import ActivityGenerator
 from tensorsim.pipeline import PoseToDoppler
 from tests.data.sets.recipes import small_recipe
@@ -342,3 +344,21 @@ def test_an_array_tells_range_direction_and_speed(mti: Mti) -> None:
     _, _, doppler, beam = np.unravel_index(cube.argmax(), cube.shape)
     assert doppler >= 16
     assert abs((beam + 0.5) / 8 - 1 - 1.8 / distance) < 0.15
+
+
+def test_settings_of_walls_without_any_wall_are_named(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {
+        "scene": SceneConfig(wall_echo=True),
+        "variations": VariationConfig(wall_permittivity=(3.0, 6.0)),
+    }
+    free, wall = RadarView("free"), RadarView("wall", "through-wall")
+    assert small_recipe(**changes, radars=(free, wall)).without_effect == []
+    assert small_recipe(radars=(free,)).without_effect == []
+    recipe = small_recipe(**changes, radars=(free,), sources=(SourceConfig("motion", str(tmp_path)),))
+    with (
+        pytest.warns(
+            TensorsimWarning, match="scene.wall_echo, variations.wall_permittivity, which change nothing"
+        ),
+        pytest.raises(TensorsimError, match="got no clips"),
+    ):
+        build_dataset(recipe, tmp_path / "set", quiet=True)
