@@ -8,6 +8,9 @@ from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
 from tensorsim.exceptions import TensorsimError
 
+#: Options that count for ``maps`` only.
+_OF_MAPS = ("scenes", "people", "snr", "films", "film_maps", "film_people", "maps_seed", "film_seed")
+
 
 @dataclass(frozen=True)
 class TrainClassifier(TrainOptions):
@@ -17,8 +20,8 @@ class TrainClassifier(TrainOptions):
         maps: folder of maps; those that are missing are made first (hours: 12 clips per person and scene).
         data: a data set of ``tensorsim dataset build`` in place of ``maps``: its classes, its parts for training and
             validation. Beside the weights, the confusion matrix (confusion.md) and the network as TorchScript and ONNX
-            (picture_to_label.pt, .onnx) are written. Of the other options, network, size, learning_rate, masks, epochs,
-            batch and init count; ``init`` may have other classes.
+            (picture_to_label.pt, .onnx) are written. Scenes, people, snr, maps_seed and films go with ``maps`` and
+            are refused; ``init`` may have other classes.
         labels: classes of ``data`` to train on; all if none are given.
         radars: radars of ``data`` whose maps are seen, as channels; all if none are given.
         network: SPNet on 224x224 pictures, or SPGNet (s2p6) on 32x32.
@@ -68,6 +71,11 @@ class TrainClassifier(TrainOptions):
                 raise TensorsimError("--labels, --radars: got some without --data, expected none")
             self._train_on_activities(self.maps)
         elif self.data is not None:
+            given = [name for name in _OF_MAPS if getattr(self, name) != getattr(TrainClassifier, name)]
+            if given:
+                raise TensorsimError(
+                    f"--{given[0].replace('_', '-')}: got one with --data, expected none: it goes with --maps"
+                )
             self._train_on_data(self.data)
 
     def _train_on_data(self, data: Path) -> None:

@@ -79,6 +79,8 @@ def test_one_of_both_kinds_of_data(tmp_path: Path, capsys: pytest.CaptureFixture
     for arguments, message in (
         ([], "got both or none"),
         (["--maps", "m", "--labels", "a"], "got some without --data"),
+        (["--data", "d", "--snr", "20", "20"], "--snr: got one with --data, expected none"),
+        (["--data", "d", "--film-people", "3"], "--film-people: got one with --data, expected none"),
     ):
         with pytest.raises(SystemExit):
             cli.main(["train", "classifier", "--out", str(tmp_path), *arguments])
