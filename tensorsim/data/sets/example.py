@@ -38,7 +38,7 @@ outputs:
   kinds: [doppler_time]   # also range_time, range_time_mti, ridges, picture, profiles, if_signal, joints, ...
   dtype: uint8            # or float16, in dB
   range_db: 60.0
-  rate_hz: 32.0           # columns per second
+  rate_hz: 32.0           # columns per second at most; an overlap of 0.5 gives about 20
 
 split:
   by: person              # nobody is in two parts

@@ -38,7 +38,8 @@ class OutputConfig:
         dtype: of maps: ``"uint8"``, 255 at the peak and 0 at ``range_db`` below it, or ``"float16"``, decibels.
         range_db: range of uint8 maps.
         size: (rows, columns) of maps, every cell the mean power of what it covers; None keeps them.
-        rate_hz: columns per second of maps, likewise; None keeps them.
+        rate_hz: columns per second of maps at most, likewise; None keeps them. Doppler-time maps have no more than
+            Doppler frames: about 20 a second with the ``overlap`` of 0.5 that recipes have.
         picture_size, picture_speed_m_s, picture_range_db: of pictures.
         frames_per_s, beams, cube_size, points: of the outputs of an array: frames per second, directions in steps of
             equal sine, cells of range and Doppler of a cube, and points of a frame.
