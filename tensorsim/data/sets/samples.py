@@ -30,7 +30,7 @@ FIRST_COLUMNS: dict[str, type] = {
     "id": str, "part": str, "shard": str, "class_index": int, "label": str, "person": str, "origin": str, "clip": str,
     "clip_index": int, "variation": int,
 }  # fmt: skip
-LAST_COLUMNS: dict[str, type] = {"people": int, "warnings": str, "sha256": str}
+LAST_COLUMNS: dict[str, type] = {"people": int, "present_s": float, "warnings": str, "sha256": str}
 VARIATION_COLUMNS: dict[str, type] = {
     "seed": int, "height_m": float, "distance_m": float, "side_m": float, "heading_deg": float, "mirrored": bool,
     "speed": float, "start": float, "companions": str, "body": str, "snr_db": float, "sway": bool, "vital_signs": bool,
@@ -95,6 +95,7 @@ def _sample(plan: Plan, named: dict[str, Any], variation: Variation) -> Sample:
         "origin": there.origin,
         "clip": there.name,
         "people": scene.joints.shape[0],
+        "present_s": int(scene.valid.any(0).sum()) / scene.fps,
         "warnings": " | ".join(made.warnings),
         "sha256": content_hash(made.arrays, label),
     }  # fmt: skip

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -174,6 +175,7 @@ def captured(tmp_path: Path) -> DatasetRecipe:
 def test_samples_that_failed_are_tried_again_when_asked(captured: DatasetRecipe, tmp_path: Path) -> None:
     out, mended = tmp_path / "set", tmp_path / "motion" / "run" / "c.npz"
     assert build_dataset(captured, out, quiet=True) == (4, 1, 4)
+    assert {row["present_s"] for row in rows_of(out)} == {1.0}
     with (out / "failures.csv").open(newline="") as file:
         (failure,) = csv.DictReader(file)
     assert (failure["clip"], failure["samples"]) == ("run/c.npz", "2")
@@ -207,6 +209,11 @@ def test_other_clips_than_at_the_start_are_refused(captured: DatasetRecipe, tmp_
     sample = next(rows_of(out, clip="walk/b.npz"))["id"]
     with pytest.raises(TensorsimError, match=r"walk/b\.npz is missing"):
         sample_again(out, sample)
+
+
+def test_the_manifest_says_how_long_anybody_is_there(captured: DatasetRecipe, tmp_path: Path) -> None:
+    build_dataset(replace(captured, duration_s=3.0), tmp_path / "set", quiet=True)
+    assert [row["present_s"] for row in rows_of(tmp_path / "set")] == pytest.approx([1.0] * 4, abs=0.05)
 
 
 def test_a_source_that_is_not_there_leaves_no_folder(tmp_path: Path) -> None:
