@@ -21,9 +21,11 @@ from tensorsim.progress import picture, progress_bar
 from tensorsim.threads import spread
 from tensorsim.types import Detections, Pose, RadarMaps, Tracks
 from tensorsim.vision.calibration.calibrator import (
+    USUAL_FOV_RAD,
     CameraCalibrator,
     CameraEstimate,
     camera_config,
+    horizontal_fov,
     with_reserve,
 )
 from tensorsim.vision.calibration.camera_motion import BackgroundMotion
@@ -182,7 +184,8 @@ def _lifted_in_still_picture(
         return still, calibrated(stage, of_size, still.scores, tracks.valid, size, fps)[1]
 
     # Angles of turns need the field of view, which is estimated when the turns are taken out.
-    first = told(CameraConfig())
+    usual = horizontal_fov(torch.tensor(USUAL_FOV_RAD, dtype=torch.float64), *size)
+    first = told(CameraConfig(horizontal_fov_rad=float(usual)))
     second = None if first is None else told(camera_config(first[1]))
     if second is None:
         return None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from tensorsim import plot
+from tensorsim import plot, streaming
 from tensorsim.body.kinematics import rotation
 from tensorsim.body.skeleton import body_to_coco, mid_hips
 from tensorsim.config import CameraConfig
@@ -240,6 +240,20 @@ def test_somebody_who_walks_is_where_a_still_camera_sees_them(pan_deg: float) ->
     without = (course(moving) - course(still)).norm(dim=-1).mean()
     assert float(off) < 0.05
     assert float(without) > 0.2
+
+
+@pytest.mark.parametrize("size", [(480, 640), (640, 360)])
+def test_turns_are_first_taken_out_with_the_usual_field_of_view_along_the_longer_side(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Upright films with more across would seem to turn too far."""
+    focal: list[float] = []
+    monkeypatch.setattr(streaming, "still_picture", lambda *found: focal.append(found[-1]))
+    stage = VideoToPose(torch.nn.Identity(), torch.nn.Identity()).eval()
+    points = 100 + 40 * torch.rand(1, 1, 6, 17, 2, generator=torch.Generator().manual_seed(0))
+    scores, steps = torch.ones_like(points[..., 0]), torch.zeros(6, 4, dtype=torch.float64)
+    lifted_film(stage, observed(points, size), points, scores, size, 30.0, True, steps)
+    assert focal == pytest.approx([max(size) / 2 / math.tan(math.radians(30.0))], rel=1e-6)
 
 
 def test_variants_of_a_film_whose_camera_moves() -> None:
