@@ -68,8 +68,11 @@ def check_tensor(x: Tensor, name: str, layout: str, dtypes: str = "real", finite
 
 
 def check_like_weights(x: Tensor, weight: Tensor, name: str) -> None:
-    """Refuse pictures of another dtype or on another device than the weights that they meet."""
-    if x.dtype != weight.dtype or x.device != weight.device:
+    """Refuse pictures of another dtype or on another device than the weights that they meet.
+
+    Under ``torch.autocast``, which casts both, dtypes may differ.
+    """
+    if (x.dtype != weight.dtype and not is_autocast(x)) or x.device != weight.device:
         raise TensorsimError(
             f"{name}: got {x.dtype} on {x.device}, expected {weight.dtype} on {weight.device} as the weights"
         )
@@ -150,6 +153,13 @@ def is_exporting() -> bool:
     """Whether torch.export is tracing: values are then unknown, and checks of values are skipped."""
     if not torch.jit.is_scripting():
         return torch.compiler.is_exporting()
+    return False
+
+
+def is_autocast(x: Tensor) -> bool:
+    """Whether ``torch.autocast`` is on for the device of a tensor; a scripted graph does not ask."""
+    if not torch.jit.is_scripting():
+        return torch.is_autocast_enabled(x.device.type)
     return False
 
 

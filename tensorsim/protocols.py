@@ -9,6 +9,7 @@ import inspect
 import typing
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
@@ -183,13 +184,19 @@ def check_detections(found: Any) -> None:
     """Refuse what a detector returned if it is not :class:`~tensorsim.types.Detections` (or alike).
 
     Raises:
-        TensorsimError: a list of dictionaries, as torchvision's detectors return, or anything else.
+        TensorsimError: a list of dictionaries, as torchvision's detectors return, or anything else; boxes in half
+            precision.
     """
     if not all(isinstance(getattr(found, name, None), Tensor) for name in Detections._fields):
         inside = f" of {type(found[0]).__name__}" if isinstance(found, list | tuple) and found else ""
         raise TensorsimError(
             f"detector: it returned a {type(found).__name__}{inside}, expected Detections"
             f"({', '.join(Detections._fields)}) with padded tensors; see tensorsim.protocols.Detector"
+        )
+    if found.boxes.dtype not in (torch.float32, torch.float64):
+        raise TensorsimError(
+            f"detector: it returned boxes in {found.boxes.dtype}, expected float32 or float64: half precision rounds "
+            "to whole pixels"
         )
 
 

@@ -440,6 +440,14 @@ def test_refuses_bad_intervals() -> None:
         VideoToPose(RectangleDetector(), StandingPose(), detection_interval=0)
 
 
+def test_positions_are_not_rounded_by_mixed_precision() -> None:
+    with (
+        torch.autocast("cpu", torch.bfloat16),
+        pytest.raises(ts.TensorsimError, match=r"video: got it under torch\.autocast, expected that off"),
+    ):
+        pipeline()(two_clips(), FPS)
+
+
 # ---- TorchScript ---------------------------------------------------------------------------------------
 
 #: Runs where `import tensorsim` fails; loads the scripted graph and saves what it gives.

@@ -97,3 +97,5 @@ def test_results_of_detectors_are_checked() -> None:
     check_detections(Detections(*torch.zeros(4, 1)))
     with pytest.raises(ts.TensorsimError, match="it returned a list of dict, expected Detections"):
         check_detections([{"boxes": torch.zeros(1, 4)}])
+    with pytest.raises(ts.TensorsimError, match=r"boxes in torch\.float16, expected float32 or float64"):
+        check_detections(Detections(*torch.zeros(4, 1).half()))

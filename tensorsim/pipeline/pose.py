@@ -8,7 +8,14 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import coco_to_body, mid_hips
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
-from tensorsim.errors import TensorsimError, check_positive, check_rank, check_replaced, check_size
+from tensorsim.errors import (
+    TensorsimError,
+    check_positive,
+    check_rank,
+    check_replaced,
+    check_size,
+    is_autocast,
+)
 from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_part
 from tensorsim.types import Detections, Pose, Tracks
@@ -209,11 +216,16 @@ class VideoToPose(nn.Module):
                 ``fps`` frames per second, see :func:`~tensorsim.vision.smoothing.even_time.to_even_time`. None: even.
 
         Raises:
-            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive, times that do not increase.
+            TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive, times that do not increase;
+                in eager code ``torch.autocast``, and boxes of a detector in half precision.
         """
         check_rank(video, 5, "video", "(B, T, 3, H, W)")
         check_size(video, 2, 3, "video", "(B, T, 3, H, W)")
         check_positive(fps, "fps")
+        if is_autocast(video):
+            raise TensorsimError(
+                "video: got it under torch.autocast, expected that off: it would round positions in pixels and metres"
+            )
         b, t, height, width = video.shape[0], video.shape[1], video.shape[3], video.shape[4]
         if b == 0 or t < 2:
             raise TensorsimError(

@@ -295,3 +295,12 @@ def test_normalisation_is_that_of_the_authors() -> None:
     """KAIR builds its networks with an epsilon of 1e-4, ten times that of torch."""
     norms = [module for module in DnCNN(depth=5).modules() if isinstance(module, nn.BatchNorm2d)]
     assert [norm.eps for norm in norms] == [1e-4] * 3
+
+
+def test_mixed_precision_casts_what_another_layer_gives() -> None:
+    images = torch.rand(1, 6, 9)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = small()(images.bfloat16())
+    assert torch.allclose(found.float(), small()(images), atol=0.1)
+    with pytest.raises(TensorsimError, match=r"expected torch\.float32 on cpu as the weights"):
+        small()(images.bfloat16())
