@@ -14,7 +14,7 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock, local
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import cv2
 import numpy as np
@@ -40,11 +40,12 @@ Run = Callable[[Images], list[Images]]
 
 
 class OnnxEngine(nn.Module):
-    """Runs a network (N, 3, H, W) -> one or several tensors (N, ...) in another runtime on the CPU, elsewhere as it is.
+    """Runs a network (N, 3, H, W) -> one or several tensors (N, ...) in another runtime on the CPU.
 
-    Without gradients. In float32 answers agree to rounding (1e-5 of the largest), in bfloat16 and in 8-bit integers,
-    for crops of people in [0, 1], to about 5 % of the largest. Bfloat16 is for processors with instructions for it; on
-    others OpenVINO computes in float32.
+    Images on other devices, of another dtype or size, or with gradients are given to the network itself. The runtime
+    keeps the weights of its first call: where they change later, build a new engine. In float32 answers agree to
+    rounding (1e-5 of the largest), in bfloat16 and in 8-bit integers, for crops of people in [0, 1], to about 5 % of
+    the largest. Bfloat16 is for processors with instructions for it; on others OpenVINO computes in float32.
 
     Args:
         network: with static shapes but for N; it is put into evaluation mode.
@@ -69,7 +70,8 @@ class OnnxEngine(nn.Module):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """The outputs of the network, flat."""
-        if images.device.type != "cpu" or images.dtype != torch.float32 or images.shape[0] == 0:
+        as_exported = images.dtype == torch.float32 and images.shape[2:] == self.size and images.shape[0] > 0
+        if images.device.type != "cpu" or images.requires_grad or not as_exported:
             return _flat(self.network(images))
         with _OPENING:
             if self._run is None:
@@ -82,6 +84,12 @@ class OnnxEngine(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_run": None}
+
+    def __prepare_scriptable__(self) -> NoReturn:
+        raise TensorsimError(
+            f"{type(self).__name__}: cannot be scripted: another runtime runs it, expected the network itself "
+            "(--engine torch)"
+        )
 
 
 class OnnxPose(nn.Module):
@@ -114,7 +122,12 @@ class OnnxDetector(nn.Module):
 
     def preprocess(self, images: Tensor) -> Tensor:
         """As the detector does, to the bit; 8-bit images on the CPU by OpenCV, in less than half the time."""
-        if images.dtype != torch.uint8 or images.device.type != "cpu" or images.shape[1:2] != (3,):
+        if (
+            images.dtype != torch.uint8
+            or images.device.type != "cpu"
+            or images.shape[1:2] != (3,)
+            or not images.numel()
+        ):
             return self.detector.preprocess(images)
         side = self.detector.input_size
         height, width = letterbox_size(images.shape[-2], images.shape[-1], side)

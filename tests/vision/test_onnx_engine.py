@@ -64,6 +64,17 @@ def test_pictures_are_prepared_to_the_bit_as_in_torch(shape: tuple[int, int]) ->
         OnnxDetector(detector).preprocess(images[0])
     with pytest.raises(TensorsimError, match="images"):
         OnnxDetector(detector).preprocess(images[:, :2])
+    with pytest.raises(TensorsimError, match="images: got an empty tensor"):
+        OnnxDetector(detector).preprocess(images[:, :, :0])
+
+
+def test_other_sizes_and_gradients_are_of_the_network_itself() -> None:
+    network = nn.Conv2d(3, 17, 3, stride=4)
+    engine = OnnxEngine(network, (8, 8))
+    larger, images = torch.rand(1, 3, 16, 12), torch.rand(1, 3, 8, 8, requires_grad=True)
+    assert torch.equal(engine(larger)[0], network(larger))
+    engine(images)[0].sum().backward()
+    assert images.grad is not None
 
 
 def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -> None:
