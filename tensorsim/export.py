@@ -26,7 +26,7 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
 
     Raises:
         TensorsimError: the path is a folder, or the module contains a stage that cannot be scripted,
-            such as ``OnnxHeatmaps``.
+            such as ``OnnxHeatmaps``; what TorchScript says of it is the cause.
     """
     if os.path.isdir(path):
         raise TensorsimError(f"{os.fspath(path)}: is a folder, expected a file to write")
@@ -36,6 +36,13 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
         warnings.filterwarnings("ignore", message=r".*torch\.jit.*deprecated")
         try:
             scripted = torch.jit.script(module.eval())
+        except TensorsimError:
+            raise
+        except Exception as error:  # TorchScript's errors share no base class
+            raise TensorsimError(
+                f"to_torchscript: got a {type(module).__name__} that TorchScript cannot compile "
+                f"({_first_line(error)})"
+            ) from error
         finally:
             for part in training:
                 part.training = True
@@ -93,9 +100,9 @@ def to_onnx(
                 verbose=False,
             )
         except Exception as error:  # the exporter's errors share no base class
-            cause = str(error.__cause__ or error).strip().splitlines()
+            cause = _first_line(error.__cause__ or error)
             raise TensorsimError(
-                f"to_onnx: got a {type(module).__name__} that ONNX cannot express ({cause[0] if cause else error})"
+                f"to_onnx: got a {type(module).__name__} that ONNX cannot express ({cause})"
             ) from error
         finally:
             for part in training:
@@ -121,3 +128,8 @@ class ComplexPairs(nn.Module):
         """Pairs (..., 2) to what the stage returns, complex numbers as pairs."""
         found = self.stage(torch.view_as_complex(pairs))
         return torch.view_as_real(found) if found.is_complex() else found
+
+
+def _first_line(error: BaseException) -> str:
+    """What an error says first, or its class if it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(":")

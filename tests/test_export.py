@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 import tensorsim as ts
+from tensorsim.vision.onnx_engine import OnnxPose
 
 
 class Unscriptable(nn.Module):
@@ -38,10 +39,17 @@ def test_a_folder_is_refused(tmp_path: Path) -> None:
 
 def test_leaves_nothing_behind_when_scripting_fails(tmp_path: Path) -> None:
     (tmp_path / "m.pt").write_bytes(b"old")
-    with pytest.raises(Exception, match="globals"):
+    with pytest.raises(
+        ts.TensorsimError, match=r"got a Unscriptable that TorchScript cannot compile .*globals"
+    ):
         ts.export.to_torchscript(Unscriptable(), tmp_path / "m.pt")
     assert [p.name for p in tmp_path.iterdir()] == ["m.pt"]
     assert (tmp_path / "m.pt").read_bytes() == b"old"
+
+
+def test_a_network_in_another_runtime_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ts.TensorsimError, match="another runtime runs it, expected the network itself"):
+        ts.export.to_torchscript(OnnxPose(nn.Conv2d(3, 17, 1)), tmp_path / "pose.pt")
 
 
 def test_an_onnx_network_is_an_edge_and_says_so(tmp_path: Path, shared_data: Path) -> None:
