@@ -241,3 +241,13 @@ def check_count(value: int, least: int, most: int, name: str) -> None:
     """Refuse what is no integer from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         raise TensorsimError(f"{name}: got {value}, expected an integer from {least} to {most}")
+
+
+def check_per_person(values: object, name: str) -> None:
+    """Refuse what is no tuple or list of positive finite numbers, one per person."""
+    if not isinstance(values, tuple | list):
+        raise TensorsimError(f"{name}: got {values!r}, expected a tuple of one number per person")
+    if len(values) == 0:
+        raise TensorsimError(f"{name}: got no values, expected one per person")
+    for value in values:
+        check_positive(value, name)

@@ -175,6 +175,17 @@ def check_part(part: Any, slot: str) -> nn.Module:
     return part
 
 
+def check_instance(part: Any, kind: type, name: str) -> None:
+    """Refuse a ready part of another class.
+
+    Raises:
+        TensorsimError: something else, or the class in place of an instance.
+    """
+    if not isinstance(part, kind):
+        got = f"the class {part.__name__}" if inspect.isclass(part) else f"a {type(part).__name__}"
+        raise TensorsimError(f"{name}: got {got}, expected an instance of {kind.__name__}")
+
+
 def is_pose_estimator(part: nn.Module) -> bool:
     """Whether a module is called like a :class:`PoseEstimator` and not like a :class:`HeatmapNetwork`."""
     return _takes(part, 3) and not _takes(part, 1)

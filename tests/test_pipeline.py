@@ -20,6 +20,7 @@ from tensorsim.motion import JointScatterers
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.results import Axes, doppler_span, people_of
 from tensorsim.streaming import maps_of_pose
+from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 from tests.film import RectangleDetector, StandingPose, film, walker
 from tests.stage import StageTester, assert_same
@@ -438,6 +439,45 @@ def test_gradients_flow_from_maps_to_joints() -> None:
 def test_refuses_bad_intervals() -> None:
     with pytest.raises(ts.TensorsimError, match="detection_interval: got 0"):
         VideoToPose(RectangleDetector(), StandingPose(), detection_interval=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames_per_batch": "8"}, "frames_per_batch: got '8', expected an integer from 1"),
+        ({"detection_interval": 2.5}, r"detection_interval: got 2\.5, expected an integer from 1"),
+        ({"fewest_joints": 15}, "fewest_joints: got 15, expected an integer from 1 to 14"),
+        ({"keypoint_threshold": 2.0}, r"keypoint_threshold: got 2\.0, expected a score in \(0, 1\)"),
+        ({"person_height_m": 1.75}, r"person_height_m: got 1\.75, expected a tuple of one number per person"),
+        ({"metric_pose": 3}, "metric_pose: got a int, expected an instance of Module"),
+        ({"bone_fit": BoneFit}, "bone_fit: got the class BoneFit, expected an instance of Module"),
+    ],
+)
+def test_refuses_bad_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ts.TensorsimError, match=message):
+        VideoToPose(RectangleDetector(), StandingPose(), **options)
+
+
+def test_refuses_other_parts_in_place_of_ready_ones() -> None:
+    simulator = ts.radar.RadarSimulator(RADAR)
+    with pytest.raises(
+        ts.TensorsimError, match="simulator: got a RadarConfig, expected an instance of RadarSimulator"
+    ):
+        PoseToDoppler(RADAR)  # type: ignore[arg-type]
+    with pytest.raises(ts.TensorsimError, match=r"rcs_scale: got inf, expected a positive finite number"):
+        PoseToDoppler(simulator, rcs_scale=(math.inf,))
+    with pytest.raises(
+        ts.TensorsimError, match="video_to_pose: got the class VideoToPose, expected an instance"
+    ):
+        VideoToDoppler(video_to_pose=VideoToPose)  # type: ignore[arg-type]
+    with pytest.raises(
+        ts.TensorsimError, match="pose_to_doppler: got a RadarSimulator, expected an instance"
+    ):
+        pipeline(pose_to_doppler=simulator, radar=None)
+    with pytest.raises(
+        ts.TensorsimError, match="video_to_doppler: got a PoseToDoppler, expected an instance"
+    ):
+        VideoToActivity(PoseToDoppler(simulator), nn.Identity())  # type: ignore[arg-type]
 
 
 def test_positions_are_not_rounded_by_mixed_precision() -> None:

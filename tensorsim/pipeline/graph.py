@@ -13,7 +13,7 @@ from tensorsim.errors import TensorsimError, TensorsimWarning, check_replaced
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.pipeline.networks import pretrained_pose
 from tensorsim.pipeline.pose import VideoToPose
-from tensorsim.protocols import check_part
+from tensorsim.protocols import check_instance, check_part
 from tensorsim.radar.presets import radar_scene
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.recognition.recognizer import ActivityRecognizer
@@ -87,6 +87,7 @@ class VideoToDoppler(nn.Module):
                 "camera": camera,
                 "detection_interval": detection_interval,
             }
+            check_instance(video_to_pose, VideoToPose, "video_to_pose")
             check_replaced("video_to_pose", {name: value is not None for name, value in of_pose.items()})
         self.video_to_pose = video_to_pose
         if pose_to_doppler is None:
@@ -94,6 +95,7 @@ class VideoToDoppler(nn.Module):
             scene = replace(scene, multipath=multipath, leakage=leakage, wall_echo=wall_echo, snr_db=snr_db)
             pose_to_doppler = PoseToDoppler(RadarSimulator(scene), denoiser=denoiser)
         else:
+            check_instance(pose_to_doppler, PoseToDoppler, "pose_to_doppler")
             of_radar = {"radar": radar is not None, "wall": wall is not None, "multipath": multipath}
             of_radar |= {"leakage": leakage, "wall_echo": wall_echo, "snr_db": snr_db != SceneConfig().snr_db}
             check_replaced("pose_to_doppler", of_radar | {"denoiser": denoiser is not None})
@@ -196,7 +198,7 @@ class VideoToActivity(nn.Module):
         recognizer: :class:`RadarMaps` -> logits (B, classes); see :class:`tensorsim.recognition.ActivityRecognizer`.
 
     Raises:
-        TensorsimError: a recognizer made for another radar, or that is none.
+        TensorsimError: a recognizer made for another radar, or parts that are not such stages.
 
     Example:
         >>> sim = ts.VideoToActivity.from_pretrained()
@@ -205,6 +207,7 @@ class VideoToActivity(nn.Module):
 
     def __init__(self, video_to_doppler: VideoToDoppler, recognizer: nn.Module) -> None:
         super().__init__()
+        check_instance(video_to_doppler, VideoToDoppler, "video_to_doppler")
         self.video_to_doppler = video_to_doppler
         self.recognizer = check_part(recognizer, "recognizer")
         radar = video_to_doppler.pose_to_doppler.simulator.radar

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import SimulationConfig
 from tensorsim.enhance.choice import map_denoiser
-from tensorsim.errors import TensorsimError, check_tensor
+from tensorsim.errors import TensorsimError, check_per_person, check_tensor
 from tensorsim.motion.absence import continued
 from tensorsim.motion.body13 import Body13Scatterers
 from tensorsim.motion.body_scatterers import BodyScatterers
@@ -19,7 +19,7 @@ from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.motion.sway import PosturalSway
 from tensorsim.motion.vital_signs import VitalSigns
-from tensorsim.protocols import check_part
+from tensorsim.protocols import check_instance, check_part
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import RadarMaps
 
@@ -61,6 +61,7 @@ class PoseToDoppler(nn.Module):
         small_motions: Sequence[nn.Module] = (),
     ) -> None:
         super().__init__()
+        check_instance(simulator, RadarSimulator, "simulator")
         self.simulator = simulator
         prf_hz = simulator.radar.prf_hz
         self.resampler = resampler if resampler is not None else PoseResampler(prf_hz)
@@ -78,8 +79,7 @@ class PoseToDoppler(nn.Module):
         self.small_motions = nn.ModuleList(small_motions)
         self.denoises = denoiser is not None
         self.denoiser = check_part(nn.Identity() if denoiser is None else denoiser, "denoiser")
-        if len(rcs_scale) == 0 or not all(scale > 0 for scale in rcs_scale):
-            raise TensorsimError(f"rcs_scale: got {rcs_scale}, expected positive factors, one per person")
+        check_per_person(rcs_scale, "rcs_scale")
         self.register_buffer("rcs_scale", torch.tensor(rcs_scale, dtype=torch.float64), persistent=False)
         self.register_buffer(
             "radar_m", torch.tensor(simulator.radar.middle_m, dtype=torch.float64), persistent=False

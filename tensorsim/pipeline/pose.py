@@ -1,6 +1,7 @@
 """Video -> people with smooth 3D joints: detection, tracking, 2D pose, lifting, position, smoothing."""
 
 import copy
+from numbers import Integral
 from typing import Final
 
 import torch
@@ -10,6 +11,7 @@ from tensorsim.body.skeleton import coco_to_body, mid_hips
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_positive,
     check_rank,
     check_replaced,
@@ -17,7 +19,7 @@ from tensorsim.errors import (
     is_autocast,
 )
 from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
-from tensorsim.protocols import check_detections, check_part
+from tensorsim.protocols import check_detections, check_instance, check_part
 from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.lifting.hidden_legs import HiddenLegs
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
@@ -57,7 +59,7 @@ class VideoToPose(nn.Module):
             keypoints that are exact; None leaves it out.
 
     Raises:
-        TensorsimError: ``detection_interval`` or ``frames_per_batch`` below 1; a ``metric_pose`` beside heights,
+        TensorsimError: numbers out of range; a ``metric_pose`` beside heights,
             distances or a camera; parts that are not such stages.
     """
 
@@ -86,8 +88,11 @@ class VideoToPose(nn.Module):
             ("detection_interval", detection_interval),
             ("frames_per_batch", frames_per_batch),
         ):
-            if value < 1:
-                raise TensorsimError(f"{name}: got {value}, expected at least 1")
+            if not isinstance(value, Integral) or value < 1:
+                raise TensorsimError(f"{name}: got {value!r}, expected an integer from 1")
+        check_count(fewest_joints, 1, 14, "fewest_joints")
+        if not 0 < keypoint_threshold < 1:
+            raise TensorsimError(f"keypoint_threshold: got {keypoint_threshold}, expected a score in (0, 1)")
         self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
@@ -101,6 +106,7 @@ class VideoToPose(nn.Module):
                 "camera": camera,
             }
             check_replaced("metric_pose", {name: value is not None for name, value in ignored.items()})
+            check_instance(metric_pose, nn.Module, "metric_pose")
         if lifter is None:
             lifter = _lifter_beside(metric_pose, keypoint_threshold)
         # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
@@ -113,10 +119,11 @@ class VideoToPose(nn.Module):
         self.camera_m = known.position_m
         self.sides = SteadySides(threshold=keypoint_threshold)
         self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
+        check_instance(self.bone_fit, nn.Module, "bone_fit")
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.hidden_legs = HiddenLegs()
         self.keypoint_threshold = keypoint_threshold
-        self.detection_interval = detection_interval
+        self.detection_interval = int(detection_interval)
         self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
         #: Who is hidden for longer is gone until they are seen again.
@@ -129,7 +136,7 @@ class VideoToPose(nn.Module):
         self.top_speed_m_s = 12.0
         #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
         self.least_score = 0.5
-        self.frames_per_batch = frames_per_batch
+        self.frames_per_batch = int(frames_per_batch)
 
     @classmethod
     def from_config(

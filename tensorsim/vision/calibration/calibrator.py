@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
-from tensorsim.errors import TensorsimError, check_key_points, check_positive
+from tensorsim.errors import TensorsimError, check_key_points, check_per_person, check_positive
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
     LEAN,
@@ -159,10 +159,7 @@ class CameraCalibrator(nn.Module):
         most_frames: int = 120,
     ) -> None:
         super().__init__()
-        if len(person_height_m) == 0:
-            raise TensorsimError("CameraCalibrator.person_height_m: got no values, expected at least one")
-        for value in person_height_m:
-            check_positive(value, "CameraCalibrator.person_height_m")
+        check_per_person(person_height_m, "CameraCalibrator.person_height_m")
         check_positive(height_sd_m, "CameraCalibrator.height_sd_m")
         check_positive(keypoint_threshold, "CameraCalibrator.keypoint_threshold")
         if most_frames < 1:

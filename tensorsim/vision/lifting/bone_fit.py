@@ -21,7 +21,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.proportions import ANKLE_HEIGHT, FLESH
-from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, is_exporting
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_per_person,
+    check_points,
+    check_positive,
+    is_exporting,
+)
 from tensorsim.vision.lifting.bone_branches import choose_branches
 from tensorsim.vision.lifting.bone_cost import (
     FREE_JOINTS,
@@ -96,11 +103,9 @@ class BoneFit(nn.Module):
             ("range_m", range_m),
             ("trust", trust),
             ("floor_m", floor_m),
-            *((f"person_height_m[{i}]", height) for i, height in enumerate(person_height_m)),
         ):
             check_positive(value, f"BoneFit.{name}")
-        if len(person_height_m) == 0:
-            raise TensorsimError("BoneFit.person_height_m: got no values, expected one per person")
+        check_per_person(person_height_m, "BoneFit.person_height_m")
         self.cost = BoneCost(length_share, depth_m, range_m, trust, floor_m, calibrated)
         self.descent = BoneDescent(self.cost)
         self.bone_m, self.steps, self.rounds, self.calibrated = bone_m, steps, rounds, calibrated

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
-from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive
+from tensorsim.errors import TensorsimError, check_finite, check_per_person, check_points, check_positive
 from tensorsim.geometry.camera import back_project, camera_to_world
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.floor import (
@@ -180,10 +180,7 @@ class MetricPose(nn.Module):
         self.distance_gives_focal = initial_distance_m is not None
         distances = PANEL_DISTANCES_M if initial_distance_m is None else initial_distance_m
         for name, values in (("person_height_m", person_height_m), ("initial_distance_m", distances)):
-            if len(values) == 0:
-                raise TensorsimError(f"MetricPose.{name}: got no values, expected one per person")
-            for value in values:
-                check_positive(value, f"MetricPose.{name}")
+            check_per_person(values, f"MetricPose.{name}")
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
         self.register_buffer("distances", torch.tensor(distances, dtype=torch.float64), persistent=False)
         self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)

@@ -18,6 +18,7 @@ from tensorsim.errors import (
     check_count,
     check_finite,
     check_floating,
+    check_per_person,
     check_points,
     check_positive,
     check_size,
@@ -113,10 +114,7 @@ class TemporalLifter(nn.Module):
         super().__init__()
         check_positive(keypoint_threshold, "TemporalLifter.keypoint_threshold")
         check_count(frames_per_block, 1, 2**31, "TemporalLifter.frames_per_block")
-        if len(person_height_m) == 0:
-            raise TensorsimError("TemporalLifter.person_height_m: got no values, expected one per person")
-        for height in person_height_m:
-            check_positive(height, "TemporalLifter.person_height_m")
+        check_per_person(person_height_m, "TemporalLifter.person_height_m")
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
         self.camera_known, self.log_bones = camera_known, math.log(_ALL_BONES)
