@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.onnx_operations import translations
+from tensorsim.protocols import check_instance
 
 
 def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
@@ -25,9 +26,10 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
         path: file to write; it appears only when complete.
 
     Raises:
-        TensorsimError: the path is a folder, or the module contains a stage that cannot be scripted,
+        TensorsimError: no module, the path is a folder, or the module contains a stage that cannot be scripted,
             such as ``OnnxHeatmaps``; what TorchScript says of it is the cause.
     """
+    check_instance(module, nn.Module, "to_torchscript")
     if os.path.isdir(path):
         raise TensorsimError(f"{os.fspath(path)}: is a folder, expected a file to write")
     training = [part for part in module.modules() if part.training]
@@ -69,14 +71,22 @@ def to_onnx(
         outputs: names of the outputs.
 
     Raises:
-        TensorsimError: the path is a folder, or the module has an operation that ONNX does not have.
+        TensorsimError: no module, the path is a folder, an example that is one tensor, dynamic dimensions that the
+            example does not have, or an operation that ONNX does not have.
     """
+    check_instance(module, nn.Module, "to_onnx")
+    if isinstance(example, Tensor):
+        raise TensorsimError("to_onnx: got a tensor as example, expected a tuple of the inputs")
     if os.path.isdir(path):
         raise TensorsimError(f"{os.fspath(path)}: is a folder, expected a file to write")
     shapes: Any = None
     if dynamic:
         for i, dimensions in dynamic.items():
             for d, name in dimensions.items():
+                if not (0 <= i < len(example) and 0 <= d < example[i].dim()):
+                    raise TensorsimError(
+                        f"to_onnx: got dimension {d} of input {i} for {name}, expected one of the example, from 0"
+                    )
                 if example[i].shape[d] < 2:
                     raise TensorsimError(
                         f"to_onnx: got {example[i].shape[d]} for the dynamic dimension {name}, expected at least 2"

@@ -37,6 +37,13 @@ def test_a_folder_is_refused(tmp_path: Path) -> None:
         ts.export.to_torchscript(nn.Linear(1, 1), tmp_path)
 
 
+def test_what_is_no_module_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        ts.TensorsimError, match="to_torchscript: got the class Linear, expected an instance of Module"
+    ):
+        ts.export.to_torchscript(nn.Linear, tmp_path / "m.pt")  # type: ignore[arg-type]
+
+
 def test_leaves_nothing_behind_when_scripting_fails(tmp_path: Path) -> None:
     (tmp_path / "m.pt").write_bytes(b"old")
     with pytest.raises(

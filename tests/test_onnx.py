@@ -162,6 +162,17 @@ def test_a_dynamic_dimension_needs_two(tmp_path: Path) -> None:
         ts.export.to_onnx(nn.Linear(1, 1), tmp_path / "m.onnx", (torch.zeros(1, 1),), {0: {0: "batch"}})
 
 
+def test_an_example_is_a_tuple_and_has_the_dynamic_dimensions(tmp_path: Path) -> None:
+    linear, example = nn.Linear(2, 2), torch.zeros(3, 2)
+    with pytest.raises(ts.TensorsimError, match="got a tensor as example, expected a tuple of the inputs"):
+        ts.export.to_onnx(linear, tmp_path / "m.onnx", example)  # type: ignore[arg-type]
+    for dynamic in ({1: {0: "batch"}}, {0: {2: "batch"}}, {0: {-2: "batch"}}):
+        with pytest.raises(
+            ts.TensorsimError, match=r"dimension -?\d of input \d for batch, expected one of the example"
+        ):
+            ts.export.to_onnx(linear, tmp_path / "m.onnx", (example,), dynamic)
+
+
 def test_pairs_stand_for_complex_numbers() -> None:
     x = torch.randn(2, 64, 20, dtype=torch.complex64)
     mti = ts.radar.MovingTargetIndicator()

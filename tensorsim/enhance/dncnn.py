@@ -20,6 +20,7 @@ from tensorsim.errors import (
     check_like_weights,
     check_min_rank,
     check_not_empty,
+    is_exporting,
 )
 
 #: How a map is scaled to an image for the network, see :class:`MapDenoiser`.
@@ -201,13 +202,15 @@ class MapDenoiser(nn.Module):
             whose floor is 0 has no noise and is returned unchanged.
 
         Raises:
-            TensorsimError: not real, fewer than two dimensions, empty, or NaN.
+            TensorsimError: not real, fewer than two dimensions, empty, or NaN; negative values with ``"floor"``.
         """
         check_floating(maps, "MapDenoiser")
         check_min_rank(maps, 2, "MapDenoiser", "(..., H, W)")
         check_not_empty(maps, "MapDenoiser")
         check_finite(maps, "MapDenoiser")
         if self.scale == "floor":
+            if not is_exporting() and bool((maps < 0).any()):
+                raise TensorsimError("MapDenoiser: got negative values, expected linear magnitudes, not dB")
             floor = map_floor(maps)
             images = torch.log1p(maps / torch.where(floor > 0, floor, torch.ones_like(floor)))
             return (maps - floor * (images - self.clean(images))).clamp(min=0.0)

@@ -97,7 +97,7 @@ def ksvd_denoise(
     noisy = image.detach().cpu().double()
     sigma = noise_deviation(noisy) if sigma is None else sigma
     if sigma == 0:
-        return image.clone()
+        return image.detach().clone()
     patches = unfold(noisy[None, None], side)[0].T  # (patches, side^2)
     means = patches.mean(1, keepdim=True)
     centred = (patches - means).numpy()
@@ -151,7 +151,8 @@ class KSVD(nn.Module):
         check_min_rank(maps, 2, "KSVD", "(..., H, W)")
         check_not_empty(maps, "KSVD")
         check_finite(maps, "KSVD")
-        flat = maps.reshape(-1, maps.shape[-2], maps.shape[-1])
+        # Its scale alone would have a gradient, which is none of the whole.
+        flat = maps.detach().reshape(-1, maps.shape[-2], maps.shape[-1])
         return torch.stack([self._clean(one) for one in flat]).reshape(maps.shape)
 
     @staticmethod

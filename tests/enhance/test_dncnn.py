@@ -247,6 +247,11 @@ def test_noise_counts_in_floors() -> None:
     assert_same(MapDenoiser(network, scale="floor")(1e-6 * maps), 1e-6 * clean, atol=1e-15)
 
 
+def test_a_map_in_decibels_is_refused_where_noise_counts_in_floors() -> None:
+    with pytest.raises(TensorsimError, match="got negative values, expected linear magnitudes"):
+        MapDenoiser(small(), scale="floor")(torch.full((6, 9), -40.0))
+
+
 def test_a_map_without_a_floor_has_no_noise() -> None:
     maps = torch.zeros(6, 9)
     maps[2] = 5.0

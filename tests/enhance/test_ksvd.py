@@ -49,6 +49,13 @@ def test_leaves_a_flat_image_alone() -> None:
     assert torch.equal(ksvd_denoise(image), image)
 
 
+def test_a_map_has_no_gradient() -> None:
+    maps = torch.full((12, 12), 0.4, requires_grad=True)
+    assert not ksvd_denoise(maps).requires_grad
+    noisy = torch.rand(9, 9, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    assert not KSVD()(noisy).requires_grad
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
