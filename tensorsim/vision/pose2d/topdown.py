@@ -120,8 +120,8 @@ class TopDownPose(nn.Module):
         """Find the keypoints of each valid box.
 
         Args:
-            images: (B, 3, H, W) RGB, floats in [0, 1] or ``uint8``.
-            boxes: (B, P, 4) ``xyxy`` pixels.
+            images: (B, 3, H, W) RGB, floats in [0, 1] of any precision or ``uint8``.
+            boxes: (B, P, 4) ``xyxy`` pixels, in the precision of the network.
             valid: (B, P) bool.
 
         Returns:
@@ -169,7 +169,8 @@ class TopDownPose(nn.Module):
             crops, height, width = self.wide_crop(images, boxes, index), self.crop.width, self.crop.height
         else:
             crops, height, width = self.crop(images, boxes, index), self.crop.height, self.crop.width
-        points, scores = self.decoder(self.network(torch.rot90(crops, turns, [2, 3])))
+        crops = torch.rot90(crops.to(boxes.dtype), turns, [2, 3])
+        points, scores = self.decoder(self.network(crops))
         points = turn_back(points, turns, height, width)
         points = crop_to_image(points, boxes, height, width, self.crop.padding)
         return points.to(boxes.dtype), scores.to(boxes.dtype)

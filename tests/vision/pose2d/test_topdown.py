@@ -241,6 +241,15 @@ def test_scripted_takes_other_clips() -> None:
         assert_same(scripted(images, boxes, valid), pose(images, boxes, valid), atol=1e-6)
 
 
+@pytest.mark.parametrize("image_type", [torch.float16, torch.float64])
+def test_images_may_have_another_type_than_the_network(image_type: torch.dtype) -> None:
+    tester = TestWithHRNet()
+    images, boxes, valid = tester.inputs((2,), torch.float32)
+    pose = tester.make()
+    with torch.no_grad():
+        assert_same(pose(images.to(image_type), boxes, valid), pose(images, boxes, valid), atol=1e-2)
+
+
 def test_crop_size_comes_from_the_network() -> None:
     assert TopDownPose(HRNet(HRNetConfig(4, 1, (1, 1, 1), 1, 4), (128, 96))).crop.height == 128
     assert TopDownPose(Brightness()).crop.width == 192
