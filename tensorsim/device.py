@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import torch
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, first_line
 
 
 def usable_device(name: str) -> torch.device:
@@ -22,8 +22,7 @@ def usable_device(name: str) -> torch.device:
         # Some devices have tensors but no values (meta), or a name but no library.
         usable = float(torch.ones(2, device=device).sum()) == 2.0
     except Exception as error:  # each backend has errors of its own
-        why = (str(error) or type(error).__name__).splitlines()[0]
-        raise TensorsimError(f"--device: {name!r} is not usable here: {why}") from None
+        raise TensorsimError(f"--device: {name!r} is not usable here: {first_line(error)}") from None
     if not usable:
         raise TensorsimError(f"--device: {name!r} is not usable here: it computes a wrong sum")
     return device

@@ -15,6 +15,7 @@ from tensorsim.exceptions import TensorsimError as TensorsimError
 from tensorsim.exceptions import TensorsimWarning as TensorsimWarning
 from tensorsim.exceptions import check_positive as check_positive
 from tensorsim.exceptions import collected_warnings as collected_warnings
+from tensorsim.exceptions import first_line as first_line
 
 
 def check_is_tensor(x: Any, name: str) -> None:

@@ -20,6 +20,11 @@ def check_positive(value: float, name: str) -> None:
         raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
 
 
+def first_line(error: BaseException) -> str:
+    """What an error says first, or its class if it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(":")
+
+
 @contextmanager
 def collected_warnings() -> Iterator[list[str]]:
     """The messages of tensorsim's own warnings in the block, each once; other warnings pass through."""

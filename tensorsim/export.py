@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, first_line
 from tensorsim.files import complete_file
 from tensorsim.onnx_operations import translations
 from tensorsim.protocols import check_instance
@@ -43,7 +43,7 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
         except Exception as error:  # TorchScript's errors share no base class
             raise TensorsimError(
                 f"to_torchscript: got a {type(module).__name__} that TorchScript cannot compile "
-                f"({_first_line(error)})"
+                f"({first_line(error)})"
             ) from error
         finally:
             for part in training:
@@ -110,7 +110,7 @@ def to_onnx(
                 verbose=False,
             )
         except Exception as error:  # the exporter's errors share no base class
-            cause = _first_line(error.__cause__ or error)
+            cause = first_line(error.__cause__ or error)
             raise TensorsimError(
                 f"to_onnx: got a {type(module).__name__} that ONNX cannot express ({cause})"
             ) from error
@@ -138,8 +138,3 @@ class ComplexPairs(nn.Module):
         """Pairs (..., 2) to what the stage returns, complex numbers as pairs."""
         found = self.stage(torch.view_as_complex(pairs))
         return torch.view_as_real(found) if found.is_complex() else found
-
-
-def _first_line(error: BaseException) -> str:
-    """What an error says first, or its class if it says nothing."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(":")

@@ -8,7 +8,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, first_line
 from tensorsim.files import complete_file, sha256_of
 from tensorsim.model_files import manifest, models_dir
 
@@ -286,12 +286,12 @@ def fetch(entry: ModelEntry, quiet: bool = False, unverified: bool = False) -> P
     import gdown
     import requests
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         gdown.download(entry.url, str(path), quiet=quiet, use_cookies=False, resume=True, timeout=30)
     except (OSError, requests.exceptions.RequestException, gdown.exceptions.DownloadError) as error:
         raise TensorsimError(
-            f"{entry.name}: could not fetch {entry.url} ({type(error).__name__}: {str(error).splitlines()[0]}); "
+            f"{entry.name}: could not fetch {entry.url} ({type(error).__name__}: {first_line(error)}); "
             f"with a connection elsewhere, save it as {path}, or give the path of a copy"
         ) from error
     digest = verify(entry)

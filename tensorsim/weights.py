@@ -20,7 +20,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, first_line
 from tensorsim.files import check_pickle_memo, complete_file
 
 PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
@@ -316,7 +316,6 @@ def _read_pickle(path: Path, data: bytes) -> Any:
     except TensorsimError as error:
         raise TensorsimError(f"{path}: {error}") from None
     except Exception as error:  # a damaged pickle can raise anything
-        summary = (str(error).strip() or "no details").splitlines()[0]
         raise TensorsimError(
-            f"{path}: damaged or not a file of weights ({type(error).__name__}: {summary})"
+            f"{path}: damaged or not a file of weights ({type(error).__name__}: {first_line(error)})"
         ) from error

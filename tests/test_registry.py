@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -139,6 +140,18 @@ def test_offline_says_what_to_do(entry: ModelEntry) -> None:
         TensorsimError, match=r"could not fetch http://127.0.0.1:9.*save it as .*test-net.pth"
     ):
         registry.fetch(offline, quiet=True)
+
+
+def test_a_cache_that_cannot_be_made_and_an_error_without_words_are_said(
+    entry: ModelEntry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gdown.download", Mock(side_effect=TimeoutError()))
+    with pytest.raises(TensorsimError, match=r"could not fetch .* \(TimeoutError: TimeoutError\)"):
+        registry.fetch(entry, quiet=True)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(registry, "cache_dir", lambda: tmp_path / "file")
+    with pytest.raises(TensorsimError, match=r"could not fetch .* \(FileExistsError: "):
+        registry.fetch(entry, quiet=True)
 
 
 def test_names_and_paths_are_told_apart(tmp_path: Path) -> None:
