@@ -44,6 +44,10 @@ def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
     left, right, bottom, top = axes.images[0].get_extent()
     assert np.allclose([left, right, bottom, top], [-0.05, 0.65, -2.5, 2.5])
     assert axes.images[0].origin == "lower"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["ridge 1", "ridge 2", "ridge 3"]
+    figure.canvas.draw()
+    assert legend.get_window_extent().y1 < axes.get_window_extent().y0, "covers nothing of the map"
 
 
 def test_long_maps_are_thinned_by_power() -> None:

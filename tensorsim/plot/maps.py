@@ -190,6 +190,16 @@ def map_figure(
         axes.set_title(heading)
         axes.set_xlabel("time in s")
     row[0].set_ylabel(axis_label)
+    if row[0].lines:
+        # Below the maps, where it covers nothing.
+        figure.legend(
+            handles=row[0].lines,
+            loc="outside lower center",
+            ncols=len(row[0].lines),
+            fontsize="small",
+            markerscale=3,
+            facecolor="darkgray",
+        )
     if subtitle is not None:
         figure.suptitle(subtitle, fontsize="small", color="dimgray")
     if speed_per_axis is not None:
@@ -246,7 +256,6 @@ def _draw_ridges(axes: Axes, time_s: np.ndarray, ridges: np.ndarray) -> None:
     for i, ridge in enumerate(ridges):
         colour = RIDGE_COLOURS[i % len(RIDGE_COLOURS)]
         axes.plot(time_s, ridge, ".", color=colour, markersize=2.5, markeredgewidth=0, label=f"ridge {i + 1}")
-    axes.legend(loc="upper right", fontsize="small", markerscale=3, facecolor="darkgray", framealpha=0.8)
 
 
 def confusion_figure(counts: np.ndarray, names: list[str], title: str) -> Figure:
