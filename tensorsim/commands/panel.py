@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
-import tyro
+from tensorsim.commands.numbers import numbers
 
-_XYZ = tyro.conf.arg(metavar="X Y Z")
+_XYZ = numbers("X Y Z")
 
 
 class Parameter(NamedTuple):

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tensorsim.commands.numbers import numbers
 
 if TYPE_CHECKING:
     from tensorsim.config import SimulationConfig
@@ -44,7 +44,7 @@ class ReceiverOptions:
     12."""
     clutter: Literal["none", "room"] | None = None
     """Furniture and walls of a room before a sensor that vibrates. Default: none."""
-    interference: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    interference: Annotated[tuple[float, float, float] | None, numbers("X Y Z")] = None
     """Another radar of the same band at this place in metres, with slower sweeps. Default: none."""
 
     def with_receiver(self, config: "SimulationConfig") -> "SimulationConfig":

@@ -10,6 +10,7 @@ import tyro
 
 from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
+from tensorsim.commands.numbers import numbers
 from tensorsim.commands.options import (
     RadarOptions,
     Run,
@@ -99,7 +100,7 @@ class Simulate(NetworkOptions, RadarOptions):
     """Where to stop."""
     stride: int = 1
     """Keep every n-th frame."""
-    image_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
+    image_size: Annotated[tuple[int, int] | None, numbers("WIDTH HEIGHT", int)] = None
     """Pixels of the pictures that keypoints were found in, where their file does not say."""
     clip: str | None = None
     """Which motion of a file with several: the name of an array, or subject and action as in "S1/Walking"."""

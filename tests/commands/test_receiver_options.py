@@ -64,6 +64,29 @@ def test_each_option_sets_its_field_and_changes_the_maps(option: str) -> None:
     assert np.abs(found - without).max() > 1e-4 * without.max()
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--interference", "1", "3"], "Missing value for argument '--interference'. Expected 3 values."),
+        (["--interference", "1,3,1"], "Missing value for argument '--interference'. Expected 3 values."),
+        (["--wall-size", "5", "b", "2"], "Error parsing --wall-size: got 5 b 2, expected 3 numbers"),
+        (
+            ["--image-size", "640", "36.5"],
+            "Error parsing --image-size: got 640 36.5, expected 2 whole numbers",
+        ),
+    ],
+)
+def test_numbers_that_are_missing_or_none_are_said(
+    given: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        cli.parse(["simulate", "film.mp4", "--out", "out", *given])
+    assert exit_.value.code == 2
+    assert message in capsys.readouterr().err
+    taken = cli.parse(["simulate", "--interference", "-1", "3", "1.5", "film.mp4", "--out", "out"])
+    assert (taken.interference, taken.source) == ((-1.0, 3.0, 1.5), Path("film.mp4"))
+
+
 def test_the_paper_has_an_ideal_receiver(tmp_path: Path) -> None:
     typical = RadarOptions(receiver="typical", clutter="room", sway=True, interference=(2.0, 6.0, 1.5))
     typical.configuration().to_yaml(tmp_path / "run.yaml")

@@ -1,0 +1,29 @@
+"""Options of several numbers."""
+
+from typing import Any
+
+from tyro.constructors import PrimitiveConstructorSpec
+
+
+def numbers(metavar: str, kind: type[float] = float) -> PrimitiveConstructorSpec[Any]:
+    """How the command line reads an option that is None by default.
+
+    Args:
+        metavar: what the help calls the numbers, one word each, such as ``"X Y Z"``.
+        kind: ``float`` or ``int``.
+    """
+
+    def read(given: list[str]) -> tuple[float, ...]:
+        try:
+            return tuple(kind(number) for number in given)
+        except ValueError:
+            whole = "whole " if kind is int else ""
+            raise ValueError(f"got {' '.join(given)}, expected {len(given)} {whole}numbers") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=len(metavar.split()),
+        metavar=metavar,
+        instance_from_str=read,
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: ["None"] if value is None else [str(number) for number in value],
+    )
