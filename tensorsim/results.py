@@ -2,6 +2,7 @@
 
 import math
 import uuid
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from tensorsim.config import CameraConfig, RadarConfig, SimulationConfig
 from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
 from tensorsim.device import one_thread
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.progress import picture, progress_bar
@@ -282,6 +284,40 @@ def write_overlay(
     return strip
 
 
+def check_length(frames: int, fps: float, stage: PoseToDoppler, uncertain: int = 0) -> None:
+    """Refuse what is shorter than a Doppler window.
+
+    Args:
+        frames: how many there are.
+        fps: frames per second.
+        stage: makes the maps.
+        uncertain: how many more there may be.
+
+    Raises:
+        TensorsimError: it is shorter.
+    """
+    pulses, prf_hz = stage.simulator.min_pulses, stage.resampler.prf_hz
+    if stage.resampler.pulses(frames + uncertain, fps) < pulses:
+        raise TensorsimError(
+            f"frames: got {frames} at {fps:.4g} fps, expected at least {math.ceil((pulses - 0.5) / prf_hz * fps)} "
+            f"for one Doppler window of {pulses / prf_hz:.3g} s (--stft-window)"
+        )
+
+
+def _chosen(found: Found, people: str, fps: float) -> Found:
+    """Those of the people found who count, with a warning where there is nobody."""
+    chosen = found._replace(pose=select_people(found.pose, people, fps))
+    if bool(found.pose.valid.any()) and not bool(chosen.pose.valid.any()):
+        warnings.warn(
+            f"people {people!r} leaves out everybody who was found: the maps show the empty scene",
+            TensorsimWarning,
+            stacklevel=2,
+        )
+    else:
+        warn_of_empty_clips(chosen.pose.valid)
+    return chosen
+
+
 @contextmanager
 def simulated(
     source: "Source",
@@ -295,12 +331,15 @@ def simulated(
 
     The overlay film is written in another thread meanwhile, and during the block; it is complete at its end. Until then
     torch computes on one thread.
+
+    Raises:
+        TensorsimError: see :func:`check_length`, and :func:`~tensorsim.vision.tracking.selection.select_people`.
     """
     found = source.find(quiet)
-    found = found._replace(pose=select_people(found.pose, config.pose.people, source.fps))
+    check_length(found.pose.valid.shape[2], source.fps, stage)
+    found = _chosen(found, config.pose.people, source.fps)
     found = within_reach(found, config.scene.radar)
     pose = found.pose
-    warn_of_empty_clips(pose.valid)
     picture(
         "world",
         lambda: _figure_pixels(

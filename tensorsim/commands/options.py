@@ -182,8 +182,9 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         from tensorsim import results
 
         pose, maps, stage = run.pose, run.maps, run.stage
-        label = results.label_of(run.recognizer, maps, pose.valid.shape[2] / run.fps, self.least_probability)
-        warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()))
+        duration_s = pose.valid.shape[2] / run.fps
+        label = results.label_of(run.recognizer, maps, duration_s, self.least_probability)
+        warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()), duration_s)
         pictures = self.pictures(stage, label["label"], run.film, run.somebody)
         axes, formats = results.axes_of(stage, maps), array_formats(self.save)
 
@@ -319,6 +320,8 @@ def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "Sim
 
 #: Speeds that the radars of the classifiers' training resolve (the through-wall preset: 0.6 m/s), with a margin.
 COARSEST_M_S = 0.8
+#: Scenes that are not much shorter than the shortest clips of the classifiers' training (2.4 s).
+SHORTEST_S = 2.0
 
 
 def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
@@ -356,10 +359,19 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
     return recognizer
 
 
-def warn_of_label(recognizer: "ActivityRecognizer | None", config: "SimulationConfig", people: int) -> None:
-    """Say where a label means little: several people in one scene, or a map that the network was not trained on."""
+def warn_of_label(
+    recognizer: "ActivityRecognizer | None", config: "SimulationConfig", people: int, duration_s: float
+) -> None:
+    """Say where a label means little: several people, a short scene, or a map that the network was not trained on."""
     if recognizer is None:
         return
+    if people > 0 and duration_s < SHORTEST_S:
+        warnings.warn(
+            f"the scene lasts {duration_s:.3g} s: its label means little, the shipped classifiers were trained on "
+            "clips of 2.4 to 5 s",
+            TensorsimWarning,
+            stacklevel=2,
+        )
     if people > 1:
         warnings.warn(
             "several people are in the scene: the label is of all of them, the classifier was trained on one person",

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     import torch
 
     from tensorsim.config import SimulationConfig
-    from tensorsim.pipeline import PoseToDoppler
     from tensorsim.sources import Source
 
 #: Options that say something of some kinds of source only.
@@ -134,7 +133,8 @@ class Simulate(NetworkOptions, RadarOptions):
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             check_drawable(stage)
-            self._check_length(source, stage)
+            if source.frame_count is not None:  # files announce a frame or two too few
+                results.check_length(source.frame_count, source.fps, stage, uncertain=2)
             with complete_or_nothing(self.out, self.source) as folder:
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)
                 with simulated as (found, maps, strip):
@@ -157,19 +157,6 @@ class Simulate(NetworkOptions, RadarOptions):
             print(f"tensorsim: warning: {message}", file=sys.stderr)
         people = number_of_people(int(pose.valid[0].any(1).sum()))
         print(f"{self.out}: {people} in {pose.valid.shape[2]} frames, {described_label(label)}")
-
-    def _check_length(self, source: "Source", stage: "PoseToDoppler") -> None:
-        """Refuse what is shorter than a Doppler window before anybody is looked for."""
-        if source.frame_count is None:
-            return
-        # Files announce a frame or two too few.
-        longest = stage.resampler.pulses(source.frame_count + 2, source.fps)
-        if longest < stage.simulator.min_pulses:
-            prf_hz = stage.resampler.prf_hz
-            raise TensorsimError(
-                f"{self.source}: got {source.frame_count / source.fps:.3g} s, expected at least "
-                f"{stage.simulator.min_pulses / prf_hz:.3g} s for one Doppler window (--stft-window)"
-            )
 
     def configuration(self) -> "SimulationConfig":
         """The configuration with the options that say how people are found."""

@@ -45,6 +45,8 @@ def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
     assert summary["source"]["kind"] == "motion"
     assert summary["frames"] == 45
     assert summary["config"]["tracking"]["detector"] is None
+    (warning,) = summary["warnings"]
+    assert warning.startswith("the scene lasts 1.5 s: its label means little")
 
     simulator = ts.radar.RadarSimulator(
         ts.RadarConfig.through_wall(), ts.WallConfig(), multipath=True, snr_db=None
@@ -53,6 +55,17 @@ def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
     valid = torch.ones(1, 1, 45, dtype=torch.bool)
     expected = ts.PoseToDoppler(simulator)(joints, valid, FPS).doppler_time[0].numpy()
     assert maps["doppler_time"] == pytest.approx(expected, abs=2e-3 * float(expected.max()))
+
+
+def test_that_nobody_moves_is_said(tmp_path: Path) -> None:
+    """Not that nobody was found; the empty scene may be as short as it likes."""
+    np.savez(
+        tmp_path / "still.npz", joints=np.random.default_rng(0).random((1, 14, 3)).repeat(30, 0), fps=FPS
+    )
+    out = tmp_path / "out"
+    cli.main(["simulate", str(tmp_path / "still.npz"), "--out", str(out), "--people", "moving", *QUICK])
+    (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
+    assert warning == "people 'moving' leaves out everybody who was found: the maps show the empty scene"
 
 
 def test_maps_at_display_rate_or_of_every_pulse(walk: np.ndarray, tmp_path: Path) -> None:
@@ -156,7 +169,12 @@ def test_keypoints_give_what_a_video_gives(
         ("walk.npz", ["--clip", "nothing"], r"got the motion 'nothing', expected one of joints \(--clip\)"),
         ("walk.npz", ["--stride", "40"], "got 1 of its 30 frames"),
         ("walk.npz", ["--config", "one_bin.yaml"], "range_gate_m: got a gate that holds one range bin"),
-        ("walk.npz", ["--stft-window", "60"], r"got 1 s, expected at least 60 s for one Doppler window"),
+        (
+            "walk.npz",
+            ["--stft-window", "60"],
+            r"frames: got 30 at 30 fps, expected at least 1801 for one .* of 60 s",
+        ),
+        ("walk.npz", ["--end", "0.1"], r"frames: got 3 at 30 fps, expected at least 4 for one .* of 0.109 s"),
         ("nothing.bvh", [], "nothing.bvh: no such file"),
         ("nothing.json", ["--fps", "30"], "nothing.json: no such file"),
         ("walk.json", [], "walk.json: got keypoints without a frame rate, expected --fps"),
