@@ -108,8 +108,8 @@ class Live(NetworkOptions, RadarOptions):
                 print(f"showing http://127.0.0.1:{page.port}/ (Ctrl-C ends)", file=sys.stderr)
             film = None if self.record is None else stack.enter_context(VideoWriter(self.record, camera.fps))
             try:
-                for frame, dropped in camera.frames():
-                    for _ in range(dropped):
+                for frame, missing in camera.frames():
+                    for _ in range(missing):
                         missed = live.miss()
                         view.add(missed)
                         self._say(missed, camera)
@@ -119,7 +119,7 @@ class Live(NetworkOptions, RadarOptions):
                     if page is not None:
                         page.show(picture)
                     if film is not None:
-                        for _ in range(1 + dropped):  # the film of the page lasts as long as what was filmed
+                        for _ in range(1 + missing):  # the film of the page lasts as long as what was filmed
                             film.add(picture)
                     self._say(new, camera)
                     if self.seconds is not None and new.time_s >= self.seconds:

@@ -20,10 +20,10 @@ _STREAMS = ("rtsp://", "rtsps://", "rtmp://", "http://", "https://", "udp://", "
 
 
 class Grabbed(NamedTuple):
-    """A frame (3, H, W) uint8 RGB, and how many frames before it are missing."""
+    """A frame (3, H, W) uint8 RGB, and how many frames before it are missing: dropped, or not in the source."""
 
     frame: Tensor
-    dropped: int
+    missing: int
 
 
 @dataclass
@@ -38,7 +38,7 @@ class _State:
 class Camera:
     """Frames of a camera at a constant rate; those that come while the consumer is busy are dropped and counted.
 
-    So are those that a source does not have where its frames come at uneven times.
+    Those that a source does not have where its frames come at uneven times are missing as well, but not dropped.
 
     Args:
         source: the number of a camera, the address of a stream, or a file.
@@ -91,12 +91,12 @@ class Camera:
             state.closed = True
             thread.join(timeout=2.0)
 
-    def _counted(self, numbered: Iterator[tuple[int, Tensor]]) -> Iterator[Grabbed]:
+    @staticmethod
+    def _counted(numbered: Iterator[tuple[int, Tensor]]) -> Iterator[Grabbed]:
         """Frames with the numbers of those between them that are missing."""
         last = -1
         for index, frame in numbered:
             missing, last = index - last - 1, index
-            self.dropped += missing
             yield Grabbed(frame, missing)
 
     def _waited_for(
@@ -123,6 +123,7 @@ class Camera:
                 if self.is_file:
                     time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
                 with arrived:
+                    self.dropped += len(waiting) == WAITING
                     waiting.append((index, frame))
                     arrived.notify()
                 if state.closed:

@@ -166,7 +166,7 @@ class LiveSimulator:
 
     @torch.inference_mode()
     def miss(self) -> LiveFrame:
-        """Take note of a frame that was dropped: people go on as they moved."""
+        """Take note of a frame that is missing: people go on as they moved."""
         self.index += 1
         self.missed += 1
         self.tracks = self.tracker.step(self.tracks, None)
