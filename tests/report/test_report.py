@@ -42,7 +42,10 @@ def run() -> tuple[Pose, RadarMaps, Axes, dict[str, Any]]:
         "probabilities": {"S8 Walking": 0.75, "S1 Empty": 0.25},
         "timeline": [{"start_s": 0.0, "end_s": 2.0, "label": "S8 Walking", "probability": 0.75}],
         "people": people_of(pose, FPS, config.scene.radar),
-        "warnings": ["</script><script>document.title = 'broken out'</script>"],
+        "warnings": [
+            "</script><script>document.title = 'broken out'</script>",
+            f"/{'long' * 30}.mp4: cut off",
+        ],
         "config": document,
         **{part: document["scene"][part] for part in ("radar", "wall")},
     }
