@@ -37,8 +37,9 @@ class Scene3D {
 
   // The box around the radar and all hips, which the view is centred on.
   measure() {
-    this.low = [-1, 0, 0];
-    this.high = [1, 2, 2];
+    const antennas = (axis) => this.scene.antennas_m.map((antenna) => antenna[axis]);
+    this.low = [-1, 0, 0].map((least, axis) => Math.min(least, ...antennas(axis)));
+    this.high = [1, 2, 2].map((most, axis) => Math.max(most, ...antennas(axis)));
     for (let person = 0; person < this.people.count; person++) {
       for (let frame = 0; frame < this.frames; frame++) {
         if (!this.isThere(person, frame)) continue;

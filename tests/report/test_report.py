@@ -150,6 +150,7 @@ def test_a_browser_plays_it(
         assert page.inner_text("#warnings li").startswith("</script>")
         assert page.evaluate("document.documentElement.scrollWidth") <= 420, "wider than a telephone"
 
+        assert page.evaluate(FAR_RADAR) == [[-1, 0, 0], [5.2, 2, 2.5]], "the radar is in view"
         dark = page.evaluate("document.querySelector('#maps canvas').toDataURL()")
         page.select_option("#colours", "gray")
         assert page.evaluate("document.querySelector('#maps canvas').toDataURL()") != dark
@@ -174,6 +175,12 @@ def test_a_browser_plays_it(
         assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
 
 
+#: The box that a scene without people shows, whose antennas are far to the right.
+FAR_RADAR = """() => {
+  const nobody = { joints_cm: "", valid: "", count: 0 };
+  const scene = new Scene3D(document.createElement("canvas"), nobody, { antennas_m: [[5, 0, 1.5], [5.2, 0, 2.5]] });
+  return [scene.low, scene.high];
+}"""
 #: Seconds that the shown picture is from: of the film beside, or by the grey of the pictures in the page.
 FILM_TIME = """(fps) => {
   const video = document.querySelector("#film video");
