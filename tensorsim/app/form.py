@@ -27,6 +27,7 @@ _MORE = {
         "seed",
     ],
     "CAMERA": ["camera_fov", "calibrate", "position", "fps", "start", "end", "stride", "flip_test"],
+    "MOTION CAPTURE": ["clip", "heading"],
     "PICTURES": ["colormap", "dynamic_range", "hide_ridges", "figure_format", "full_rate", "sound"],
 }
 GROUPS = ("VISION", "RADAR", "WALL", "PROCESSING", *_MORE)
@@ -111,12 +112,12 @@ def for_demo(options: dict[str, Any]) -> dict[str, Any]:
     """The same options for a generated person.
 
     Raises:
-        TensorsimError: an option that a film alone has.
+        TensorsimError: an option that a file alone has.
     """
     unknown = [name for name in options if name not in Demo.__dataclass_fields__]
     if unknown:
         raise TensorsimError(
-            f"{unknown[0].replace('_', ' ')}: got it for a generated person, expected it for a film only"
+            f"{unknown[0].replace('_', ' ')}: got it for a generated person, expected it for a file only"
         )
     return options
 

@@ -94,9 +94,9 @@ class Simulate(NetworkOptions, RadarOptions):
     fps: float | None = None
     """Frames per second, instead of what the file says."""
     start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Where to start."""
+    """Where to start, in seconds of the film."""
     end: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Where to stop."""
+    """Where to stop, in seconds of the film."""
     stride: int = 1
     """Keep every n-th frame."""
     image_size: Annotated[tuple[int, int] | None, numbers("WIDTH HEIGHT", int)] = None
@@ -104,7 +104,7 @@ class Simulate(NetworkOptions, RadarOptions):
     clip: str | None = None
     """Which motion of a file with several: the name of an array, or subject and action as in "S1/Walking"."""
     heading: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
-    """Turn of captured motion about the vertical, counter-clockwise seen from above."""
+    """Turn of captured motion about the vertical in degrees, counter-clockwise seen from above."""
 
     def run(self) -> None:
         """Do it."""

@@ -52,6 +52,8 @@ def test_values_of_controls_become_options() -> None:
         "carrier_hz": None,
         "denoiser": " ",
         "mti": "",
+        "clip": "S1/Walking",
+        "heading": "30",
     }
     options = options_of(values)
     assert options == {
@@ -62,6 +64,8 @@ def test_values_of_controls_become_options() -> None:
         "range_window": "hann",
         "vital_signs": True,
         "flip_test": False,
+        "clip": "S1/Walking",
+        "heading": 30.0,
     }
     command = Simulate(source=Path("film.mp4"), out=Path("out"), scene="through-wall", **options)
     config = command.configuration()
