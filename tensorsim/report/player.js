@@ -6,6 +6,9 @@ class Film {
       this.video = holder.appendChild(document.createElement("video"));
       this.video.muted = true;
       this.video.preload = "auto";
+      this.video.addEventListener("error", () => {
+        holder.querySelector("figcaption").textContent = `Film (${film.beside} cannot be read beside this page)`;
+      });
       this.video.src = film.beside;
       return;
     }
@@ -26,7 +29,7 @@ class Film {
   play(playing, speed) {
     if (!this.video) return;
     this.video.playbackRate = speed;
-    if (playing) this.video.play();
+    if (playing) this.video.play().catch(() => {}); // without its file the maps play alone
     else this.video.pause();
   }
 

@@ -175,6 +175,26 @@ def test_a_browser_plays_it(
         assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
 
 
+@pytest.mark.slow
+def test_a_browser_plays_the_maps_without_the_film_beside(
+    tmp_path: Path, run: tuple[Pose, RadarMaps, Axes, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(film_module, "MOST_FRAMES", 10)
+    written(tmp_path, run, strip(tmp_path))
+    (tmp_path / "report.webm").unlink()
+    with chromium() as browser:
+        page = browser.new_page()
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto((tmp_path / "report.html").as_uri())
+        page.wait_for_selector("body[data-ready=yes]")
+        page.click("#play")
+        page.wait_for_timeout(300)
+        assert page.inner_text("#film figcaption") == "Film (report.webm cannot be read beside this page)"
+        assert float(page.input_value("#time")) > 0
+        assert errors == []
+
+
 #: The box that a scene without people shows, whose antennas are far to the right.
 FAR_RADAR = """() => {
   const nobody = { joints_cm: "", valid: "", count: 0 };
