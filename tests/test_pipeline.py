@@ -436,6 +436,19 @@ def test_gradients_flow_from_maps_to_joints() -> None:
     assert bool((joints.grad != 0).any())
 
 
+def test_gradients_flow_from_maps_to_frames() -> None:
+    """Through crops, heat maps and key points; who is where is found without gradients."""
+    motion = ts.motion.ActivityGenerator().generate("walking", batch=1, seed=1, duration_s=0.4, rate_hz=20.0)
+    frames = ts.data.PersonRenderer(height=180, width=240)(motion.joints[:1], seed=1).frames
+    frames = (frames.reshape(1, -1, 3, 180, 240) / (255 if frames.dtype == torch.uint8 else 1)).float()
+    out = ts.VideoToDoppler.from_pretrained()(frames.requires_grad_(True), 20.0)
+    assert bool(out.valid.any())
+    out.doppler_time.square().sum().backward()
+    assert frames.grad is not None
+    assert torch.isfinite(frames.grad).all()
+    assert bool((frames.grad != 0).any())
+
+
 def test_refuses_bad_intervals() -> None:
     with pytest.raises(ts.TensorsimError, match="detection_interval: got 0"):
         VideoToPose(RectangleDetector(), StandingPose(), detection_interval=0)

@@ -129,7 +129,8 @@ class PoseConfig:
                 f"PoseConfig.lifter_weights: got {self.lifter_weights!r} with the nearest lifter, expected it with "
                 "lifter='temporal'"
             )
-        if self.people not in ("all", "moving", "nearest") and not self.people.isdecimal():
+        number = isinstance(self.people, str) and self.people.isdecimal() and int(self.people) >= 1
+        if self.people not in ("all", "moving", "nearest") and not number:
             raise TensorsimError(
                 f"PoseConfig.people: got {self.people!r}, expected 'all', 'moving', 'nearest' or a number from 1"
             )
@@ -141,8 +142,8 @@ class PoseConfig:
             values = getattr(self, name)
             if values is None:
                 continue
-            if len(values) == 0:
-                raise TensorsimError(f"PoseConfig.{name}: got no values, expected one per person")
+            if not hasattr(values, "__len__") or len(values) == 0:
+                raise TensorsimError(f"PoseConfig.{name}: got {values!r}, expected a tuple of one per person")
             for value in values:
                 require_positive("PoseConfig", **{name: value})
 

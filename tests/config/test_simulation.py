@@ -250,3 +250,17 @@ def test_bodies_and_small_motions_are_those_of_the_scene() -> None:
     assert_same(scripted(still, valid, 30.0), alive, atol=1e-5)
     for module in (stage, scripted):
         assert_same([module.doppler_time(still, valid, 30.0)], [alive.doppler_time], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("people", "0", "people: got '0', expected 'all', 'moving', 'nearest' or a number from 1"),
+        ("people", 2, "people: got 2, expected"),
+        ("person_height_m", 1.75, "person_height_m: got 1.75, expected a tuple of one per person"),
+        ("initial_distance_m", (), r"initial_distance_m: got \(\), expected a tuple"),
+    ],
+)
+def test_people_that_cannot_be_are_refused(field: str, value: object, message: str) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        ts.PoseConfig(**{field: value})  # type: ignore[arg-type]
