@@ -7,7 +7,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_not_empty
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_like_weights,
+    check_not_empty,
+)
 
 Network = TypeVar("Network", bound="ImageClassifier")
 
@@ -16,9 +22,10 @@ def centred(pictures: Tensor, mean: Tensor, name: str) -> Tensor:
     """Images (..., C, H, W) as a batch (B, C, H, W), less the mean (C,) of each channel.
 
     Raises:
-        TensorsimError: another number of channels, no images, NaN.
+        TensorsimError: another number of channels, dtype or device than that of the mean, no images, NaN.
     """
     check_floating(pictures, name)
+    check_like_weights(pictures, mean, name)
     channels = mean.shape[0]
     if pictures.dim() < 3 or pictures.shape[-3] != channels:
         raise TensorsimError(

@@ -44,6 +44,10 @@ class TestSPNet(StageTester):
             ((torch.zeros(0, 2, 8, 8),), "got an empty tensor"),
             ((torch.full((2, 8, 8), float("inf")),), "NaN or infinite"),
             ((torch.zeros(2, 8, 8, dtype=torch.uint8),), "expected a real floating point tensor"),
+            (
+                (torch.zeros(2, 8, 8, dtype=torch.float64),),
+                f"{name}: got torch.float64 on cpu, expected torch.float32",
+            ),
         ]
 
 
