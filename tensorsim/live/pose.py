@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body
+from tensorsim.body.skeleton import coco_to_body, mid_hips
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside, lowered, lowest_ankle
 from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict, kalman_update
 
@@ -70,6 +70,7 @@ class CausalPose(nn.Module):
         self.brief_gap = int(brief_gap_s * fps)
         self.floor_frames = max(1, int(metric_pose.floor_window_s * fps))
         self.floor_quantile = 0.15
+        self.least_width = 0.2  # of a box that the edge of the picture cuts, in its heights
         # Gain -3 dB at 1 Hz: sizes of 4 % error, somebody who starts to walk within half a second.
         self.size_density, self.size_noise, self.size_speed = 0.1, 0.04**2, 0.3
         self.unknown = 0.1 * _WIDE * self.size_noise  # variance from which a size is not known
@@ -115,18 +116,22 @@ class CausalPose(nn.Module):
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         reliable = (body_scores >= self.keypoint_threshold) & there[:, None]
         body_scores = body_scores * reliable
-        usable = there & (reliable.sum(dim=-1) >= self.fewest_joints)
+        cut_off = cut_off_beside(boxes, width)
+        # A few joints or a strip of somebody who leaves by the edge of the picture determine no pose.
+        fewest = torch.where(cut_off, self.metric_pose.whole_body_joints, self.fewest_joints)
+        inside = boxes[:, 2].clamp(max=width) - boxes[:, 0].clamp(min=0)
+        strip = cut_off & (inside < self.least_width * (boxes[:, 3] - boxes[:, 1]))
+        usable = there & (reliable.sum(dim=-1) >= fewest) & ~strip
         lifted = self.lifter(body[:, None], body_scores[:, None])
 
         whole = usable & (reliable.sum(dim=-1) >= self.metric_pose.whole_body_joints)
         whole = whole & (lifted.distance[:, 0] < self.metric_pose.poor_fit)
         first = whole & ((state.size.p00[:, 0] >= self.unknown) | (state.missed > self.brief_gap))
-        cut_off = cut_off_beside(boxes, width)[:, None]
         size = self._filtered(
             state.size,
             lifted.scale.clamp(min=1.0).log(),
             self.size_density,
-            torch.where(cut_off, 25 * self.size_noise, self.size_noise).double(),
+            torch.where(cut_off[:, None], 25 * self.size_noise, self.size_noise).double(),
             self.size_speed,
             whole[:, None],
             first[:, None],
@@ -145,7 +150,7 @@ class CausalPose(nn.Module):
         low = torch.where(usable, lowest_ankle(placed), torch.nan)
         lows = torch.cat([state.lows[:, 1:], low[:, None]], dim=-1)
         placed = lowered(placed, torch.nanquantile(lows, self.floor_quantile, dim=-1).nan_to_num())
-        return self._after(state, placed, seen, usable, scores, size, lows)
+        return self._after(state, placed, seen, usable, cut_off, scores, size, lows)
 
     def _after(
         self,
@@ -153,6 +158,7 @@ class CausalPose(nn.Module):
         placed: Tensor,
         seen: Tensor,
         usable: Tensor,
+        cut_off: Tensor,
         scores: Tensor,
         size: KalmanState,
         lows: Tensor,
@@ -161,6 +167,10 @@ class CausalPose(nn.Module):
         hidden = torch.where(seen, 0, state.hidden + 1)
         measured = usable[:, None] & (seen | (hidden > self.brief_gap))
         newly = usable & (state.missed > self.brief_gap)
+        # What is beyond the edge of the picture goes along with the hips: nothing else is known of it.
+        along = state.shown + (mid_hips(placed) - mid_hips(state.shown))[:, None]
+        beyond = cut_off[:, None] & usable[:, None] & ~seen & ~newly[:, None]
+        placed, measured = torch.where(beyond[..., None], along, placed), measured | beyond
         joints = self._filtered(
             state.joints,
             placed,

@@ -55,9 +55,8 @@ class LiveView:
                 torch.stack([getattr(person, name) for person in new.people]).float().numpy()
                 for name in ("box", "keypoints", "scores")
             )
-            image = plot.draw_people(
-                image, boxes, keypoints, scores, np.ones(len(new.people), bool), self.threshold
-            )
+            present = np.array([person.present for person in new.people])
+            image = plot.draw_people(image, boxes, keypoints, scores, present, self.threshold)
         small = cv2.resize(image, (WIDTH, round(image.shape[0] * WIDTH / image.shape[1])))
         text = f"{new.time_s:.1f} s   delay {new.delay_s:.2f} s   dropped {dropped}"
         small[:26] = small[:26] // 4  # a dark bar behind the text

@@ -136,6 +136,34 @@ def test_sizes_of_who_is_cut_off_by_the_edge_count_little(left_px: float, off: t
     assert off[0] <= abs(found / true - 1) <= off[1]
 
 
+def test_who_leaves_by_the_edge_is_followed_while_enough_is_seen() -> None:
+    """What is beyond the edge goes along with the hips; a few joints, or a strip of a box, are nobody."""
+    stage = simulator().poses[0]
+    state = stage.begin(1)
+    swing = torch.zeros(17, 2)
+    with torch.no_grad():
+        for t in range(12):
+            swing[16, 0] = 4.0 * t  # the right ankle, ahead of the body
+            points = torch.tensor(STANDING)[None] * 120 + torch.tensor([200.0 + 4 * t, 30.0]) + swing
+            box = torch.tensor([[180.0 + 4 * t, 30.0, 300.0, 170.0]])
+            state = stage(state, points, torch.full((1, 17), 0.9), box, torch.tensor([True]), 240, 320)
+        scores = torch.full((1, 17), 0.9)
+        scores[0, 16] = 0.1
+        box = torch.tensor([[230.0, 30.0, 320.0, 170.0]])
+        before = state.shown[0]
+        for _ in range(8):  # far longer than the smoother predicts
+            points = points + torch.tensor([2.0, 0.0])
+            state = stage(state, points, scores, box, torch.tensor([True]), 240, 320)
+        about = [shown[10] - shown[[8, 11]].mean(dim=0) for shown in (before, state.shown[0])]
+        assert float((about[1] - about[0]).norm()) < 0.25
+        assert int(state.missed) == 0
+        few = torch.where(torch.arange(17) < 9, scores, 0.1)
+        strip = torch.tensor([[300.0, 30.0, 325.0, 170.0]])
+        for seen, where, missed in ((few, INSIDE, 0), (few, box, 1), (scores, strip, 2), (scores, box, 0)):
+            state = stage(state, points, seen, where, torch.tensor([True]), 240, 320)
+            assert int(state.missed) == missed
+
+
 def test_who_was_hidden_is_placed_anew() -> None:
     stage = simulator().poses[0]
 
