@@ -250,5 +250,5 @@ def check_per_person(values: object, name: str) -> None:
         raise TensorsimError(f"{name}: got {values!r}, expected a tuple of one number per person")
     if len(values) == 0:
         raise TensorsimError(f"{name}: got no values, expected one per person")
-    for value in values:
-        check_positive(value, name)
+    for person, value in enumerate(values):
+        check_positive(value, f"{name}[{person}]")

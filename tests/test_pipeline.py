@@ -477,7 +477,9 @@ def test_refuses_other_parts_in_place_of_ready_ones() -> None:
         ts.TensorsimError, match="simulator: got a RadarConfig, expected an instance of RadarSimulator"
     ):
         PoseToDoppler(RADAR)  # type: ignore[arg-type]
-    with pytest.raises(ts.TensorsimError, match=r"rcs_scale: got inf, expected a positive finite number"):
+    with pytest.raises(
+        ts.TensorsimError, match=r"rcs_scale\[0\]: got inf, expected a positive finite number"
+    ):
         PoseToDoppler(simulator, rcs_scale=(math.inf,))
     with pytest.raises(
         ts.TensorsimError, match="video_to_pose: got the class VideoToPose, expected an instance"

@@ -5,7 +5,7 @@ from typing import Literal
 
 from tensorsim.config.camera import CameraConfig
 from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_per_person
 
 Position = Literal["camera", "paper"]
 Lifting = Literal["temporal", "nearest"]
@@ -139,13 +139,8 @@ class PoseConfig:
                 f"PoseConfig.keypoint_threshold: got {self.keypoint_threshold!r}, expected a score in (0, 1)"
             )
         for name in ("person_height_m", "person_weight_kg", "initial_distance_m"):
-            values = getattr(self, name)
-            if values is None:
-                continue
-            if not hasattr(values, "__len__") or len(values) == 0:
-                raise TensorsimError(f"PoseConfig.{name}: got {values!r}, expected a tuple of one per person")
-            for value in values:
-                require_positive("PoseConfig", **{name: value})
+            if getattr(self, name) is not None:
+                check_per_person(getattr(self, name), f"PoseConfig.{name}")
 
     def rcs_scale(self, person: int) -> float:
         """Factor on the cross sections of this person, by weight."""

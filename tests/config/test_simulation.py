@@ -257,8 +257,8 @@ def test_bodies_and_small_motions_are_those_of_the_scene() -> None:
     [
         ("people", "0", "people: got '0', expected 'all', 'moving', 'nearest' or a number from 1"),
         ("people", 2, "people: got 2, expected"),
-        ("person_height_m", 1.75, "person_height_m: got 1.75, expected a tuple of one per person"),
-        ("initial_distance_m", (), r"initial_distance_m: got \(\), expected a tuple"),
+        ("person_height_m", 1.75, "person_height_m: got 1.75, expected a tuple of one number per person"),
+        ("initial_distance_m", (4.0, 0.0), r"initial_distance_m\[1\]: got 0.0, expected a positive"),
     ],
 )
 def test_people_that_cannot_be_are_refused(field: str, value: object, message: str) -> None:

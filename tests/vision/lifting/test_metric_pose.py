@@ -104,8 +104,8 @@ class TestPaperMode(MetricPoseTester):
     [
         ({"mode": "gps"}, "mode: got 'gps'"),
         ({"person_height_m": ()}, "person_height_m: got no values"),
-        ({"person_height_m": (1.8, -1.0)}, r"person_height_m: got -1\.0"),
-        ({"initial_distance_m": (0.0,)}, r"initial_distance_m: got 0\.0"),
+        ({"person_height_m": (1.8, -1.0)}, r"person_height_m\[1\]: got -1\.0"),
+        ({"initial_distance_m": (0.0,)}, r"initial_distance_m\[0\]: got 0\.0"),
         ({"initial_distance_m": ()}, "initial_distance_m: got no values"),
         ({"keypoint_threshold": 0.0}, "keypoint_threshold"),
         ({"range_smoothing_s": -1.0}, "range_smoothing_s"),
