@@ -107,7 +107,8 @@ def test_ranks_and_workers_share_the_shards(folder: Path, monkeypatch: pytest.Mo
 
 def test_workers_that_persist_see_the_epoch(folder: Path) -> None:
     stream = ts.data.MapStream(ts.data.MapDataset(folder), seed=3)
-    loader = DataLoader(stream, None, num_workers=1, persistent_workers=True)
+    # A fork would copy the threads' locks of whatever ran before in this process.
+    loader = DataLoader(stream, None, num_workers=1, persistent_workers=True, multiprocessing_context="spawn")
     for epoch in range(4):
         stream.set_epoch(epoch)
         assert [sample["id"] for sample in loader] == [sample["id"] for sample in stream]
