@@ -1,5 +1,7 @@
 """Reading data sets: what a sample is, who gets which, and how batches are changed."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -105,13 +107,23 @@ def test_ranks_and_workers_share_the_shards(folder: Path, monkeypatch: pytest.Mo
     assert [len(batch["label"]) for batch in loader] == [3, 1]
 
 
+#: Whether a worker that persists has the order of its epoch, four times, in a process of its own.
+PERSISTENT = """
+import sys
+import tensorsim as ts
+from torch.utils.data import DataLoader
+stream = ts.data.MapStream(ts.data.MapDataset(sys.argv[1]), seed=3)
+loader = DataLoader(stream, None, num_workers=1, persistent_workers=True)
+for epoch in range(4):
+    stream.set_epoch(epoch)
+    print([sample["id"] for sample in loader] == [sample["id"] for sample in stream])
+"""
+
+
 def test_workers_that_persist_see_the_epoch(folder: Path) -> None:
-    stream = ts.data.MapStream(ts.data.MapDataset(folder), seed=3)
-    # A fork would copy the threads' locks of whatever ran before in this process.
-    loader = DataLoader(stream, None, num_workers=1, persistent_workers=True, multiprocessing_context="spawn")
-    for epoch in range(4):
-        stream.set_epoch(epoch)
-        assert [sample["id"] for sample in loader] == [sample["id"] for sample in stream]
+    command = [sys.executable, "-c", PERSISTENT, str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == "True\n" * 4, done.stderr
 
 
 def test_simulated_maps_are_those_of_the_data_set_and_then_others(folder: Path) -> None:
