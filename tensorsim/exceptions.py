@@ -1,7 +1,8 @@
 """Exceptions of tensorsim, without torch: the command line says what is wrong with its options before it loads that."""
 
+import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -41,3 +42,9 @@ def collected_warnings() -> Iterator[list[str]]:
         warnings.simplefilter("always", TensorsimWarning)
         warnings.showwarning = collect
         yield messages
+
+
+def print_warnings(messages: Iterable[str]) -> None:
+    """Print the messages that :func:`collected_warnings` collected to standard error."""
+    for message in messages:
+        print(f"tensorsim: warning: {message}", file=sys.stderr)

@@ -1,13 +1,12 @@
 """``tensorsim dataset``: labelled data sets of radar maps from a recipe."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tensorsim.exceptions import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 
 if TYPE_CHECKING:
     from tensorsim.data.sets.engines import Engine
@@ -54,8 +53,7 @@ class DatasetBuild:
         with collected_warnings() as messages:
             engine = self._engine()
             built = build_dataset(recipe, self.out, engine, self.cache, self.strict, self.quiet, self.retry)
-        for message in messages:
-            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        print_warnings(messages)
         print(f"{self.out}: {built.samples} samples, {built.made} of them made now")
         if built.failures:
             clips = "1 clip" if built.failures == 1 else f"{built.failures} clips"

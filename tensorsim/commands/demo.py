@@ -15,7 +15,7 @@ from tensorsim.commands.options import (
     load_recognizer,
     number_of_people,
 )
-from tensorsim.exceptions import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -117,8 +117,7 @@ class Demo(NetworkOptions, RadarOptions):
                 summary = label | results.summary_of(source, config, seen, maps) | about
                 self.write_report(folder, done, strip.result(), summary, true_maps)
                 results.write_summary(folder, summary)
-        for message in messages:
-            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        print_warnings(messages)
         count = int(pose.valid[0].any(1).sum())
         found = f"{number_of_people(count)} found, {described_label(label)}"
         print(

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import sys
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, Literal
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +67,6 @@ class EvaluateFilms(NetworkOptions):
 
         from tensorsim.config import PoseConfig
         from tensorsim.device import usable_device
-        from tensorsim.errors import collected_warnings
         from tensorsim.evaluation.labelled_films import FilmReader, Scene, markdown, read_labels
         from tensorsim.pipeline import PoseToDoppler, VideoToPose
         from tensorsim.pipeline.networks import pretrained_lifter
@@ -104,8 +102,7 @@ class EvaluateFilms(NetworkOptions):
                     sheet = stem if stems[stem] == 1 else f"{film.path.name}_{film.start_s:g}s"
                     row = self._row(film, reader, scenes, device, self.out / f"{sheet}.png")
                     rows.append(row | {"warnings": messages})
-                for message in messages:
-                    print(f"tensorsim: warning: {film.path.name}: {message}", file=sys.stderr)
+                print_warnings(f"{film.path.name}: {message}" for message in messages)
         text = markdown(rows)
         (self.out / "films.md").write_text(text, encoding="utf-8")
         (self.out / "films.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")

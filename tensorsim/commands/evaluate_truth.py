@@ -1,13 +1,12 @@
 """``tensorsim evaluate truth``: how right the maps are."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.networks import default_networks
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,6 @@ class EvaluateTruth:
         elif self.detector is not None or self.pose is not None:
             raise TensorsimError("--detector, --pose: got them without setting c, which they are for")
 
-        from tensorsim.errors import collected_warnings
         from tensorsim.evaluation.report import markdown, save_pictures, write_csv
         from tensorsim.evaluation.truth import TruthLoop, example_maps
 
@@ -69,8 +67,7 @@ class EvaluateTruth:
         )  # fmt: skip
         with collected_warnings() as messages:
             cells = loop.run(self.quiet)
-        for message in messages:
-            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        print_warnings(messages)
         text = markdown(cells)
         self.out.mkdir(parents=True, exist_ok=True)
         (self.out / "truth.md").write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ import tyro
 
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, load_recognizer, number_of_people
-from tensorsim.exceptions import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 from tensorsim.limits import check_range
 
 if TYPE_CHECKING:
@@ -134,8 +134,7 @@ class Live(NetworkOptions, RadarOptions):
     @staticmethod
     def _warn(messages: list[str]) -> int:
         """Print warnings, and return how many."""
-        for message in messages:
-            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        print_warnings(messages)
         return len(messages)
 
     def _say(self, new: "LiveFrame", camera: "Camera") -> None:

@@ -1,7 +1,6 @@
 """``tensorsim simulate``: a video, or motion that is known, to what a radar would have seen of it."""
 
 import math
-import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -20,7 +19,7 @@ from tensorsim.commands.options import (
     load_recognizer,
     number_of_people,
 )
-from tensorsim.exceptions import TensorsimError, collected_warnings
+from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 from tensorsim.limits import check_range
 
 if TYPE_CHECKING:
@@ -153,8 +152,7 @@ class Simulate(NetworkOptions, RadarOptions):
                     folder, done, strip.result(), summary, further=[person.map for person in alone]
                 )
                 results.write_summary(folder, summary)
-        for message in messages:
-            print(f"tensorsim: warning: {message}", file=sys.stderr)
+        print_warnings(messages)
         people = number_of_people(int(pose.valid[0].any(1).sum()))
         print(f"{self.out}: {people} in {pose.valid.shape[2]} frames, {described_label(label)}")
 

@@ -121,10 +121,11 @@ class CausalPose(nn.Module):
         fewest = torch.where(cut_off, self.metric_pose.whole_body_joints, self.fewest_joints)
         inside = boxes[:, 2].clamp(max=width) - boxes[:, 0].clamp(min=0)
         strip = cut_off & (inside < self.least_width * (boxes[:, 3] - boxes[:, 1]))
-        usable = there & (reliable.sum(dim=-1) >= fewest) & ~strip
+        count = reliable.sum(dim=-1)
+        usable = there & (count >= fewest) & ~strip
         lifted = self.lifter(body[:, None], body_scores[:, None])
 
-        whole = usable & (reliable.sum(dim=-1) >= self.metric_pose.whole_body_joints)
+        whole = usable & (count >= self.metric_pose.whole_body_joints)
         whole = whole & (lifted.distance[:, 0] < self.metric_pose.poor_fit)
         first = whole & ((state.size.p00[:, 0] >= self.unknown) | (state.missed > self.brief_gap))
         size = self._filtered(
