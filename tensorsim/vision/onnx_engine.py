@@ -236,6 +236,8 @@ def _in_openvino(model: bytes, threads: int, bfloat16: bool, cache: Path | None)
     if cache is not None:  # compiled networks, which take a third of the time to open
         settings["CACHE_DIR"] = str(cache)
     compiled = core.compile_model(core.read_model(model), "CPU", settings)
+    # The first call of a process makes its table of NumPy types: two at a time would wait for each other forever.
+    openvino.Type.f32.to_dtype()
     of_thread = local()
 
     def run(images: Images) -> list[Images]:

@@ -1,6 +1,8 @@
 """Networks in ONNX Runtime and OpenVINO answer as in torch, for any number of images, and are exported once."""
 
 import pickle
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -112,6 +114,25 @@ def test_openvino_answers_several_threads_at_a_time() -> None:
     with ThreadPoolExecutor(3) as pool:
         found = torch.cat(list(pool.map(engine, crops.split(1))))
     assert torch.allclose(found, network(crops), atol=1e-4)
+
+
+def test_first_calls_of_several_threads_in_openvino_end() -> None:
+    # In a process of its own, because only the first calls of a process can block each other.
+    script = """
+import sys, threading
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from torch import nn
+from tensorsim.vision.onnx_engine import _opened
+run, together = _opened(nn.Conv2d(3, 4, 3), (8, 9), "openvino", 8), threading.Barrier(8)
+def first(images):
+    together.wait()
+    return run(images)
+sys.setswitchinterval(1e-6)
+with ThreadPoolExecutor(8) as pool:
+    list(pool.map(first, np.zeros((8, 1, 3, 8, 9), np.float32)))
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
 @torch.no_grad()
