@@ -3,6 +3,7 @@
 import itertools
 from pathlib import Path
 
+import matplotlib.colors
 import numpy as np
 import pytest
 import torch
@@ -20,7 +21,7 @@ def test_decibels_are_below_the_peak_and_clipped() -> None:
 
 def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
     magnitude = np.ones((5, 7))
-    ridges = np.stack([np.zeros(7), np.ones(7), -np.ones(7)])
+    ridges = np.repeat(np.array([0.0, 1.0, -1.0, 1.5, -1.5, 2.0])[:, None], 7, axis=1)
     figure = plot.map_figure(
         magnitude,
         np.arange(7) / 10,
@@ -35,7 +36,7 @@ def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
     assert axes.get_xlabel() == "time in s"
     assert axes.get_ylabel() == "Doppler in Hz"
     assert [line.get_color() for line in axes.lines] == list(plot.RIDGE_COLOURS)
-    assert len(set(plot.RIDGE_COLOURS)) == 3
+    assert len({matplotlib.colors.to_rgb(colour) for colour in plot.RIDGE_COLOURS}) == 6
     assert np.allclose([line.get_ydata() for line in axes.lines], ridges)
     assert speed.get_ylabel().startswith("radial speed in m/s")
     assert np.allclose(np.array(axes.get_ylim()) * 0.5, speed.get_ylim())
@@ -45,7 +46,7 @@ def test_map_figure_has_axes_with_units_a_colour_bar_and_ridges() -> None:
     assert np.allclose([left, right, bottom, top], [-0.05, 0.65, -2.5, 2.5])
     assert axes.images[0].origin == "lower"
     (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["ridge 1", "ridge 2", "ridge 3"]
+    assert [text.get_text() for text in legend.get_texts()] == [f"ridge {number}" for number in range(1, 7)]
     figure.canvas.draw()
     assert legend.get_window_extent().y1 < axes.get_window_extent().y0, "covers nothing of the map"
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from tensorsim.config import RadarConfig
     from tensorsim.radar.simulator import RadarSimulator
 
-#: One colour per ridge, distinct on every colour map.
-RIDGE_COLOURS = ("white", "magenta", "black")
+#: One colour per ridge, of which there are 6 at most: far from each other, and from what is strong on the colour maps.
+RIDGE_COLOURS = ("white", "magenta", "black", "blue", "cyan", "#ff9ccb")
 
 #: Pictures show this much below the peak.
 DYNAMIC_RANGE_DB = 50.0

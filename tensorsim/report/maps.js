@@ -25,7 +25,6 @@ function sizedContext(canvas) {
 }
 
 const MARGIN = { left: 62, right: 50, top: 6, bottom: 22 };
-const RIDGE_COLOURS = ["#fff", "#f0f", "#000"];
 
 // One map with its axes and the cursor.
 class MapView {
@@ -69,7 +68,8 @@ class MapView {
     context.putImageData(image, 0, 0);
   }
 
-  draw(time, showRidges) {
+  // `ridgeColours` has one per ridge; null hides them.
+  draw(time, ridgeColours) {
     const context = sizedContext(this.canvas);
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const { map, duration } = this;
@@ -78,15 +78,15 @@ class MapView {
     const y = (value) => MARGIN.top + ((map.high - value) / (map.high - map.low)) * inner.height;
     context.clearRect(0, 0, width, height);
     context.drawImage(this.picture, x(map.start_s), MARGIN.top, x(map.end_s) - x(map.start_s), inner.height);
-    if (showRidges) this.drawRidges(context, x, y);
+    if (ridgeColours) this.drawRidges(context, x, y, ridgeColours);
     this.drawAxes(context, x, y, inner);
     context.fillStyle = "#f33";
     context.fillRect(x(time) - 1, MARGIN.top, 2, inner.height);
   }
 
-  drawRidges(context, x, y) {
+  drawRidges(context, x, y, colours) {
     this.map.ridges.forEach((ridge, number) => {
-      context.fillStyle = RIDGE_COLOURS[number % RIDGE_COLOURS.length];
+      context.fillStyle = colours[number];
       const step = (this.map.end_s - this.map.start_s) / ridge.length;
       ridge.forEach((value, column) => {
         if (value !== null) context.fillRect(x(this.map.start_s + (column + 0.5) * step) - 1, y(value) - 1, 2, 2);

@@ -65,6 +65,7 @@ def write_report(
         + ([] if truth is None else map_contents(truth, axes, pictures, " of the true motion"))
         + list(further),
         "style": asdict(pictures.style),
+        "ridge_colours": list(plot.RIDGE_COLOURS),
         "colourmaps": {name: colour_table(name) for name in _COLOURMAPS},
         "timeline": timeline_content(summary.get("timeline") or [], frames / fps),
         "summary": {key: value for key, value in summary.items() if key not in ("files", "run")},

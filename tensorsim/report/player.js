@@ -127,7 +127,8 @@ async function start() {
     const frame = Math.min(Math.floor(state.time * content.fps + 1e-6), content.frames - 1);
     film.show(state.time, frame);
     scene.draw(frame);
-    for (const view of views) view.draw(state.time, element("ridges").checked);
+    const ridgeColours = element("ridges").checked ? content.ridge_colours : null;
+    for (const view of views) view.draw(state.time, ridgeColours);
     element("time").value = state.time;
     element("clock").textContent = `${state.time.toFixed(2)} s`;
     if (cursor) cursor.style.left = `${(100 * state.time) / content.duration_s}%`;

@@ -12,7 +12,7 @@ import torch
 
 import tensorsim as ts
 from tensorsim.data.video import VideoReader
-from tensorsim.plot import decibels
+from tensorsim.plot import RIDGE_COLOURS, decibels
 from tensorsim.report import FilmStrip, write_report
 from tensorsim.report import film as film_module
 from tensorsim.report.page import STORED_DB, timeline_content
@@ -91,6 +91,7 @@ def test_content_equals_the_run(tmp_path: Path, run: tuple[Pose, RadarMaps, Axes
     assert moving["start_s"] == pytest.approx(0.5 / 256)
     rows = picture(doppler["png"]).shape[0]
     assert doppler["high"] - doppler["low"] == pytest.approx(rows * np.diff(axes.doppler_hz)[0])
+    assert content["ridge_colours"] == list(RIDGE_COLOURS), "those of the pictures"
     assert content["scene"]["wall"]["size_m"] == [5.0, 0.24, 2.5]
     assert content["summary"]["warnings"] == summary["warnings"]
 
