@@ -2,9 +2,8 @@
 
 import csv
 import json
-import math
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,15 +66,15 @@ class EvaluateFilms(NetworkOptions):
 
         from tensorsim.config import PoseConfig
         from tensorsim.device import usable_device
-        from tensorsim.evaluation.labelled_films import FilmReader, Scene, markdown, read_labels
+        from tensorsim.evaluation.labelled_films import FilmReader, Scene, markdown, read_labels, whole_films
         from tensorsim.pipeline import PoseToDoppler, VideoToPose
         from tensorsim.pipeline.networks import pretrained_lifter
 
         films = read_labels(self.data)
         if self.only:
-            films = [film for film in films if any(part in film.path.name for part in self.only)]
+            films = [film for film in films if any(part in film.file for part in self.only)]
         if self.whole:
-            films = [replace(film, start_s=0.0, end_s=math.inf) for film in films]
+            films = whole_films(films)
         if not films:
             raise TensorsimError(f"{self.data}: got no film to label, expected at least one")
         device = usable_device(self.device)
@@ -94,15 +93,16 @@ class EvaluateFilms(NetworkOptions):
                 raise TensorsimError("--classifier: got 'none', expected weights")
             scenes[name] = Scene(PoseToDoppler.from_config(config).to(device), recognizer)
         self.out.mkdir(parents=True, exist_ok=True)
-        rows, stems = [], Counter(film.path.stem for film in films)
+        rows, stems = [], Counter(_sheet_name(film.file) for film in films)
         with torch.inference_mode():
             for film in films:
                 with collected_warnings() as messages:
-                    stem = film.path.stem
-                    sheet = stem if stems[stem] == 1 else f"{film.path.name}_{film.start_s:g}s"
+                    sheet = _sheet_name(film.file)
+                    if stems[sheet] > 1:
+                        sheet = f"{film.file.replace('/', '_')}_{film.start_s:g}-{film.end_s:g}s"
                     row = self._row(film, reader, scenes, device, self.out / f"{sheet}.png")
                     rows.append(row | {"warnings": messages})
-                print_warnings(f"{film.path.name}: {message}" for message in messages)
+                print_warnings(f"{film.file}: {message}" for message in messages)
         text = markdown(rows)
         (self.out / "films.md").write_text(text, encoding="utf-8")
         (self.out / "films.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
@@ -143,6 +143,11 @@ class EvaluateFilms(NetworkOptions):
                 for name, how in scenes.items()
             }
         return row | {"variants": of_variants}
+
+
+def _sheet_name(file: str) -> str:
+    """The name of a film, with that of its folder, and without its suffix."""
+    return str(Path(file).with_suffix("")).replace("/", "_")
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -61,7 +61,7 @@ def contact_sheet(
         axes = figure.add_subplot(grid[_ROWS, place * width : (place + 1) * width])
         _draw_map(axes, verdict, maps, map_axes)
     _draw_places(figure.add_subplot(grid[_ROWS, len(scenes) * width :]), pose, reader.fps)
-    figure.suptitle(f"{film.path.name}: {' or '.join(film.accept)}{_said_of(camera)}")
+    figure.suptitle(f"{film.file}: {' or '.join(film.accept)}{_said_of(camera)}")
     return figure
 
 

@@ -46,15 +46,21 @@ class LabelledFilm:
     """A film of known activity.
 
     Attributes:
-        path: of the film.
+        folder, file: where the film is.
         start_s, end_s: the seconds in which the activity happens.
         accept: labels that are right, of ``tensorsim.ACTIVITIES``.
     """
 
-    path: Path
+    folder: Path
+    file: str
     start_s: float
     end_s: float
     accept: tuple[str, ...]
+
+    @property
+    def path(self) -> Path:
+        """Of the film."""
+        return self.folder / self.file
 
 
 @dataclass(frozen=True)
@@ -90,14 +96,14 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
 
     Raises:
         TensorsimError: no such file, not such a list, no films, an unknown activity or none, seconds that cannot be, a
-            film that is not there.
+            film that is not there, or seconds that are listed twice.
     """
     table = folder / "labels.json"
     try:
         listed = json.loads(table.read_text(encoding="utf-8"))
         films = [
             LabelledFilm(
-                folder / row["file"], float(row["start_s"]), float(row["end_s"]), tuple(row["accept"])
+                folder, str(row["file"]), float(row["start_s"]), float(row["end_s"]), tuple(row["accept"])
             )
             for row in listed
         ]
@@ -113,21 +119,35 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
     for film in films:
         if not 0 <= film.start_s < film.end_s:
             raise TensorsimError(
-                f"{table}: {film.path.name}: got the seconds {film.start_s:g} to {film.end_s:g}, expected a start from "
+                f"{table}: {film.file}: got the seconds {film.start_s:g} to {film.end_s:g}, expected a start from "
                 "0 on and a later end"
             )
         if not film.accept:
             raise TensorsimError(
-                f"{table}: {film.path.name}: got no activity to accept, expected at least one"
+                f"{table}: {film.file}: got no activity to accept, expected at least one"
             )
         for label in film.accept:
             if label not in ACTIVITIES:
                 raise TensorsimError(
-                    f"{table}: {film.path.name}: got {label!r}, expected one of the 12 activities"
+                    f"{table}: {film.file}: got {label!r}, expected one of the 12 activities"
                 )
         if not film.path.is_file():
-            raise TensorsimError(f"{table}: {film.path.name}: no such file beside it")
+            raise TensorsimError(f"{table}: {film.file}: no such file beside it")
+    (cut, count), *_ = Counter((film.file, film.start_s, film.end_s) for film in films).most_common(1)
+    if count > 1:
+        raise TensorsimError(
+            f"{table}: {cut[0]}: got the seconds {cut[1]:g} to {cut[2]:g} twice, expected them once, with all activities "
+            "to accept"
+        )
     return films
+
+
+def whole_films(films: Iterable[LabelledFilm]) -> list[LabelledFilm]:
+    """Each film once, from beginning to end; what is right in any of its parts is right."""
+    accept: dict[tuple[Path, str], dict[str, None]] = {}
+    for film in films:
+        accept.setdefault((film.folder, film.file), {}).update(dict.fromkeys(film.accept))
+    return [LabelledFilm(*place, 0.0, math.inf, tuple(names)) for place, names in accept.items()]
 
 
 class FilmReader:
@@ -294,7 +314,7 @@ def film_row(
 ) -> dict[str, Any]:
     """What ``films.json`` says of a film."""
     return {
-        "file": film.path.name,
+        "file": film.file,
         "start_s": film.start_s,
         "end_s": film.end_s if math.isfinite(film.end_s) else None,
         "seconds": round(frames / fps, 2),
@@ -313,7 +333,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines = [heads, ["---"] * len(heads)]
     names = Counter(row["file"] for row in rows)
     for row in rows:
-        part = f", from {row['start_s']:g} s" if names[row["file"]] > 1 else ""
+        part = f", {row['start_s']:g} to {row['end_s']:g} s" if names[row["file"]] > 1 else ""
         followed_s = ", ".join(f"{p['followed_s']:.1f}" for p in row["people"]) or "nobody"
         verdicts = [_said(row["scenes"][scene]) for scene in scenes]
         right = " or ".join(name.split()[0] for name in row["accept"])

@@ -126,14 +126,21 @@ def test_parts_of_one_film_have_a_sheet_each(arguments: list[str], data: Path, t
         {"file": "walk.avi", "start_s": start_s, "end_s": start_s + 1, "accept": [ACTIVITIES[7]]}
         for start_s in (0, 0.5)
     ]
+    parts.append(parts[0] | {"end_s": 1.25, "accept": [ACTIVITIES[0]]})
     (data / "labels.json").write_text(json.dumps(parts))
     cli.main(arguments)
     out = tmp_path / "out"
-    assert sorted(path.name for path in out.glob("*.png")) == ["walk.avi_0.5s.png", "walk.avi_0s.png"]
+    assert sorted(path.name for path in out.glob("*.png")) == [
+        f"walk.avi_{part}s.png" for part in ("0-1.25", "0-1", "0.5-1.5")
+    ]
     with (out / "films.csv").open() as file:
         lines = [(line["start_s"], line["end_s"]) for line in csv.DictReader(file)]
-    assert lines == [("0.0", "1.0"), ("0.5", "1.5")]
-    assert "| walk.avi, from 0.5 s |" in (out / "films.md").read_text()
+    assert lines == [("0.0", "1.0"), ("0.5", "1.5"), ("0.0", "1.25")]
+    assert "| walk.avi, 0.5 to 1.5 s |" in (out / "films.md").read_text()
+
+    cli.main([*arguments, "--whole"])
+    (whole,) = json.loads((out / "films.json").read_text())
+    assert whole["accept"] == [ACTIVITIES[7], ACTIVITIES[0]], "what is right in any part"
 
 
 def test_variants_of_films_are_labelled_without_the_networks(
@@ -161,7 +168,7 @@ def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -
     path = tmp_path / "walk.gif"
     durations = [100] * 9 + [1100] + [100] * 10
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations)
-    known = LabelledFilm(path, 0.25, 2.65, (ACTIVITIES[7],))
+    known = LabelledFilm(path.parent, path.name, 0.25, 2.65, (ACTIVITIES[7],))
     (tmp_path / "w.onnx").write_text("")
     stage = VideoToPose(CountingDetector(), StandingPose()).eval()
     reader = FilmReader(
@@ -207,7 +214,7 @@ def test_what_networks_found_is_kept_for_each_engine(data: Path, tmp_path: Path,
 def test_how_the_camera_moves_is_kept_with_what_the_networks_found(tmp_path: Path) -> None:
     frames = panned(film(*walker(25, FPS, 4.0, 1.2, 0.3)), 6)
     write_video(tmp_path / "pan.avi", frames.permute(0, 2, 3, 1).numpy(), FPS)
-    known = LabelledFilm(tmp_path / "pan.avi", 0.0, 2.4, (ACTIVITIES[7],))
+    known = LabelledFilm(tmp_path, "pan.avi", 0.0, 2.4, (ACTIVITIES[7],))
     (tmp_path / "w.onnx").write_text("")
     stage = VideoToPose(CountingDetector(), StandingPose()).eval()
     networks = (tmp_path / "w.onnx", tmp_path / "w.onnx")
@@ -220,7 +227,7 @@ def test_how_the_camera_moves_is_kept_with_what_the_networks_found(tmp_path: Pat
         assert kept == ["camera", "detections", "keypoints"]
         (tmp_path / "pan.avi").rename(tmp_path / "moved.avi")
         again = FilmReader(stage, networks, tmp_path / "cache")
-        film_there = LabelledFilm(tmp_path / "moved.avi", 0.0, 2.4, known.accept)
+        film_there = LabelledFilm(tmp_path, "moved.avi", 0.0, 2.4, known.accept)
         seen = again.observed(film_there, again.open(film_there), torch.device("cpu"), quiet=True)
     assert found[False].from_film is None
     assert found[True].from_film is not None
@@ -237,6 +244,7 @@ def test_how_the_camera_moves_is_kept_with_what_the_networks_found(tmp_path: Pat
     [
         ([{"file": "walk.avi", "start_s": 0}], r"KeyError \('end_s'\), expected a list"),
         ([{"file": "walk.avi", "start_s": 0, "end_s": 1, "accept": ["Walk"]}], "got 'Walk', expected one of"),
+        ([{"file": "walk.avi", "start_s": 0, "end_s": 1, "accept": [ACTIVITIES[7]]}] * 2, "0 to 1 twice"),
         ([{"file": "run.avi", "start_s": 0, "end_s": 1, "accept": [ACTIVITIES[7]]}], "run.avi: no such file"),
         ([], "got no films"),
         (
@@ -292,7 +300,7 @@ def somebody(speed_m_s: float, frames: int = 20) -> Pose:
 
 def test_a_verdict_is_right_where_the_label_is_accepted() -> None:
     stage = PoseToDoppler(RadarSimulator(RadarConfig.through_wall(), snr_db=50.0))
-    known = LabelledFilm(Path("walk.avi"), 0.0, 2.0, (ACTIVITIES[7],))
+    known = LabelledFilm(Path(), "walk.avi", 0.0, 2.0, (ACTIVITIES[7],))
     cpu = torch.device("cpu")
     for index, right in ((7, True), (1, False)):
         how = Scene(stage, Always(index))  # type: ignore[arg-type]

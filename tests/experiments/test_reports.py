@@ -200,7 +200,7 @@ def test_groups_of_maps_are_as_small_as_asked_for(tmp_path: Path) -> None:
 
 
 def test_the_first_films_of_a_folder_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    films = [LabelledFilm(tmp_path / f"{k}.mp4", 0.0, 4.0, ("S8 Walking",)) for k in range(3)]
+    films = [LabelledFilm(tmp_path, f"{k}.mp4", 0.0, 4.0, ("S8 Walking",)) for k in range(3)]
     for film in films:
         film.path.write_bytes(b"film")
     monkeypatch.setattr(real_films, "read_labels", lambda folder: films)
