@@ -184,7 +184,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         pose, maps, stage = run.pose, run.maps, run.stage
         duration_s = pose.valid.shape[2] / run.fps
         label = results.label_of(run.recognizer, maps, duration_s, self.least_probability)
-        warn_of_label(run.recognizer, run.config, int(pose.valid.any(-1).sum()), duration_s)
+        warn_of_label(run.recognizer, int(pose.valid.any(-1).sum()), duration_s)
         pictures = self.pictures(stage, label["label"], run.film, run.somebody)
         axes, formats = results.axes_of(stage, maps), array_formats(self.save)
 
@@ -320,6 +320,8 @@ def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "Sim
 
 #: Speeds that the radars of the classifiers' training resolve (the through-wall preset: 0.6 m/s), with a margin.
 COARSEST_M_S = 0.8
+#: A radar of one channel that separates ranges less mixes up approaching and receding people in a room.
+COARSEST_M = 1.5
 #: Scenes that are not much shorter than the shortest clips of the classifiers' training (2.4 s).
 SHORTEST_S = 2.0
 
@@ -328,7 +330,8 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
     """The classifier of the maps of this radar; None if no label is wanted or the radar is unlike those of training.
 
     The pictures of the shipped networks show speeds up to 3.8 m/s, resolved to 0.6 m/s or better. A radar for which
-    faster motion folds, or which resolves speeds less, gets no label but a warning.
+    faster motion folds, or which resolves speeds less, gets no label but a warning. Maps that they were not trained on
+    otherwise (interference, both signs of Doppler mixed up) get a label and a warning.
 
     Raises:
         TensorsimError: weights that are not there, of another network, or without names of their classes.
@@ -356,13 +359,33 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
     if unlike is not None:
         warnings.warn(f"no label: the radar {unlike}", TensorsimWarning, stacklevel=2)
         return None
+    for reason in _unlike_training(config, recognizer):
+        warnings.warn(f"the label means little: {reason}", TensorsimWarning, stacklevel=2)
     return recognizer
 
 
-def warn_of_label(
-    recognizer: "ActivityRecognizer | None", config: "SimulationConfig", people: int, duration_s: float
-) -> None:
-    """Say where a label means little: several people, a short scene, or a map that the network was not trained on."""
+def _unlike_training(config: "SimulationConfig", recognizer: "ActivityRecognizer") -> list[str]:
+    """In what the maps are unlike those of the classifier's training."""
+    from tensorsim.recognition import SPNet
+
+    unlike = []
+    if config.processing.integration == "paper":
+        unlike.append(
+            "integration 'paper' folds approaching and receding motion, the classifier was trained on signed Doppler"
+        )
+    if config.scene.interference is not None:
+        unlike.append("another radar is heard, the shipped classifiers were trained without interference")
+    one_channel = config.scene.receiver.real and config.scene.radar.range_resolution_m > COARSEST_M
+    if one_channel and isinstance(recognizer.network, SPNet):
+        unlike.append(
+            "a radar of one channel without range folds approaching and receding motion, which the shipped SPGNet "
+            "knows and the shipped SPNet does not"
+        )
+    return unlike
+
+
+def warn_of_label(recognizer: "ActivityRecognizer | None", people: int, duration_s: float) -> None:
+    """Say where a label means little: several people, or a short scene."""
     if recognizer is None:
         return
     if people > 0 and duration_s < SHORTEST_S:
@@ -375,12 +398,6 @@ def warn_of_label(
     if people > 1:
         warnings.warn(
             "several people are in the scene: the label is of all of them, the classifier was trained on one person",
-            TensorsimWarning,
-            stacklevel=2,
-        )
-    if config.processing.integration == "paper":
-        warnings.warn(
-            "integration 'paper' folds approaching and receding motion: the classifier was trained on signed Doppler",
             TensorsimWarning,
             stacklevel=2,
         )

@@ -123,9 +123,7 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
                 "0 on and a later end"
             )
         if not film.accept:
-            raise TensorsimError(
-                f"{table}: {film.file}: got no activity to accept, expected at least one"
-            )
+            raise TensorsimError(f"{table}: {film.file}: got no activity to accept, expected at least one")
         for label in film.accept:
             if label not in ACTIVITIES:
                 raise TensorsimError(
@@ -136,8 +134,8 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
     (cut, count), *_ = Counter((film.file, film.start_s, film.end_s) for film in films).most_common(1)
     if count > 1:
         raise TensorsimError(
-            f"{table}: {cut[0]}: got the seconds {cut[1]:g} to {cut[2]:g} twice, expected them once, with all activities "
-            "to accept"
+            f"{table}: {cut[0]}: got the seconds {cut[1]:g} to {cut[2]:g} twice, expected them once, with all "
+            "activities to accept"
         )
     return films
 

@@ -1,8 +1,8 @@
 """The shipped classifier on maps of other pulse rates: ``python -m tests.benchmarks.eval_prf [--people N]``.
 
 Generated people do eleven activities (all but that of an empty room) behind the wall, seen at several pulse rates, and
-at 128 Hz with both signs of Doppler folded into one, as a radar without range and with one channel sees them. Prints
-the accuracy on their true motion at 50 dB.
+at 128 Hz with both signs of Doppler folded into one, as a radar without range and with one channel sees them, and
+while another radar is heard. Prints the accuracy on their true motion at 50 dB.
 """
 
 import argparse
@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim import ACTIVITIES, PoseToDoppler, SimulationConfig
+from tensorsim.config import InterferenceConfig
 from tensorsim.motion import ActivityGenerator
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.types import RadarMaps
@@ -61,6 +62,8 @@ def main() -> None:
         limit = config.scene.radar.unambiguous_speed_m_s
         print(f"{prf_hz:g} Hz, to {limit:.1f} m/s: {100 * accuracy(config, people):.1f} %", flush=True)
     print(f"128 Hz, folded: {100 * accuracy(base, people, fold=True):.1f} %")
+    heard = base.replace(scene__interference=InterferenceConfig())
+    print(f"128 Hz, another radar heard: {100 * accuracy(heard, people):.1f} %")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from tensorsim.commands.options import load_recognizer
-from tensorsim.config import SceneConfig, SimulationConfig
+from tensorsim.config import InterferenceConfig, SceneConfig, SimulationConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.presets import PRESETS
 
@@ -40,3 +40,25 @@ def test_a_file_that_is_not_there():
 
 def test_none_is_wanted():
     assert load_recognizer(SimulationConfig(classifier="none")) is None
+
+
+@pytest.mark.parametrize(
+    ("scene", "classifier", "change", "message"),
+    [
+        ("through-wall", None, {"processing__integration": "paper"}, "integration 'paper' folds"),
+        ("through-wall", None, {"scene__interference": InterferenceConfig()}, "another radar is heard"),
+        ("cw-24ghz", "spnet-activities", {"scene__receiver__real": True}, "one channel without range folds"),
+    ],
+)
+def test_maps_unlike_those_of_training_get_a_warning(scene, classifier, change, message):
+    config = SimulationConfig(scene=PRESETS[scene], classifier=classifier)
+    with pytest.warns(TensorsimWarning, match=f"the label means little: .*{message}"):
+        assert load_recognizer(config.replace(**change)) is not None
+
+
+@pytest.mark.parametrize("scene", ["through-wall", "cw-24ghz"])
+def test_one_channel_is_what_the_shipped_classifier_knows(scene):
+    config = SimulationConfig(scene=PRESETS[scene]).replace(scene__receiver__real=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_recognizer(config) is not None
