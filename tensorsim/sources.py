@@ -69,7 +69,7 @@ def film_source(
     return Source(
         "video",
         reader.fps,
-        reader.frame_count,
+        None if reader.duration_s is None else round(reader.duration_s * reader.fps),
         lambda quiet: people_of_film(stage, reader, device, quiet, calibrate),
         lambda: reader.even_chunks(8),
         stage.keypoint_threshold,

@@ -197,11 +197,11 @@ def _check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
     if kind_of(film) != "video":
         return
     reader = VideoReader(film, fps=given.get("fps"), start_s=given.get("start"), end_s=given.get("end"))
-    count, end_s = reader.frame_count, given.get("end")
-    if count is None and end_s is not None and end_s - (given.get("start") or 0.0) <= longest_s:
+    seconds, end_s = reader.duration_s, given.get("end")
+    if seconds is None and end_s is not None and end_s - (given.get("start") or 0.0) <= longest_s:
         return
-    if count is None or count / reader.fps > longest_s:
-        length = "an unknown length" if count is None else f"{count / reader.fps:.1f} s"
+    if seconds is None or seconds > longest_s:
+        length = "an unknown length" if seconds is None else f"{seconds:.1f} s"
         raise TensorsimError(
             f"{film.name}: got {length}, expected at most {longest_s:g} s; set Start and End in the group Camera"
         )

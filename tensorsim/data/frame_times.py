@@ -1,4 +1,4 @@
-"""Times of the frames of a film: whether they are even, and which frame is nearest to each even time."""
+"""Times of the frames of a film: whether they are even, how often they come, and which is nearest to each even time."""
 
 import torch
 from torch import Tensor
@@ -56,6 +56,16 @@ def unevenness_s(times_s: Tensor, fps: float) -> float:
     even = torch.arange(times_s.numel(), dtype=times_s.dtype) / fps
     late_s = float((times_s - times_s[0] - even).abs().max())
     return late_s if late_s > max(_UNEVEN_S, _UNEVEN_FRAMES / fps) else 0.0
+
+
+def usual_fps(times_s: Tensor) -> float:
+    """Frames per second of increasing times (T,), where pauses do not count.
+
+    >>> usual_fps(torch.tensor([0.0, 0.5, 1.0, 30.0, 30.5]))
+    2.0
+    """
+    steps_s = times_s.double().diff()
+    return round(1 / float(steps_s[steps_s < 1.5 * steps_s.median()].mean()), 6)
 
 
 def nearest_frames(times_s: Tensor, fps: float) -> Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tensorsim.data.frame_times import FilmClock, nearest_frames, unevenness_s
+from tensorsim.data.frame_times import FilmClock, nearest_frames, unevenness_s, usual_fps
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.limits import RANGES, check_range
 from tensorsim.threads import ahead
@@ -58,10 +58,12 @@ class VideoReader:
 
     Attributes:
         path: of the file.
-        fps: frames per second of what is read: the film's divided by ``stride``.
+        fps: frames per second of what is read: the film's divided by ``stride``. Those of the film are what it
+            announces or, where its frames come at other times, what they are without pauses.
         height, width: of the frames, in pixels.
         frame_count: frames to expect by what the file announces, None if it does not say; the film may have
             fewer.
+        duration_s: seconds to expect, likewise.
         uneven_times_s: (n,) float64 times in seconds of the frames that were read, known once all have been, where they
             are not evenly spaced (a GIF with a pause, a telephone that saves power); None where they are, or where
             ``fps`` was given.
@@ -91,6 +93,8 @@ class VideoReader:
         start_s = 0.0 if start_s is None else start_s
         _check_cut(fps, start_s, end_s, stride)
         _check_is_film(self.path)
+        self._stride, self._own_times = stride, fps is None
+        self._end_s = math.inf if end_s is None or end_s > RANGES["time"].high else end_s
         with self._opened() as capture:
             file_fps, announced = properties(capture)
             if fps is None and not 0 < file_fps < ABSURD_FPS:
@@ -98,10 +102,14 @@ class VideoReader:
                     f"{self.path}: the file announces {file_fps} frames per second, expected a positive "
                     f"number below {ABSURD_FPS:g}; give the frame rate as fps"
                 )
-            film_fps = float(file_fps if fps is None else fps)
-            self._stride = stride
-            self._film_fps, self._own_times = film_fps, fps is None
-            self._end_s = math.inf if end_s is None or end_s > RANGES["time"].high else end_s
+            film_fps, length_s = float(file_fps if fps is None else fps), None
+            if fps is None:
+                times_s = self._times_in_file(start_s)
+                # Of a film with a long pause the file announces the mean rate.
+                if unevenness_s(times_s, film_fps) and usual_fps(times_s) < ABSURD_FPS:
+                    film_fps = usual_fps(times_s)
+                    length_s = float(times_s[-1] - times_s[0]) + 1 / film_fps
+            self._film_fps = film_fps
             clock = self._clock()
             self._first, at_s = _first_from(capture, clock, start_s - 1e-6 / film_fps)
             found, frame = (False, np.empty((0, 0))) if at_s is None else capture.retrieve()
@@ -126,6 +134,9 @@ class VideoReader:
         self.frame_count = (
             None if announced is None else max(1, -(-(self._stop(announced) - self._first) // stride))
         )
+        if length_s is None and self.frame_count is not None:
+            length_s = self.frame_count / self.fps
+        self.duration_s = length_s
         self._most_kept = int(kept_mb * 1e6 / frame.nbytes)
         self._kept: list[Tensor] = []
 
@@ -246,15 +257,28 @@ class VideoReader:
         late_s = unevenness_s(times_s, self.fps) if self._own_times else 0.0
         self.uneven_times_s = times_s if late_s else None
         if late_s:
-            steps_s = times_s.diff()
-            usual = steps_s[steps_s < 1.5 * steps_s.median()].mean()
             warnings.warn(
-                f"{self.path}: its frames are up to {late_s:.2f} s away from the constant {self.fps:g} frames per "
-                f"second that it announces (mostly there are {1 / usual:.3g}): motion is interpolated to even times; "
-                "give fps to take the frames as evenly spaced",
+                f"{self.path}: its frames are up to {late_s:.2f} s away from even times, {self.fps:.4g} per second: "
+                "motion is interpolated to these; give fps to take the frames as evenly spaced",
                 TensorsimWarning,
                 stacklevel=3,
             )
+
+    def _times_in_file(self, start_s: float) -> Tensor:
+        """Times (n,) of the frames of the cut in seconds as the file has them, ascending; nothing is decoded."""
+        import cv2
+
+        times_s: list[float] = []
+        with self._opened() as capture:
+            capture.set(cv2.CAP_PROP_FORMAT, -1)
+            while capture.grab():
+                times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+                # Frames that are decoded later may be shown earlier, by less than a second.
+                if times_s[-1] - times_s[0] > self._end_s + 1:
+                    break
+        times = torch.tensor(sorted(times_s), dtype=torch.float64)
+        since = times - times[:1]
+        return times[(since >= start_s) & (since < self._end_s)]
 
     def _stop(self, announced: int) -> int:
         """The frame after the last one of the cut, if frames are evenly spaced."""
