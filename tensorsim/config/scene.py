@@ -102,8 +102,6 @@ class SceneConfig:
             raise TensorsimError(
                 f"SceneConfig.paths: got names of paths and {', '.join(switched)}, expected one or the other"
             )
-        if not self.wall_attenuation and self.wall is None:
-            raise TensorsimError("SceneConfig.wall_attenuation: got False without a wall, expected a wall")
         require_counts(self, "bounces")
         for name in ("noise_figure_db", *(["snr_db"] if self.snr_db is not None else [])):
             value = getattr(self, name)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from tensorsim.data.sets.clips import Clip, ClipSource
 from tensorsim.data.sets.files import FileClips
 from tensorsim.data.sets.open_sources import open_source
-from tensorsim.data.sets.recipe import PARTS, DatasetRecipe
+from tensorsim.data.sets.recipe import PARTS, DatasetRecipe, folder_name
 from tensorsim.data.sets.scene import Scene, beside_each_other, kept_inside
 from tensorsim.data.sets.variations import Variation, draw, seed_of
 from tensorsim.errors import TensorsimError
@@ -49,7 +49,8 @@ class Plan:
         labels: names of the classes, in the order of the sources.
 
     Raises:
-        TensorsimError: a folder or table that is not there, or no clips in it.
+        TensorsimError: a folder or table that is not there, no clips in it, or classes that pictures in class folders
+            cannot tell apart.
     """
 
     def __init__(self, recipe: DatasetRecipe, cache: str | None = None) -> None:
@@ -62,6 +63,19 @@ class Plan:
         self.starts = np.cumsum([0] + [len(source) for source in self.sources])
         if self.clips == 0:
             raise TensorsimError("recipe: got sources without clips, expected at least one")
+        if recipe.storage.format == "png":
+            self._check_folders()
+
+    def _check_folders(self) -> None:
+        """Refuse classes whose pictures would come into one folder, also where capitals do not count."""
+        there: dict[str, str] = {}
+        for label in self.labels:
+            other = there.setdefault(folder_name(label).casefold(), label)
+            if other != label:
+                raise TensorsimError(
+                    f"recipe: got the classes {other!r} and {label!r}, which have the same folder of pictures "
+                    f"({folder_name(label)}), expected names that differ in letters or digits"
+                )
 
     @property
     def clips(self) -> int:

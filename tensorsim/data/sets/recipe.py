@@ -182,7 +182,12 @@ _PROCESSING = ProcessingConfig(
 
 
 #: Fields of a scene that change nothing without a wall.
-_OF_WALLS = ("multipath", "wall_echo", "wall_paths", "incidence", "bounces")
+_OF_WALLS = ("multipath", "wall_echo", "wall_paths", "wall_attenuation", "incidence", "bounces")
+
+
+def folder_name(label: str) -> str:
+    """A class as the name of a folder."""
+    return re.sub(r"[^\w-]+", "_", label).strip("_") or "class"
 
 
 def matlab_name(array: str) -> str:

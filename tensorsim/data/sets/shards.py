@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,18 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tensorsim.data.sets.recipe import StorageConfig, matlab_name
+from tensorsim.data.sets.recipe import StorageConfig, folder_name, matlab_name
 from tensorsim.data.sets.samples import Sample
 from tensorsim.files import complete_file
 
 #: Suffix of the shards of each format; pictures have none.
 SUFFIXES = {"webdataset": ".tar", "hdf5": ".h5", "mat": ".mat"}
 _MAT_HEADER = b"MATLAB 5.0 MAT-file, tensorsim"
-
-
-def folder_name(label: str) -> str:
-    """A class as the name of a folder."""
-    return re.sub(r"[^\w-]+", "_", label).strip("_") or "class"
 
 
 def shard_path(folder: Path, storage: StorageConfig, name: str) -> Path:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tensorsim.data.sets.recipe import DatasetRecipe, matlab_name
-from tensorsim.data.sets.shards import folder_name, shard_path
+from tensorsim.data.sets.recipe import DatasetRecipe, folder_name, matlab_name
+from tensorsim.data.sets.shards import shard_path
 from tensorsim.errors import TensorsimError
 from tensorsim.files import reading
 

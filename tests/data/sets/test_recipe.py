@@ -14,7 +14,7 @@ from tensorsim.config.processing import Mti
 from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.plan import Plan, shared_out
-from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, StorageConfig
 from tensorsim.data.sets.scene import Scene, kept_inside, part_of, seen_from, varied
 from tensorsim.data.sets.synthesis import people_gate, synthesize, view_config
 from tensorsim.data.sets.variations import Variation, VariationConfig, draw
@@ -344,6 +344,27 @@ def test_an_array_tells_range_direction_and_speed(mti: Mti) -> None:
     _, _, doppler, beam = np.unravel_index(cube.argmax(), cube.shape)
     assert doppler >= 16
     assert abs((beam + 0.5) / 8 - 1 - 1.8 / distance) < 0.15
+
+
+def test_walls_that_do_not_attenuate() -> None:
+    document = small_recipe().to_document() | {"scene": {"wall_attenuation": False}}
+    recipe = DatasetRecipe.from_document(document)
+    wall, free = recipe.simulation(RadarView("wall", "through-wall")), recipe.simulation(RadarView("free"))
+    assert (wall.scene.wall_attenuation, wall.scene.wall is None) == (False, False)
+    assert free.scene.wall is None
+    alone = small_recipe(scene=SceneConfig(wall_attenuation=False), radars=(RadarView("free"),))
+    assert alone.without_effect == ["scene.wall_attenuation"]
+
+
+def test_classes_whose_pictures_have_one_folder_are_refused(tmp_path: Path) -> None:
+    for name in ("C", "C++"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.npz").touch()
+    recipe = small_recipe(sources=(SourceConfig("motion", str(tmp_path)),))
+    assert Plan(recipe).labels == ("C", "C++")
+    pictures = replace(recipe, storage=StorageConfig("png"), outputs=OutputConfig(kinds=("picture",)))
+    with pytest.raises(TensorsimError, match=r"the classes 'C' and 'C\+\+', which have the same folder"):
+        Plan(pictures)
 
 
 def test_settings_of_walls_without_any_wall_are_named(tmp_path: Path) -> None:
