@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from tensorsim.config.checks import Vector, as_positions, is_finite, require_positive, require_vector
+from tensorsim.config.checks import Vector, is_finite, make_plain, require_positive, require_vector
 from tensorsim.errors import TensorsimError
 
 
@@ -35,14 +35,13 @@ class CameraConfig:
     roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
+        make_plain(self)
         if self.focal_px is not None:
             require_positive("CameraConfig", focal_px=self.focal_px)
         if not (is_finite(self.horizontal_fov_rad) and 0 < self.horizontal_fov_rad < math.pi):
             raise TensorsimError(
                 f"CameraConfig.horizontal_fov_rad: got {self.horizontal_fov_rad}, expected between 0 and pi"
             )
-        for name in ("position_m", "center_px"):
-            object.__setattr__(self, name, as_positions(getattr(self, name)))
         require_vector("CameraConfig", position_m=self.position_m)
         center = self.center_px
         if center is not None and not (

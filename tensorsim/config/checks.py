@@ -1,5 +1,6 @@
 """Checks that the configurations share."""
 
+import dataclasses
 import math
 from numbers import Integral, Real
 from typing import Any, get_args
@@ -33,10 +34,16 @@ def require_dielectric(owner: str, relative_permittivity: float, loss_tangent: f
         check_range(value, name.replace("_", " "), f"{owner}.{name}")
 
 
-def as_positions(value: Any) -> Any:
-    """Arrays and lists as tuples, so that a configuration is hashable; a tuple of numbers stays as it is."""
+def as_plain(value: Any) -> Any:
+    """Arrays and lists as tuples, numbers of NumPy as Python's; anything else stays as it is."""
     value = value.tolist() if hasattr(value, "tolist") else value
-    return tuple(as_positions(v) for v in value) if isinstance(value, list | tuple) else value
+    return tuple(as_plain(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+def make_plain(config: Any) -> None:
+    """:func:`as_plain` of every field, so that a configuration is hashable and modules made from it can be scripted."""
+    for field in dataclasses.fields(config):
+        object.__setattr__(config, field.name, as_plain(getattr(config, field.name)))
 
 
 def listed(positions: Any) -> tuple[Vector, ...]:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from tensorsim.config.checks import (
-    as_positions,
     is_finite,
+    make_plain,
     require_choices,
     require_counts,
     require_positive,
@@ -61,7 +61,7 @@ class ProcessingConfig:
     pulse_chunk: int = 1024
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "range_gate_m", as_positions(self.range_gate_m))
+        make_plain(self)
         require_choices(self, mti=Mti, integration=Integration)
         if self.range_window is not None:
             require_choices(self, range_window=RangeWindow)

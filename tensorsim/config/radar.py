@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 from tensorsim.config.checks import (
     Vector,
-    as_positions,
     is_finite,
     listed,
+    make_plain,
     require_position,
     require_positive,
 )
@@ -43,6 +43,7 @@ class RadarConfig:
     isolation_db: float = 20.0
 
     def __post_init__(self) -> None:
+        make_plain(self)
         require_positive(
             "RadarConfig",
             carrier_hz=self.carrier_hz,
@@ -59,8 +60,6 @@ class RadarConfig:
             ("sample_rate_hz", "sample rate"),
         ):
             check_range(getattr(self, name), quantity, f"RadarConfig.{name}")
-        for name in ("tx_m", "rx_m"):
-            object.__setattr__(self, name, as_positions(getattr(self, name)))
         for tx in self.tx_positions_m:
             require_position("RadarConfig", tx_m=tx)
         for rx in self.rx_positions_m:

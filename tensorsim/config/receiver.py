@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from tensorsim.config.checks import (
     Vector,
-    as_positions,
     is_finite,
+    make_plain,
     require_counts,
     require_position,
     require_positive,
@@ -45,6 +45,7 @@ class ReceiverConfig:
     adc_headroom_db: float = 12.0
 
     def __post_init__(self) -> None:
+        make_plain(self)
         for name in (
             "phase_noise_dbc_hz",
             "iq_imbalance_db",
@@ -105,6 +106,7 @@ class ClutterConfig:
     jitter_m: float = 10e-6
 
     def __post_init__(self) -> None:
+        make_plain(self)
         require_counts(self, "reflectors")
         if not (is_finite(self.jitter_m) and self.jitter_m >= 0):
             raise TensorsimError(
@@ -133,7 +135,7 @@ class InterferenceConfig:
     delay_s: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position_m", as_positions(self.position_m))
+        make_plain(self)
         require_position("InterferenceConfig", position_m=self.position_m)
         require_positive("InterferenceConfig", chirp_ratio=self.chirp_ratio)
         for name in ("power_ratio_db", "delay_s"):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
+from tensorsim.config.checks import is_finite, make_plain, require_choices, require_counts, require_positive
 from tensorsim.config.radar import RadarConfig
 from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
@@ -77,6 +77,7 @@ class SceneConfig:
     transmit_power_w: float = 0.01
 
     def __post_init__(self) -> None:
+        make_plain(self)
         for name, kind in (
             ("radar", RadarConfig),
             ("wall", WallConfig),

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from tensorsim.config.checks import (
     Vector,
-    as_positions,
     is_finite,
+    make_plain,
     require_dielectric,
     require_position,
     require_vector,
@@ -31,8 +31,7 @@ class WallConfig:
     loss_tangent: float = 0.03
 
     def __post_init__(self) -> None:
-        for name in ("center_m", "size_m"):
-            object.__setattr__(self, name, as_positions(getattr(self, name)))
+        make_plain(self)
         require_position("WallConfig", center_m=self.center_m)
         require_vector("WallConfig", size_m=self.size_m)
         if self.size_m[0] <= 0 or self.size_m[1] < 0 or self.size_m[2] <= 0:
@@ -67,6 +66,7 @@ class FloorConfig:
     reflection: float | None = None
 
     def __post_init__(self) -> None:
+        make_plain(self)
         require_dielectric("FloorConfig", self.relative_permittivity, self.loss_tangent)
         if self.reflection is not None and not (is_finite(self.reflection) and -1 <= self.reflection <= 1):
             raise TensorsimError(f"FloorConfig.reflection: got {self.reflection}, expected between -1 and 1")

@@ -42,11 +42,14 @@ def test_a_yaml_file_holds_everything(tmp_path: Path) -> None:
         "scene__radar__tx_m": np.zeros(3, dtype=np.float32),
         "scene__snr_db": np.float32(20.5),
         "scene__bounces": np.int32(2),
+        "scene__receiver__iq_imbalance_db": np.float64(0.5),
+        "scene__receiver__adc_bits": np.int64(8),
         "processing__display_rate_hz": np.int64(30),
         "processing__ridge_count": np.int64(2),
     }
     config = ts.SimulationConfig().replace(**numpy)
     assert type(config.scene.bounces) is type(config.processing.ridge_count) is int
+    torch.jit.script(ts.radar.RadarSimulator(config.scene))
     config.to_yaml(tmp_path / "run.yaml")
     assert ts.SimulationConfig.from_yaml(tmp_path / "run.yaml") == config
     (tmp_path / "some.yaml").write_text("scene: {radar: {prf_hz: 4e3}}\nseed: 3\n")

@@ -126,8 +126,10 @@ def floor_leg(point, antenna, floor, polarization):
     r = np.linalg.norm(offset)
     if floor.reflection is not None:
         return r, r / C, floor.reflection
-    g = interface(floor.relative_permittivity, floor.loss_tangent, offset[2] / r, polarization)
-    return r, r / C, g
+    # ITU-R P.527 for the vertical and the horizontal field over the sine of the grazing angle.
+    eps, sine = floor.relative_permittivity * (1 - 1j * floor.loss_tangent), offset[2] / r
+    inner, outer = np.sqrt(eps - 1 + sine**2), eps * sine if polarization == "tm" else sine
+    return r, r / C, (outer - inner) / (outer + inner)
 
 
 def pair_legs(radar, out, back):

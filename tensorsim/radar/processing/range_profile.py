@@ -73,7 +73,8 @@ class RangeProfile(nn.Module):
         window: (N,).
 
     Raises:
-        TensorsimError: unknown window, a gate without bins, a real IF, N other than the radar's.
+        TensorsimError: unknown window, one of zeros alone (for two samples), a gate without bins, a real IF, N other
+            than the radar's.
     """
 
     window: Tensor
@@ -92,6 +93,11 @@ class RangeProfile(nn.Module):
             if window not in _WINDOWS:
                 raise TensorsimError(f"window: got {window!r}, expected one of {sorted(_WINDOWS)} or None")
             values = _WINDOWS[window](samples, periodic=False, dtype=torch.float64)
+            if values.max() < 1e-9:
+                raise TensorsimError(
+                    f"window: got {window!r}, which is 0 at both of the {samples} samples of a pulse, expected "
+                    "'hamming' or None"
+                )
         self.samples = samples
         first, last = 0, samples // 2 - 1
         if gate_m is not None:

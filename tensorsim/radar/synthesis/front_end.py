@@ -53,8 +53,8 @@ def oscillator(radar: RadarConfig, level_dbc_hz: float, seed: int) -> PhaseNoise
 class FrontEnd(nn.Module):
     """From the IF that arrives to the samples that are recorded.
 
-    In the order of a receiver: phase noise, interference, thermal noise, unequal I and Q, constant offset, one channel
-    in place of two, converters. Phase noise of the echo cancels in part, as it comes from the own oscillator; that of
+    In the order of a receiver: phase noise, interference, thermal noise, unequal I and Q, constant offset, converters,
+    one channel in place of two. Phase noise of the echo cancels in part, as it comes from the own oscillator; that of
     the interference does not. Offset and full scale of the converters are relative to the mean powers of the whole
     clip. Phase noise and interference depend on the number of the pulse, so that pieces of a clip give what the whole
     gives; all antennas and all clips of a batch have the same.
@@ -118,11 +118,11 @@ class FrontEnd(nn.Module):
         offset = signal * self.offset_ratio
         if self.offset_ratio > 0:
             samples = samples + broadcast(offset.sqrt(), samples)[..., None, None].to(samples.dtype)
-        if self.real is not None:
-            samples = self.real(samples)
         if self.bits > 0:
             full_scale = safe_sqrt((levels.arriving + thermal + offset) * self.headroom)
             samples = quantise(samples, broadcast(full_scale, samples), self.bits)
+        if self.real is not None:  # last: no level of a converter is 0, which a missing channel is
+            samples = self.real(samples)
         return samples, drawn
 
 

@@ -250,6 +250,9 @@ class TracedLegs(nn.Module):
             permittivity = torch.full_like(cosine, self.floor_permittivity)
             loss_tangent = torch.full_like(cosine, self.floor_loss)
             reflection = fresnel(permittivity, loss_tangent, cosine, self.floor_polarization)
+            # Fresnel's coefficient is that of the field along the floor; upright antennas have the vertical one.
+            if self.floor_polarization == "tm":
+                reflection = -reflection
         else:
             constant = torch.full_like(length, self.floor_reflection)
             reflection = torch.complex(constant, torch.zeros_like(constant))

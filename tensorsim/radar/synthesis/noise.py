@@ -131,7 +131,7 @@ class ReceiverNoise(nn.Module):
         check_positive(transmit_power_w, "transmit_power_w")
         thermal = BOLTZMANN_J_PER_K * REFERENCE_TEMPERATURE_K * bandwidth_hz * 10 ** (noise_figure_db / 10)
         self.reference = reference
-        self.absolute_power = thermal / transmit_power_w
+        self.absolute_power = float(thermal / transmit_power_w)
         self.empty_power = float(empty_power)
         self.noiseless = snr_db is None and reference != "absolute"
         self.noise_per_signal = 0.0 if snr_db is None else 10 ** (-snr_db / 10)

@@ -122,7 +122,9 @@ class PropagationPaths(TracedLegs):
                         (mirrored transmitter, times G), b (mirrored receiver, times G), c (both, times G^2);
                         see :func:`~tensorsim.radar.synthesis.legs.mirror_delays`.
     ``floor``           the images of the antennas in z = 0, times the floor's reflection coefficient:
-                        floor-direct, direct-floor, floor-floor. These legs pass the wall without bounces.
+                        floor-direct, direct-floor, floor-floor. These legs pass the wall without bounces. The
+                        coefficient is that of the field that antennas hear: of upright ones, the vertical field's
+                        (Balanis, *Antenna Theory*, 4.8), 1 over metal and -1 at grazing incidence.
     ``leakage``         transmitter to receiver: ``10^(-isolation/20)``, delay ``|Ptx - Prx| / c``.
     ``wall_echo``       transmitter - near face - receiver, the Friis equation on the mirrored path:
                         ``lambda sqrt(Gt Gr) / (4 pi R) G`` with ``R = |Ptx' - Prx|``.

@@ -41,8 +41,8 @@ class QuadratureImbalance(nn.Module):
                 f"gain_db, phase_rad: got {gain_db} and {phase_rad}, expected finite numbers"
             )
         gain = 10 ** (gain_db / 20)
-        self.direct = (1 + gain * cmath.exp(-1j * phase_rad)) / 2
-        self.image = (1 - gain * cmath.exp(1j * phase_rad)) / 2
+        self.direct = complex(1 + gain * cmath.exp(-1j * phase_rad)) / 2
+        self.image = complex(1 - gain * cmath.exp(1j * phase_rad)) / 2
         self.image_rejection_db = (
             math.inf if self.image == 0 else 20 * math.log10(abs(self.direct) / abs(self.image))
         )

@@ -100,6 +100,12 @@ def test_leakage_shows_at_its_delay():
 
 
 def test_bad_arguments():
+    two = RadarConfig(sample_rate_hz=2e6, chirp_s=1e-6, bandwidth_hz=1e8)
+    for window in ("hann", "blackman"):
+        with pytest.raises(
+            TensorsimError, match=f"window: got '{window}', which is 0 at both of the 2 samples"
+        ):
+            RangeProfile(two, window)
     with pytest.raises(TensorsimError, match="window: got 'kaiser'"):
         RangeProfile(FREE, "kaiser")
 

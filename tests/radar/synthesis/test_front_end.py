@@ -112,6 +112,20 @@ def test_real_receivers_have_the_noise_of_the_image_in_their_range_bins() -> Non
     assert 10 * math.log10(found[1] / found[0]) == pytest.approx(-3.01, abs=0.3)
 
 
+@pytest.mark.parametrize("bits", [1, 4, 8])
+def test_converters_of_real_receivers_leave_the_missing_channel_out(bits: int) -> None:
+    """The profile is that of the quantised I alone; a quantised 0 would be a constant Q of half a step."""
+    radar = RadarConfig.free_space()
+    p = mover(radar, 900, -1.0, 3.0)
+    shown = maps_of(radar, p, ReceiverConfig(real=True, adc_bits=bits)).range_time.double().numpy()
+    wave = EchoSynthesizer(radar)(p, torch.ones(1)).numpy().astype(complex)
+    step = 2 * math.sqrt((abs(wave) ** 2).mean() * 10**1.2) / 2**bits
+    most = 2 ** (bits - 1) - 0.5
+    levels = np.clip(np.floor(wave.real / step) + 0.5, -most, most) * step
+    expected = abs(np.fft.fft(levels * WINDOW)[:, :200]).T
+    assert np.linalg.norm(shown - expected) / np.linalg.norm(expected) < 0.02
+
+
 @pytest.mark.parametrize(("bits", "headroom_db"), [(8, 12.0), (10, 6.0), (12, 3.0)])
 def test_quantisation_noise_floor(bits: int, headroom_db: float) -> None:
     """A wave of full scale has 6.02 bits + 1.76 dB, spread over all bins; headroom costs as much."""

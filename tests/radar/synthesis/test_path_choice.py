@@ -99,6 +99,22 @@ def test_floor_equals_the_definition(floor, polarization):
     )  # position above is float32
 
 
+@pytest.mark.parametrize(
+    ("floor", "grazing", "upright", "lying"),
+    [
+        (FloorConfig(1000.0, 100.0), False, 1.0, -1.0),  # metal: the image of an upright dipole is upright
+        (FloorConfig(), True, -1.0, -1.0),  # two rays cancel, however the antennas are polarised
+    ],
+)
+def test_sign_of_the_floor(floor, grazing, upright, lying):
+    point = torch.tensor([[0.0, 900.0 if grazing else 2.0, 0.1 if grazing else 1.0]]).double()
+    for polarization, expected in (("te", upright), ("tm", lying)):
+        paths = EchoSynthesizer(THROUGH, floor=floor, polarization=polarization).double().paths
+        gain = paths(point, torch.ones(1).double()).gain[0]
+        ratio = complex(gain[1] / gain[0])
+        assert ratio / abs(ratio) == pytest.approx(expected, abs=0.05)
+
+
 def test_floor_below_a_wall_of_air_is_the_floor_alone():
     p, rcs = scene()
     nothing = WallConfig((0, 1, 1.25), (50, 0.24, 2.5), 1.0, 0.0)
