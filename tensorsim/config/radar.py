@@ -136,8 +136,9 @@ class RadarConfig:
 
     @property
     def range_resolution_m(self) -> float:
-        """Spacing of range bins, c / (2B)."""
-        return SPEED_OF_LIGHT_M_S / (2 * self.bandwidth_hz)
+        """Spacing of range bins, c / (2B); where fs T is no whole number, B is what the N samples span."""
+        span = self.samples_per_chirp / (self.sample_rate_hz * self.chirp_s)
+        return SPEED_OF_LIGHT_M_S / (2 * self.bandwidth_hz * span)
 
     @property
     def reach_m(self) -> float:

@@ -238,18 +238,18 @@ def place_wall(wall: WallConfig | None, radar: RadarConfig) -> WallConfig | None
         The wall, or None for no wall or one of thickness 0.
 
     Raises:
-        TensorsimError: the whole wall is behind the antennas.
+        TensorsimError: the whole wall is behind the antennas, or between them.
     """
     if wall is None or wall.size_m[1] == 0.0:
         return None
     x, y, z = wall.center_m
     half = wall.size_m[1] / 2
     antennas_y = [antenna[1] for antenna in radar.tx_positions_m + radar.rx_positions_m]
-    plane, rear_antenna = max(antennas_y), min(antennas_y)
-    if y + half <= rear_antenna + CONTACT_M:
+    plane = max(antennas_y)
+    if y + half <= plane + CONTACT_M:
         raise TensorsimError(
-            f"wall: its far face is at y = {y + half:.4g} m, expected in front of the antennas "
-            f"at y = {plane:.4g} m: a wall behind them has no effect"
+            f"wall: its far face is at y = {y + half:.4g} m, expected in front of all antennas, the foremost at "
+            f"y = {plane:.4g} m: a wall behind them has no effect, and one between them is not computed"
         )
     if y - half < plane + CONTACT_M:
         if y - half < plane - CONTACT_M:

@@ -82,6 +82,18 @@ def test_range_peak_is_at_half_the_path(distance):
     assert float(peak) == pytest.approx(distance, abs=C / (4 * 4e9) * 1.001)  # half a bin
 
 
+@pytest.mark.parametrize("chirp_s", [16.5e-6, 33.4e-6, 64.45e-6])
+def test_range_axis_where_samples_do_not_fill_the_sweep(chirp_s):
+    radar = RadarConfig(10e9, 1e9, chirp_s, 1000.0, 1e6, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
+    place = 0.7 * radar.reach_m
+    target = torch.tensor([[[0.0, place, 1.0]]]).double()
+    pulse = EchoSynthesizer(radar).double()(target, torch.ones(1).double())[0].numpy()
+    spectrum = np.abs(np.fft.fft(pulse * np.hanning(len(pulse)), 256 * len(pulse)))
+    assert np.argmax(spectrum[: 128 * len(pulse)]) / 256 * radar.range_resolution_m == pytest.approx(
+        place, rel=1e-3
+    )
+
+
 def test_range_axis():
     axis = RangeProfile(FREE).range_m
     assert axis.shape == (200,)

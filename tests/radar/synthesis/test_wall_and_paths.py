@@ -251,6 +251,9 @@ def test_wall_behind_the_antennas_is_refused():
         place_wall(WallConfig(center_m=(0, -1, 1.5)), RADAR)
     with pytest.raises(TensorsimError, match="a wall behind them has no effect"):
         place_wall(WallConfig(center_m=(0, -0.12, 1.5)), RADAR)
+    apart = RadarConfig.through_wall(rx_m=(0.0, 5.0, 1.5))
+    with pytest.raises(TensorsimError, match=r"far face is at y = 2.12 m, .* the foremost at y = 5 m"):
+        place_wall(WallConfig(center_m=(0, 2, 1.5)), apart)
 
 
 def test_opaque_wall_warns():
