@@ -10,6 +10,7 @@ from tensorsim.errors import check_positive
 from tensorsim.motion.scatterers import check_antenna
 from tensorsim.radar.synthesis.dechirp import phasor
 from tensorsim.radar.synthesis.echo import check_scene
+from tensorsim.radar.synthesis.legs import leg_length
 
 
 def continuous_wave(path_m: Tensor, amplitude: Tensor, wavelength_m: float) -> Tensor:
@@ -68,7 +69,8 @@ class ContinuousWaveEcho(nn.Module):
         """Scatterers (..., M, S, 3) m with (..., M, S) m^2 to the baseband signal (..., M)."""
         rcs = check_scene(positions, rcs)
         exact = positions.double()
-        there = (exact - self.tx.double()).square().sum(-1).sqrt()
-        back = (exact - self.rx.double()).square().sum(-1).sqrt()
+        shortest_m = self.wavelength_m / (4 * math.pi)  # as everywhere: the radar equation ends there
+        there = leg_length(exact, self.tx.double(), shortest_m)
+        back = leg_length(exact, self.rx.double(), shortest_m)
         amplitude = self.scale * rcs.double().clamp(min=0.0).sqrt() / (there * back)
         return continuous_wave(there + back, amplitude.to(self.precision.dtype), self.wavelength_m)

@@ -15,8 +15,9 @@ class Interference(nn.Module):
 
     Own sweep and foreign one beat at the difference of their momentary frequencies; what is within half the sample
     rate of zero is in the IF, a chirp in itself that spreads over all range bins, and what lies beyond is filtered
-    out. One path, direct: amplitude ``sqrt(Pt2 / Pt1 Gt Gr) lambda / (4 pi R)`` (Friis). See Brooker, *Mutual
-    interference of millimeter-wave radar systems*, IEEE Trans. Electromagn. Compat. 49, 2007.
+    out. One path, direct and in air, whatever walls the scene has: amplitude ``sqrt(Pt2 / Pt1 Gt Gr) lambda /
+    (4 pi R)`` (Friis). See Brooker, *Mutual interference of millimeter-wave radar systems*, IEEE Trans. Electromagn.
+    Compat. 49, 2007.
 
     Times count from pulse 0, so that pieces of a clip give what the whole clip gives. The two clocks are ideal.
 
