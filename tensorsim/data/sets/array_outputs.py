@@ -13,7 +13,12 @@ from tensorsim.data.sets.scene import Scene
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline.maps import PoseToDoppler
 from tensorsim.radar.options import echo_of
-from tensorsim.radar.processing.array import align_transmitters, steering_vectors, virtual_elements
+from tensorsim.radar.processing.array import (
+    align_transmitters,
+    row_spacing_m,
+    steering_vectors,
+    virtual_elements,
+)
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.radar.processing.point_cloud import PointCloud
@@ -35,7 +40,7 @@ def array_outputs(config: SimulationConfig, wanted: OutputConfig, scene: Scene) 
     refer to are means over some of the pulses.
 
     Raises:
-        TensorsimError: a point cloud of antennas that are no even line along x.
+        TensorsimError: a point cloud of antennas that are no even row along x.
     """
     radar, processing = config.scene.radar, config.processing
     profile = RangeProfile(radar, processing.range_window, _fixed(processing.range_gate_m))
@@ -114,15 +119,12 @@ def _points(
     cubes: Tensor, radar: RadarConfig, profile: RangeProfile, frames: DopplerFrames, wanted: OutputConfig
 ) -> Stored:
     """Points (frames, points, 4) of cubes (frames, V, R, F)."""
-    steps = virtual_elements(radar).diff(dim=0)
-    if not torch.allclose(steps, steps[:1] * torch.tensor([1.0, 0, 0]).double(), atol=1e-6):
-        raise TensorsimError("point_cloud: got other antennas, expected an even line along x")
     cfar = point_cfar(radar, frames)
     cloud = PointCloud(
         radar.range_resolution_m,
         radar.prf_hz / frames.bins * radar.doppler_wavelength_m / 2,
         wanted.points,
-        float(steps[0, 0]) / radar.doppler_wavelength_m,
+        row_spacing_m(radar) / radar.doppler_wavelength_m,
     )
     power = cubes.abs().square().mean(1)
     found = cloud(cubes.conj().resolve_conj(), cfar(power))

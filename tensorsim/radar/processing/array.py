@@ -36,6 +36,25 @@ def virtual_elements(radar: RadarConfig) -> Tensor:
     return (tx[:, None] + rx).flatten(0, 1)
 
 
+def row_spacing_m(radar: RadarConfig) -> float:
+    """Distance of neighbouring virtual elements of an even row along x; half a wavelength for one alone.
+
+    Raises:
+        TensorsimError: an array that is no even row along x, from left to right.
+    """
+    elements = virtual_elements(radar)
+    if len(elements) == 1:
+        return radar.doppler_wavelength_m / 2
+    steps = elements.diff(dim=0)
+    step_m = float(steps[0, 0])
+    if step_m <= 0 or bool((steps - steps.new_tensor([step_m, 0.0, 0.0])).abs().max() > 1e-6):
+        raise TensorsimError(
+            f"radar: got virtual elements at {[[round(v, 5) for v in place] for place in elements.tolist()]} m, "
+            "expected an even row along x, from left to right"
+        )
+    return step_m
+
+
 def steering_vectors(
     channels_m: Tensor, azimuth_rad: Tensor, elevation_rad: float, wavelength_m: float
 ) -> Tensor:

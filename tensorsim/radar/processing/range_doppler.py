@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_size, check_tensor
-from tensorsim.radar.processing.array import steering_vectors, virtual_elements
+from tensorsim.radar.processing.array import row_spacing_m, steering_vectors, virtual_elements
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.point_cloud import PointCloud, Points
@@ -157,21 +157,10 @@ class PointDetector(nn.Module):
     ) -> None:
         super().__init__()
         self.cube = RangeDopplerCube(radar, window_s, overlap)
-        elements = virtual_elements(radar)
-        spacing = elements.diff(dim=0)
-        even = bool((spacing - spacing[:1]).abs().max() < 1e-6) if len(elements) > 2 else True
-        along_x = bool((spacing[:, 1:].abs() < 1e-9).all()) and bool((spacing[:, 0] > 0).all())
-        if not (even and along_x):
-            raise TensorsimError(
-                f"radar: got virtual elements at {[[round(v, 5) for v in place] for place in elements.tolist()]} m, "
-                "expected an even row along x, from left to right"
-            )
-        step_m = float(spacing[0, 0]) if len(elements) > 1 else radar.doppler_wavelength_m / 2
+        spacing = row_spacing_m(radar) / radar.doppler_wavelength_m
         self.cfar = point_cfar(radar, self.cube) if cfar is None else cfar
         speed_step = self.cube.prf_hz / self.cube.bins * radar.doppler_wavelength_m / 2
-        self.cloud = PointCloud(
-            radar.range_resolution_m, speed_step, points, step_m / radar.doppler_wavelength_m
-        )
+        self.cloud = PointCloud(radar.range_resolution_m, speed_step, points, spacing)
         self.nearest_m = float(nearest_m)
 
     def forward(self, profiles: Tensor) -> Points:

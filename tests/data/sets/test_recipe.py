@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from tensorsim import cli
-from tensorsim.config import SceneConfig, WallConfig
+from tensorsim.config import SceneConfig, SimulationConfig, Vector, WallConfig
 from tensorsim.config.processing import Mti
+from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.plan import Plan, shared_out
@@ -308,6 +309,30 @@ def test_one_noise_for_each_radar() -> None:
     scene = plan.scene(0, "train", variation)
     made = synthesize(recipe, Scene(*scene), variation)
     assert (made.arrays["a.doppler_time"] != made.arrays["b.doppler_time"]).any()
+
+
+@pytest.mark.parametrize(
+    ("receivers", "message"),
+    [
+        (((0.01, 0.0, 1.0),), None),
+        (((0.01, 0.0, 1.0), (0.0, 0.0, 1.0)), "expected an even row along x, from left to right"),
+    ],
+)
+def test_points_of_one_antenna_and_of_a_row_from_right_to_left(
+    receivers: tuple[Vector, ...], message: str | None
+) -> None:
+    config = SimulationConfig().replace(scene__radar__rx_m=receivers)
+    y = 3.0 - 0.1 * torch.arange(8).reshape(1, -1, 1)
+    scene = Scene(torch.stack([0 * y, y, 1 + 0 * y], -1).expand(1, 8, 14, 3), torch.ones(1, 8).bool(), 30.0)
+    outputs = OutputConfig(kinds=("point_cloud",), frames_per_s=10.0, points=4)
+    if message is not None:
+        with pytest.raises(TensorsimError, match=message):
+            array_outputs(config, outputs, scene)
+        return
+    points = array_outputs(config, outputs, scene)["point_cloud"].array.reshape(-1, 4)
+    found = points[~np.isnan(points[:, 0])]
+    assert abs(found[:, 1].max() - 3.0) < 0.3
+    assert (found[:, 2] == 0).all()
 
 
 @pytest.mark.parametrize("mti", ["two-pulse", "high-pass"])
