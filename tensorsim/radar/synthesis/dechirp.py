@@ -133,6 +133,7 @@ def dispersed_sum(
     carrier_hz: float,
     slope_hz_per_s: float,
     time_s: Tensor,
+    attenuates: bool = True,
 ) -> Tensor:
     """:func:`beat_sum` of paths whose gain depends on the frequency of the sweep: (..., S, P) -> (..., N).
 
@@ -140,7 +141,8 @@ def dispersed_sum(
     by ``T(f) / T_0(fc) = exp(-alpha d (f / fc - 1)) / (1 - G^2 exp(-2 alpha d f / fc - j 2 pi f t))``: the
     closed sum of all internal bounces over the straight passage, t the delay of a pair. The phase of the straight
     passage is in ``tau`` and not in this factor. The delay ``k t`` of the k-th bounce enters through the frequency
-    alone, which leaves out ``mu (k t)^2 / 2`` cycles (2e-4 for the default wall).
+    alone, which leaves out ``mu (k t)^2 / 2`` cycles (2e-4 for the default wall). Where the wall does not attenuate,
+    the straight passage loses nothing at any frequency.
     """
     echo = paths.gain.new_zeros(list(paths.gain.shape[:-2]) + list(time_s.shape))
     for s in range(paths.gain.shape[-2]):  # all scatterers at once would need S P N complex numbers per pulse
@@ -150,7 +152,9 @@ def dispersed_sum(
         relative = frequency / carrier_hz
         neper, bounce = resonance.loss_neper[..., s, :, :, None], resonance.bounce_s[..., s, :, :, None]
         turn = torch.polar(torch.exp(-2 * neper * relative), -2 * math.pi * bounce * frequency)
-        leg = torch.exp(-neper * (relative - 1)) / (1 - resonance.square[..., s, :, :, None] * turn)
+        leg = 1 / (1 - resonance.square[..., s, :, :, None] * turn)
+        if attenuates:
+            leg = leg * torch.exp(-neper * (relative - 1))
         factor = (leg[..., 0, :] * leg[..., 1, :]).conj() * paths.gain[..., s, :, None]
         echo = echo + (phasor(cycles - cycles.round()) * factor).sum(-2)
     return echo

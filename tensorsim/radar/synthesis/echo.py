@@ -137,7 +137,9 @@ class EchoSynthesizer(nn.Module):
 
     def _dispersed(self, paths: Paths, resonance: Resonance) -> Tensor:
         time = torch.arange(self.samples, device=self.fine.device).double() / self.sample_rate_hz
-        pulses = dispersed_sum(paths, resonance, self.carrier_hz, self.slope_hz_per_s, time)
+        pulses = dispersed_sum(
+            paths, resonance, self.carrier_hz, self.slope_hz_per_s, time, self.paths.attenuates
+        )
         return pulses.to(torch.complex(self.fine, self.fine).dtype)
 
     def _sum(self, delay_s: Tensor, gain: Tensor, dtype: torch.dtype) -> Tensor:

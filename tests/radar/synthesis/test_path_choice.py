@@ -115,6 +115,20 @@ def test_sign_of_the_floor(floor, grazing, upright, lying):
         assert ratio / abs(ratio) == pytest.approx(expected, abs=0.05)
 
 
+def test_without_attenuation_the_closed_slab_has_the_ripple_of_its_bounces_alone():
+    wall, point = WallConfig(), torch.tensor([[[-0.1, 4.0, 1.5]]]).double()
+    radar = replace(THROUGH, rx_m=THROUGH.tx_m)
+    one = torch.ones(1).double()
+    options = {"incidence": "airy", "wall_attenuation": False}
+    found = EchoSynthesizer(radar, wall, **options).double()(point, one)
+    air = EchoSynthesizer(radar).double()(point, one)
+    delay = float(EchoSynthesizer(radar, wall, **options).paths(point[0], one).delay_s)
+    f = radar.carrier_hz + radar.slope_hz_per_s * (np.arange(400) / radar.sample_rate_hz - delay)
+    n, g, _, _ = reference.wall_terms(wall, radar.carrier_hz)
+    once = g**2 * np.exp(-4j * np.pi * f * 0.24 * n.real / C + 4 * np.pi * f * 0.24 * n.imag / C)
+    np.testing.assert_allclose((found / air).abs()[0], abs(1 / (1 - once)) ** 2, rtol=1e-6)
+
+
 def test_floor_below_a_wall_of_air_is_the_floor_alone():
     p, rcs = scene()
     nothing = WallConfig((0, 1, 1.25), (50, 0.24, 2.5), 1.0, 0.0)
