@@ -149,6 +149,7 @@ def doppler_figure(
 ) -> "Figure":
     """The picture of a Doppler-time map with its ridges; that of the true motion beside it, if given."""
     both = [maps] if truth is None else [maps, truth]
+    range_db = pictures.style.dynamic_range_db
     return plot.map_figure(
         maps.doppler_time.numpy(),
         axes.time_s,
@@ -157,7 +158,7 @@ def doppler_figure(
         "Doppler in Hz, positive = approaching",
         ridges=strong_ridges(maps, axes),
         speed_per_axis=axes.speed_per_hz,
-        half_span=max(doppler_span(one, axes) for one in both),
+        half_span=max(plot.doppler_span(one.doppler_time.numpy(), axes.doppler_hz, range_db) for one in both),
         reference=None if truth is None else truth.doppler_time.numpy(),
         reference_ridges=None if truth is None else strong_ridges(truth, axes),
         **pictures.options("doppler_time"),
@@ -191,14 +192,6 @@ def strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
     """Ridges (3, K) in Hz, NaN where one is no more than noise at the floor of the colours."""
     floor = float(maps.doppler_time.max()) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
     return np.where(maps.ridge_magnitudes.numpy() > floor, axes.doppler_hz[maps.ridges.numpy()], np.nan)
-
-
-def doppler_span(maps: RadarMaps, axes: Axes) -> float:
-    """Half of the part of the Doppler axis that has something to show, in Hz."""
-    level = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB).max(1)
-    # Most of the axis is noise, which may be above the floor of the colours.
-    shown = np.abs(axes.doppler_hz)[(level > -plot.DYNAMIC_RANGE_DB) & (level > np.median(level) + 6)]
-    return 1.25 * float(shown.max(initial=axes.doppler_hz[-1] / 8))
 
 
 def write_doppler_sound(

@@ -18,7 +18,7 @@ from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.motion import JointScatterers
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
-from tensorsim.results import Axes, doppler_span, people_of
+from tensorsim.results import people_of
 from tensorsim.streaming import maps_of_pose
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
@@ -313,16 +313,6 @@ def test_joints_without_people_are_refused() -> None:
         TensorsimError, match=r"joints: got shape \[1, 30, 14, 3\], expected \(B, P, T, 14, 3\)"
     ):
         stage(torch.zeros(1, 30, 14, 3), torch.ones(1, 30, dtype=torch.bool), FPS)
-
-
-def test_noise_above_the_floor_of_the_colours_is_not_shown_in_full() -> None:
-    """The picture of the Doppler-time map is as wide as what stands out of the noise."""
-    doppler_hz = torch.linspace(-4000, 4000, 801)
-    level = 0.01 * torch.rand(801, 50, generator=torch.Generator().manual_seed(0))
-    level[(doppler_hz.abs() < 900), 20] = 1.0
-    maps = ts.types.RadarMaps(*(torch.zeros(1) for _ in range(2)), level, *(torch.zeros(1) for _ in range(3)))
-    axes = Axes(np.zeros(1), doppler_hz.numpy(), np.zeros(1), 256.0, 0.01)
-    assert doppler_span(maps, axes) == pytest.approx(1.25 * 890.0)
 
 
 def test_ranges_of_people_are_those_from_the_antennas() -> None:

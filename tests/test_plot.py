@@ -213,6 +213,34 @@ def test_tick_labels_do_not_overlap() -> None:
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
+@pytest.mark.parametrize("last_m", [7.0, 12.0, 28.0])
+def test_labels_of_the_skeletons_have_room(last_m: float) -> None:
+    joints = np.zeros((1, 20, 14, 3))
+    joints[0] = np.linspace([-1.0, 3.0, 1.0], [1.0, last_m, 1.0], 20)[:, None]
+    figure = plot.skeleton_figure(joints, np.ones((1, 20), bool), 10.0)
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        low, high = axis.get_view_interval()
+        ticks = [tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
+        boxes = [text.get_window_extent().padded(2) for text in ticks]
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
+def test_the_doppler_axis_is_as_wide_as_what_stands_out_of_the_noise() -> None:
+    doppler_hz = np.linspace(-4000, 4000, 801)
+    noise = 0.01 * np.random.default_rng(0).random((801, 50))  # above the floor of the colours
+    brief = np.where((np.abs(doppler_hz) < 900)[:, None] & (np.arange(50) == 20), 1.0, noise)
+    assert plot.doppler_span(brief, doppler_hz) == pytest.approx(1.25 * 890)
+    # Brisk motion behind a wall fills most of the axis at one time or another.
+    wide = np.where((doppler_hz < 2500)[:, None] & (np.arange(50) % 5 == 0), 0.5, brief)
+    assert plot.doppler_span(wide, doppler_hz) >= 4000
+    weak = np.where(np.abs(doppler_hz)[:, None] < 1500, 1e-3 * np.ones(50), 1e-6)
+    weak[400] = 1.0
+    assert plot.doppler_span(weak, doppler_hz, 70.0) == pytest.approx(1.25 * 1490)
+    assert plot.doppler_span(weak, doppler_hz, 40.0) == pytest.approx(1.25 * 500)
+
+
 def test_overview_shows_a_run_in_a_small_picture(tmp_path: Path) -> None:
     frames = [np.full((48, 64, 3), 128, np.uint8)] * 4
     ts.data.write_video(tmp_path / "overlay.mp4", frames, 10.0)
@@ -231,7 +259,7 @@ def test_overview_shows_a_run_in_a_small_picture(tmp_path: Path) -> None:
     picture, range_axes, doppler_axes, _ = figure.axes
     assert np.abs(picture.images[0].get_array().mean() - 128) < 4
     assert range_axes.get_ylabel() == "range in m"
-    assert np.allclose(doppler_axes.get_ylim(), (-8.8, 8.8))
+    assert np.allclose(doppler_axes.get_ylim(), (-10.0, 10.0))
     save_small(figure, tmp_path / "overview.png")
     assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
     (tmp_path / "maps.npz").unlink()

@@ -11,6 +11,7 @@ from tensorsim.plot.maps import (
     colormap,
     confusion_figure,
     decibels,
+    doppler_span,
     map_figure,
     person_peaks,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "colormap",
     "confusion_figure",
     "decibels",
+    "doppler_span",
     "draw_floor",
     "draw_lines",
     "draw_people",

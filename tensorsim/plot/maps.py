@@ -209,6 +209,20 @@ def map_figure(
     return figure
 
 
+def doppler_span(
+    magnitude: np.ndarray, doppler_hz: np.ndarray, dynamic_range_db: float = DYNAMIC_RANGE_DB
+) -> float:
+    """Half of the part of the Doppler axis in which a Doppler-time map (F, K) has something to show, in Hz.
+
+    Noise may be above the floor of the colours. Rows of it stand out neither from other rows nor over time.
+    """
+    levels = decibels(magnitude, 120.0)
+    strongest = levels.max(1)
+    noise = np.minimum(np.median(strongest), np.median(levels, axis=1) + 9)
+    rows = (strongest > -dynamic_range_db) & (strongest > noise + 6)
+    return 1.25 * float(np.abs(doppler_hz[rows]).max(initial=doppler_hz[-1] / 8))
+
+
 def _write_note(axes: Axes, note: str) -> None:
     """Words in the middle of a map."""
     box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none"}

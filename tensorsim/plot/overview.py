@@ -11,7 +11,7 @@ import numpy as np
 from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.plot.figure import new_figure
-from tensorsim.plot.maps import MapStyle, colormap, decibels, thin_columns
+from tensorsim.plot.maps import MapStyle, colormap, decibels, doppler_span, thin_columns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +38,7 @@ def overview_figure(folder: Path, style: MapStyle | None = None) -> Figure:
     frames = read_video(folder / "overlay.mp4").video[0]
     with np.load(folder / "maps.npz") as file:
         maps = {name: file[name] for name in file.files}
-    span_hz = _shown_span(maps["doppler_time"], maps["doppler_hz"], style.dynamic_range_db)
+    span_hz = doppler_span(maps["doppler_time"], maps["doppler_hz"], style.dynamic_range_db)
     figure = new_figure(12.0, 2.9)
     picture, range_axes, doppler_axes = figure.subplots(1, 3, width_ratios=(1.25, 1, 1))
     picture.imshow(frames[frames.shape[0] // 2].permute(1, 2, 0).numpy())
@@ -72,12 +72,6 @@ def overview_figure(folder: Path, style: MapStyle | None = None) -> Figure:
     doppler_axes.set_ylim(-span_hz, span_hz)
     figure.colorbar(image, ax=[range_axes, doppler_axes], label="dB below the peak", pad=0.01)
     return figure
-
-
-def _shown_span(magnitude: np.ndarray, doppler_hz: np.ndarray, dynamic_range_db: float) -> float:
-    """The largest Doppler that stands out from the floor of the colours, and a tenth more."""
-    rows = (decibels(magnitude, dynamic_range_db) > -dynamic_range_db).any(1)
-    return 1.1 * float(np.abs(doppler_hz[rows]).max(initial=doppler_hz[-1] / 8))
 
 
 def save_small(figure: Figure, path: Path) -> None:

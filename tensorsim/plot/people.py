@@ -73,15 +73,20 @@ def skeleton_figure(
     low, high = points.min(axis=0), points.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low)
+    # All axes have one scale: the longest says how far apart labels have to be.
+    longest = (high - low).max()
+    least = next(step for step in (0.5, 1.0, 2.0, 5.0, np.inf) if step >= longest / 16)
     for scale, label, spacing in (
         (axes.xaxis, "x", 0.5 if high[0] - low[0] < 4.0 else 1.0),
         (axes.yaxis, "y (range)", 1.0),
         (axes.zaxis, "z", 0.5),
     ):
-        scale.set_major_locator(MultipleLocator(spacing))
+        scale.set_major_locator(MultipleLocator(max(spacing, least)))
         scale.set_tick_params(labelsize="small")
         scale.set_label_text(f"{label} in m")
-    axes.yaxis.labelpad = 12  # its labels are on a slope, where they need more room
+    # Names are moved away from their axis by shares of the other one; the labels of y are on a slope.
+    axes.xaxis.labelpad = 5.0 * longest / (high[1] - low[1])
+    axes.yaxis.labelpad = max(12.0, 5.0 * longest / (high[0] - low[0]))
     axes.set_title("skeletons in radar coordinates")
     axes.view_init(elev=20, azim=-60)
     axes.legend(loc="upper left")

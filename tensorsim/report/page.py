@@ -131,9 +131,9 @@ def colour_table(name: Any) -> str:
 
 def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = "") -> list[dict[str, Any]]:
     """The Doppler-time map with its ridges, and both range-time maps."""
-    from tensorsim.results import doppler_span, strong_ridges
+    from tensorsim.results import strong_ridges
 
-    span = doppler_span(maps, axes)
+    span = plot.doppler_span(maps.doppler_time.numpy(), axes.doppler_hz)
     rows = np.abs(axes.doppler_hz) <= span
     shown = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB) > -plot.DYNAMIC_RANGE_DB
     ridges = plot.clear_ridges(strong_ridges(maps, axes), axes.doppler_hz, shown, 0.06 * span)
