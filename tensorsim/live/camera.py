@@ -28,8 +28,10 @@ class Grabbed(NamedTuple):
 
 @dataclass
 class _State:
-    """Of the thread that grabs frames: whether it came to its end, whether it should, and what went wrong."""
+    """Of the thread that grabs frames: whether it came to its end, whether it should, and what went wrong; and how many
+    frames the consumer will never see."""
 
+    dropped: int = 0
     ended: bool = False
     closed: bool = False
     error: Exception | None = None
@@ -48,7 +50,7 @@ class Camera:
 
     Attributes:
         fps: frames per second.
-        dropped: frames so far.
+        dropped: frames that are missing before the last one that was given.
 
     Raises:
         TensorsimError: a source that cannot be opened, or ``every_frame`` of one that does not wait.
@@ -111,6 +113,7 @@ class Camera:
                         raise state.error
                     return
                 index, frame = waiting.popleft()
+                self.dropped = state.dropped
             if frame is None:
                 raise TensorsimError(f"{self.source}: the camera gave no more frames")
             yield index, frame
@@ -123,7 +126,7 @@ class Camera:
                 if self.is_file:
                     time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
                 with arrived:
-                    self.dropped += len(waiting) == WAITING
+                    state.dropped += len(waiting) == WAITING
                     waiting.append((index, frame))
                     arrived.notify()
                 if state.closed:

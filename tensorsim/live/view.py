@@ -10,11 +10,16 @@ from tensorsim.live.simulator import LiveFrame, LiveSimulator
 WIDTH, MAP_HEIGHT, STRIP_HEIGHT = 640, 240, 26
 #: Seconds of the map that are shown.
 SHOWN_S = 10.0
+#: A person at 9 m, relative to one at 3 m (amplitude).
+FAR_AWAY = 1 / 9
 _COLOURS = ((70, 110, 180), (170, 100, 60), (80, 140, 80), (150, 80, 150), (120, 120, 60), (60, 130, 140))
 
 
 class LiveView:
     """Draws what a :class:`~tensorsim.LiveSimulator` gives, frame by frame.
+
+    The map is drawn in dB below its peak, or below the echo of a person far away: the noise of an empty scene is as
+    weak as it is.
 
     Args:
         simulator: whose frames are drawn.
@@ -31,6 +36,7 @@ class LiveView:
         self.range_db = style.dynamic_range_db
         self.table = (plot.colormap(style.colormap)(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
         self.rows = np.abs(simulator.doppler_hz) <= 2 * top_speed_m_s / radar.radar.doppler_wavelength_m
+        self.least_peak = FAR_AWAY * plot.person_peaks(radar)["doppler_time"]
         self.top_hz = float(simulator.doppler_hz[self.rows].max())
         self.columns = round(SHOWN_S * radar.doppler.frame_rate_hz)
         self.map = LastColumns(self.columns)
@@ -71,7 +77,8 @@ class LiveView:
         if self.map.parts:
             last = self.map.result().numpy()
             shown[:, self.columns - last.shape[1] :] = last
-        level = plot.decibels(shown, self.range_db) / self.range_db + 1
+        peak = max(float(shown.max()), self.least_peak)
+        level = plot.decibels(shown, self.range_db, peak) / self.range_db + 1
         small = cv2.resize(level[::-1], (WIDTH, MAP_HEIGHT), interpolation=cv2.INTER_AREA)
         picture = self.table[(small * 255).astype(np.uint8)]
         cv2.line(picture, (0, MAP_HEIGHT // 2), (WIDTH, MAP_HEIGHT // 2), (150, 150, 150), 1)
