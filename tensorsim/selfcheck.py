@@ -62,8 +62,8 @@ def _radar_chain() -> str:
 
 def _device() -> str:
     if not torch.cuda.is_available():
-        return f"CPU with {torch.get_num_threads()} threads (no CUDA device)"
-    return f"{torch.cuda.get_device_name()} and CPU with {torch.get_num_threads()} threads"
+        return "CPU (no CUDA device)"
+    return f"{torch.cuda.get_device_name()} and CPU"
 
 
 def _threads() -> str:
@@ -72,7 +72,7 @@ def _threads() -> str:
         f"{name}={os.environ[name]}" for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT") if name in os.environ
     )
     return (
-        f"{torch.get_num_threads()} threads, {cpu_quota()} of {os.cpu_count()} processors usable, "
+        f"{torch.get_num_threads()} of torch, {cpu_quota()} of {os.cpu_count()} processors usable, "
         f"waiting: {waits or 'the default of OpenMP, slow on a busy machine; set OMP_WAIT_POLICY=PASSIVE'}"
     )
 

@@ -75,12 +75,13 @@ class RadarConfig:
         check_range(turns * len(self.rx_positions_m), "antennas", "RadarConfig: tx_m times rx_m")
         if self.chirp_s * self.prf_hz * turns > 1.0:
             chirps = (
-                f"a chirp of {self.chirp_s} s does"
+                f"a chirp of {self.chirp_s:.4g} s does"
                 if turns == 1
-                else f"{turns} chirps of {self.chirp_s} s do"
+                else f"{turns} chirps of {self.chirp_s:.4g} s do"
             )
             raise TensorsimError(
-                f"RadarConfig: {chirps} not fit the pulse interval {1.0 / self.prf_hz} s of prf_hz {self.prf_hz}"
+                f"RadarConfig: {chirps} not fit the pulse interval {1.0 / self.prf_hz:.4g} s of prf_hz "
+                f"{self.prf_hz:.5g}"
             )
 
     @classmethod

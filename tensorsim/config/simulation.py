@@ -170,7 +170,7 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
         )
     if path[0] not in known:
         raise TensorsimError(
-            f"got no {path[0]!r} in {config!r}, expected one of its fields{suggestion(path[0], known)}"
+            f"got no {path[0]!r} in {type(config).__name__}, expected one of its fields{suggestion(path[0], known)}"
         )
     if len(path) > 1:
         value = _replaced(getattr(config, path[0]), path[1:], value)

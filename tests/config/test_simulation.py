@@ -81,7 +81,7 @@ def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: P
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scene__snr": 3.0}, "'snr'.*perhaps 'snr_db'"),
+        ({"scene__snr": 3.0}, "got no 'snr' in SceneConfig, expected one of its fields, perhaps 'snr_db'"),
         ({"pose__keypoint_threshold": 1.5}, "keypoint_threshold: got 1.5, expected a score in"),
         ({"scene__wall__loss_tangent": 0.1}, "got 'loss_tangent' of a part that this scene does not have"),
         ({"scene": 3}, "SimulationConfig.scene: got 3, expected a SceneConfig"),

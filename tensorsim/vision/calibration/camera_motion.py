@@ -124,7 +124,7 @@ class BackgroundMotion:
             effect = (
                 "its turns and zooms are taken out of the motion of people, but not where it is carried along"
                 if made_still
-                else "the motion of people and the estimated camera contain that"
+                else "that is not taken out of the motion of people"
             )
             warnings.warn(
                 f"the camera moves: the background shifts by up to {self.shift_px_s:.0f} pixels per second, in "
