@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 
 if TYPE_CHECKING:
@@ -27,9 +28,9 @@ class DatasetBuild:
     """Processes of this machine."""
     engine: Literal["processes", "ray"] = "processes"
     """Ray runs on clusters as well: pip install 'tensorsim[scale]'."""
-    address: str | None = None
+    address: Option[str] = None
     """Of a running Ray cluster, whose nodes all see the folder; by default one is started here."""
-    cache: Path | None = None
+    cache: Option[Path] = None
     """Folder for the people found in films, which several data sets can share. Default: OUT/.people."""
     strict: bool = False
     """Stop at the first clip that fails, in place of a line in failures.csv."""
@@ -89,7 +90,7 @@ class DatasetSample:
     """The data set."""
     id: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="ID")]]
     """The sample, as in the manifest."""
-    out: Path | None = None
+    out: Option[Path] = None
     """Folder for its arrays, as ID.RADAR.OUTPUT.npy."""
 
     def run(self) -> None:

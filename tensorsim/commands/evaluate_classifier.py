@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 
@@ -31,15 +32,15 @@ class EvaluateClassifier:
     """
 
     weights: Path
-    maps: Path | None = None
+    maps: Option[Path] = None
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     people: int = 40
     held_out: bool = False
     maps_seed: int = 1
     snr: tuple[float, ...] = (50.0, 40.0, 30.0, 20.0, 10.0)
-    films: Path | None = None
-    poses: Path | None = None
-    out: Path | None = None
+    films: Option[Path] = None
+    poses: Option[Path] = None
+    out: Option[Path] = None
     quiet: bool = False
 
     def run(self) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 
@@ -31,7 +32,7 @@ class EvaluateDenoiser:
     snr: tuple[float, ...] = (10.0,)
     seed: int = 1
     ksvd: bool = True
-    out: Path | None = None
+    out: Option[Path] = None
     quiet: bool = False
 
     def run(self) -> None:

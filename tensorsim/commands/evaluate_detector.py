@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError
 
 
@@ -19,10 +20,10 @@ class EvaluateDetector:
         quiet: no progress bars.
     """
 
-    weights: Path | None = None
-    against: Path | None = None
-    data: Path | None = None
-    coco: Path | None = None
+    weights: Option[Path] = None
+    against: Option[Path] = None
+    data: Option[Path] = None
+    coco: Option[Path] = None
     films: tuple[Path, ...] = ()
     quiet: bool = False
 

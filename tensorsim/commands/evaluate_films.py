@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
@@ -27,13 +28,13 @@ class EvaluateFilms(NetworkOptions):
     """Folder of the results."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Radars."""
-    body: Literal["joints", "limbs", "version1", "surface"] | None = None
+    body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
     """Scatterers of a person, as in `tensorsim simulate`."""
-    classifier: str | None = None
+    classifier: Option[str] = None
     """Activity classifier: path or name. Default: the shipped one."""
     only: tuple[str, ...] = ()
     """Names of films, or parts of them; default all."""
-    lifter: Literal["temporal", "nearest"] | None = None
+    lifter: Option[Literal["temporal", "nearest"]] = None
     """How joints get their depths, as in `tensorsim simulate`."""
     stride: int = 1
     """Keep every n-th frame."""

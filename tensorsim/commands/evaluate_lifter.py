@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 
@@ -24,8 +25,8 @@ class EvaluateLifter:
     """
 
     motion: tuple[Path, ...] = ()
-    films: Path | None = None
-    weights: str | None = None
+    films: Option[Path] = None
+    weights: Option[str] = None
     motions: int = 1200
     seed: int = 1234
     quiet: bool = False

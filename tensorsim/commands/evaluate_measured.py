@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 from tensorsim.files import complete_file, write_json
@@ -20,7 +21,7 @@ class EvaluateMeasured:
     """Folder of measured sets to learn from: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
     out: Path
     """Folder of the results."""
-    test: Path | None = None
+    test: Option[Path] = None
     """Folder of measured sets to test on, the same layout; default the last 30 % of each class of --train, in the
     order of the files, which is then trained on the others only."""
     quick: bool = False

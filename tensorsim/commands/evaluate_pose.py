@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import Engine
 from tensorsim.exceptions import TensorsimError
 
@@ -27,9 +28,9 @@ class EvaluatePose:
         quiet: no progress bars.
     """
 
-    weights: Path | None = None
-    data: Path | None = None
-    coco: Path | None = None
+    weights: Option[Path] = None
+    data: Option[Path] = None
+    coco: Option[Path] = None
     flip_test: bool = True
     engine: Engine = "torch"
     quiet: bool = False

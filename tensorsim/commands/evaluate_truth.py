@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import default_networks
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
@@ -24,7 +25,7 @@ class EvaluateTruth:
     """Rows; default all twelve activities, or none with --motion ("all" for all with --motion)."""
     motion: tuple[Path, ...] = ()
     """Motion capture (.npz, .bvh), each file a row."""
-    motion_fps: float | None = None
+    motion_fps: Option[float] = None
     """Frames per second of the motion capture, instead of what the files say; needed where they say nothing."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Radars."""
@@ -32,11 +33,11 @@ class EvaluateTruth:
     """From true 3D joints at video rate (a), true 2D keypoints (b), or the rendered film by networks (c)."""
     stages: bool = True
     """Also replace each stage by the truth in turn."""
-    detector: str | None = None
+    detector: Option[str] = None
     """For setting c: path or name. Default: $TENSORSIM_DETECTOR, else the shipped one."""
-    pose: str | None = None
+    pose: Option[str] = None
     """For setting c: path or name. Default: $TENSORSIM_POSE, else the shipped one."""
-    lifter: Literal["temporal", "nearest"] | None = None
+    lifter: Option[Literal["temporal", "nearest"]] = None
     """How key points are lifted. Default: as `tensorsim simulate` does."""
     seed: int = 0
     """Of the first clip of each activity; the next have the next."""

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError
 
 
@@ -18,59 +19,59 @@ class RunExperiment:
     value keep that of the experiment; the report says what they are.
     """
 
-    name: tyro.conf.Positional[str]
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
     """list, or a name that it prints."""
-    out: Path | None = None
+    out: Option[Path] = None
     """Folder of the results."""
     quick: bool = False
     """A small run of a minute or two, to see that everything works."""
-    config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None
+    config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
     """Settings, such as the NAME.yaml of an earlier run."""
-    cache: Path | None = None
+    cache: Option[Path] = None
     """Folder of scene sets, trained networks and single results. Default: OUT/work."""
-    networks: tuple[str, ...] | None = None
+    networks: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """Recognisers: spnet, ccln, ..."""
-    scenes: tuple[str, ...] | None = None
+    scenes: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """free-space, through-wall."""
-    inputs: tuple[str, ...] | None = None
+    inputs: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """doppler, range, ridges, merged."""
-    denoisers: tuple[str, ...] | None = None
+    denoisers: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """none, perona-malik, ksvd, dncnn."""
-    activities: tuple[str, ...] | None = None
+    activities: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """Names of activities; all twelve if none is given."""
-    data: str | None = None
+    data: Option[str] = None
     """Folder of measured sets: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
-    films: str | None = None
+    films: Option[str] = None
     """Folder of real films with labels.json, as `tensorsim evaluate films` takes it."""
-    maps: str | None = None
+    maps: Option[str] = None
     """Folder of simulated maps of everyday motion, as `tensorsim train everyday` makes them. Default: in the cache."""
-    groups: int | None = None
+    groups: Option[int] = None
     """Groups of these maps, of some 100 clips each."""
-    clips: int | None = None
+    clips: Option[int] = None
     """Clips per class."""
-    test_clips: int | None = None
+    test_clips: Option[int] = None
     """Clips per class of other people, to test on."""
-    size: int | None = None
+    size: Option[int] = None
     """Height and width of the pictures."""
-    epochs: int | None = None
+    epochs: Option[int] = None
     """Passes over the training clips."""
-    steps: int | None = None
+    steps: Option[int] = None
     """Batches of a training, where it does not count epochs."""
-    film_steps: int | None = None
+    film_steps: Option[int] = None
     """Batches of a training on the maps of everyday motion."""
-    length_s: float | None = None
+    length_s: Option[float] = None
     """Length of a clip in seconds."""
-    seeds: int | None = None
+    seeds: Option[int] = None
     """Trainings with different weights."""
-    film_seeds: int | None = None
+    film_seeds: Option[int] = None
     """Trainings with different weights on the maps of everyday motion."""
-    snr_db: tuple[float, ...] | None = None
+    snr_db: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="DB ...")] = None
     """Signal-to-noise ratios of the tests."""
-    seed: int | None = None
+    seed: Option[int] = None
     """Of people, motion and noise."""
     jobs: int = 1
     """Processes at a time."""
-    settings: str | None = None
+    settings: Option[str] = None
     """Folder with the NAME.yaml of earlier runs, for `paper`: the sizes of its experiments."""
     quiet: bool = False
     """No progress bars."""

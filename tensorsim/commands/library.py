@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 
@@ -27,7 +28,7 @@ class BuildLibrary:
     """File to write."""
     generate: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Poses of the activities and the pose sampler to add."""
-    most: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    most: Annotated[Option[int], tyro.conf.arg(metavar="N")] = None
     """Poses to keep at most, chosen at random; memory of the lifter is about 2 KB a pose."""
     tolerance: float = 0.015
     """Poses nearer than this are duplicates: root mean square over the joints, in body heights."""

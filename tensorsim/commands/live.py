@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, load_recognizer, number_of_people
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
@@ -37,22 +38,25 @@ class Live(NetworkOptions, RadarOptions):
 
     The page has the camera's picture with the people in it, the Doppler-time map that scrolls, and the labels. Frames
     that come faster than they can be worked on are dropped and counted. Ends with the film, or with Ctrl-C.
+
+    Refuses the options of `simulate` for its files, and those that look ahead or choose among people: --figure-format,
+    --hide-ridges, --sound, --full-rate, --save, --motion, --denoiser, --people, and --device.
     """
 
     camera: str
     """Number of a camera, address of a stream (rtsp://...), or a film that is played like a camera."""
-    person_height: tuple[float, ...] | None = None
+    person_height: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
     """Body heights in metres in order of appearance, instead of those of the configuration (1.80, 1.70); the last one
     serves the rest."""
-    fps: float | None = None
+    fps: Option[float] = None
     """Frames per second, instead of what the source announces."""
     every_frame: bool = False
     """Of a film, take every frame, however long that takes, instead of dropping frames to keep up with its time."""
-    seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    seconds: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
     """Stop after so much time of the film."""
     port: int | None = 8787
     """Port of the page at 127.0.0.1; 0 takes a free one, None shows no page."""
-    record: Path | None = None
+    record: Option[Path] = None
     """Film of what the page shows, ending in .webm or .mp4."""
 
     def run(self) -> None:
@@ -147,7 +151,9 @@ class Live(NetworkOptions, RadarOptions):
         """Refuse options that cannot work, before anything heavy is imported."""
         for field in fields(self):
             if field.name in _UNUSED and getattr(self, field.name) != field.default:
-                raise TensorsimError(f"--{field.name.replace('_', '-')}: got it for live, which does without")
+                raise TensorsimError(
+                    f"--{field.name.replace('_', '-')}: got it for live, which has no use for it"
+                )
         super().check(Path(self.record or ".").parent)
         for value in self.person_height or ():
             check_range(value, "body height", "--person-height")

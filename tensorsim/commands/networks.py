@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError
 
 Engine = Literal["onnxruntime", "openvino", "int8", "torch"]
@@ -14,10 +15,10 @@ Engine = Literal["onnxruntime", "openvino", "int8", "torch"]
 class NetworkOptions:
     """Which networks find people in films."""
 
-    detector: str | None = None
+    detector: Option[str] = None
     """Person detector: RTMDet as .pth, .safetensors or .onnx, or a name of `tensorsim models list`. Default:
     $TENSORSIM_DETECTOR, else the shipped one."""
-    pose: str | None = None
+    pose: Option[str] = None
     """COCO-17 heat maps: HRNet as .pth, .safetensors or name, or any such network as .onnx. Default: $TENSORSIM_POSE,
     else the shipped one."""
     flip_test: bool = True

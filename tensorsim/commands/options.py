@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import tyro
 
 from tensorsim.array_files import array_formats
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
 from tensorsim.exceptions import TensorsimError, TensorsimWarning
@@ -54,21 +55,21 @@ def check_seed(seed: int, option: str = "--seed") -> None:
 class RadarOptions(PanelOptions, ReceiverOptions):
     """How people's joints become maps. Options without a value keep that of the configuration."""
 
-    config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None
+    config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
     """Configuration of a run: a YAML file with fields of SimulationConfig, or the summary.json of an earlier run. Other
     options change it."""
     paper: bool = False
     """The literal formulas of the paper everywhere (SimulationConfig.paper)."""
-    scene: Literal["free-space", "through-wall"] | None = None
+    scene: Option[Literal["free-space", "through-wall"]] = None
     """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath. Default: free-space."""
-    radar: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    radar: Annotated[Option[str], tyro.conf.arg(metavar="NAME|FILE")] = None
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall, and
     the arrays ti-awr1843-array, infineon-bgt60tr13c-array) or a YAML file with fields of RadarConfig; a wall that it
     comes with replaces the scene's, a floor adds its reflections."""
-    people: Annotated[str | None, tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
+    people: Annotated[Option[str], tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
     """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
-    body: Literal["joints", "limbs", "version1", "surface"] | None = None
+    body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
     """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
     cross section follows the aspect, the 13 points of the original's first version, or points over torso and limbs
     with the energy over speed of measured walks. Default: joints."""
@@ -76,29 +77,30 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     """People sway while they stand."""
     vital_signs: bool = False
     """People breathe and their hearts beat."""
-    motion: Literal["smooth", "paper"] | None = None
-    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay."""
-    integration: Literal["noncoherent", "paper"] | None = None
+    motion: Option[Literal["smooth", "paper"]] = None
+    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay.
+    Default: smooth."""
+    integration: Option[Literal["noncoherent", "paper"]] = None
     """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler. Default: noncoherent."""
-    wall_paths: Literal["series", "paper"] | None = None
+    wall_paths: Option[Literal["series", "paper"]] = None
     """Bounces inside the wall: complete to first order, or the paper's. Default: series."""
-    multipath: bool | None = None
-    """Wall bounces; default on behind a wall."""
+    multipath: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
+    """Bounces inside the wall. Default: True behind a wall."""
     leakage: bool = False
     """Direct signal from transmitter to receiver."""
     wall_echo: bool = False
     """Static mirror reflection of the wall."""
-    snr: float | None = None
+    snr: Option[float] = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
-    denoiser: str | None = None
+    denoiser: Option[str] = None
     """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
     .safetensors or a name of `tensorsim models list`). Default: none."""
-    classifier: str | None = None
-    """Activity classifier: SPNet or its light sibling as .safetensors, or a name of `tensorsim models list`; "none"
+    classifier: Option[str] = None
+    """Activity classifier: SPGNet or SPNet as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
     least_probability: float = 0.2
     """A label whose probability is lower is "not sure". 0 always gives the likeliest of the twelve."""
-    seed: int | None = None
+    seed: Option[int] = None
     """Seed of everything that is random. Default: 0."""
     colormap: Literal["turbo", "viridis", "jet", "parula", "gray"] = "turbo"
     """Colours of the maps."""

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
-from tensorsim.commands.numbers import numbers
+import tyro
+
+from tensorsim.commands.arguments import Option, numbers
 
 _XYZ = numbers("X Y Z")
 
@@ -73,67 +75,67 @@ PANEL = (
 class PanelOptions:
     """Parameters of the control panel."""
 
-    keypoint_threshold: float | None = None
+    keypoint_threshold: Option[float] = None
     """Score from which a key point counts as seen. Default: 0.3."""
-    person_weight: tuple[float, ...] | None = None
+    person_weight: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="KG ...")] = None
     """Body weights in kg in order of appearance; cross sections scale with the body surface. Default: 84.24 75.00."""
-    min_detection_size: float | None = None
+    min_detection_size: Option[float] = None
     """Smallest width and height of a detection in pixels. Default: 5."""
-    detection_interval: int | None = None
+    detection_interval: Option[int] = None
     """The detector runs on every n-th frame. Default: 2."""
-    max_tracks: int | None = None
+    max_tracks: Option[int] = None
     """People at a time. Default: 5."""
-    confirmation_hits: int | None = None
-    """Detections that confirm a track. Default: 2 ..."""
-    confirmation_window: int | None = None
-    """... of so many frames in which the detector ran. Default: 5."""
-    deletion_misses: int | None = None
-    """Misses that end a track. Default: 23 ..."""
-    deletion_window: int | None = None
-    """... of so many frames in which the detector ran. Default: 23."""
-    assignment_threshold: float | None = None
+    confirmation_hits: Option[int] = None
+    """Detections within --confirmation-window that confirm a track. Default: 2."""
+    confirmation_window: Option[int] = None
+    """Frames in which the detector ran, for --confirmation-hits. Default: 5."""
+    deletion_misses: Option[int] = None
+    """Misses within --deletion-window that end a track. Default: 23."""
+    deletion_window: Option[int] = None
+    """Frames in which the detector ran, for --deletion-misses. Default: 23."""
+    assignment_threshold: Option[float] = None
     """Largest squared Mahalanobis distance of a detection from its track. Default: 150."""
-    process_noise: float | None = None
+    process_noise: Option[float] = None
     """Kalman process noise of a track's box, size^2 / frame^3. Default: 0.001."""
-    measurement_noise: float | None = None
+    measurement_noise: Option[float] = None
     """Kalman measurement noise of a track's box, size^2. Default: 0.0004 (panel: 0.01)."""
-    carrier_hz: float | None = None
+    carrier_hz: Option[float] = None
     """Start of the sweep. Default: 77e9, behind a wall 2e9."""
-    chirp_s: float | None = None
+    chirp_s: Option[float] = None
     """Length of the sweep. Default: 40e-6."""
-    bandwidth_hz: float | None = None
+    bandwidth_hz: Option[float] = None
     """Width of the sweep. Default: 4e9, behind a wall 1e9."""
-    prf_hz: float | None = None
+    prf_hz: Option[float] = None
     """Pulse repetition frequency. Default: 8192, behind a wall 128."""
-    sample_rate_hz: float | None = None
+    sample_rate_hz: Option[float] = None
     """Sample rate of the intermediate frequency. Default: 10e6."""
-    tx_position: Annotated[tuple[float, float, float] | None, _XYZ] = None
+    tx_position: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Transmitter in metres. Default: -0.1 0 1.5."""
-    rx_position: Annotated[tuple[float, float, float] | None, _XYZ] = None
+    rx_position: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Receiver in metres. Default: 0.1 0 1.5."""
-    antenna_gain_dbi: float | None = None
+    antenna_gain_dbi: Option[float] = None
     """Gain of both antennas. Default: 10."""
-    isolation_db: float | None = None
+    isolation_db: Option[float] = None
     """Isolation of transmitter and receiver, for --leakage. Default: 20."""
-    wall_permittivity: float | None = None
+    wall_permittivity: Option[float] = None
     """Relative permittivity of the wall. Default: 6."""
-    wall_loss_tangent: float | None = None
+    wall_loss_tangent: Option[float] = None
     """Loss tangent of the wall. Default: 0.03."""
-    wall_size: Annotated[tuple[float, float, float] | None, _XYZ] = None
+    wall_size: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Width, thickness and height of the wall in metres. Default: 5 0.24 2.5."""
-    wall_center: Annotated[tuple[float, float, float] | None, _XYZ] = None
+    wall_center: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Centre of the wall in metres. Default: the near face touches the antenna plane."""
-    smoothing_ratio: float | None = None
+    smoothing_ratio: Option[float] = None
     """Length in seconds of a Savitzky-Golay filter along the pulses (panel: 0.25). Default: none, see --motion."""
-    range_window: Literal["hamming", "hann", "blackman"] | None = None
+    range_window: Option[Literal["hamming", "hann", "blackman"]] = None
     """Window over fast time. Default: hamming."""
-    mti: Literal["two-pulse", "n-pulse"] | None = None
+    mti: Option[Literal["two-pulse", "n-pulse"]] = None
     """Moving target indicator. Default: two-pulse."""
-    stft_window: float | None = None
+    stft_window: Option[float] = None
     """Length of the STFT window in seconds. Default: 0.1."""
-    stft_overlap: float | None = None
+    stft_overlap: Option[float] = None
     """Shared part of neighbouring STFT windows. Default: 0.9."""
-    ridges: int | None = None
+    ridges: Option[int] = None
     """Ridges of the Doppler-time map. Default: 3."""
 
 

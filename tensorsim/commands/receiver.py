@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tensorsim.commands.numbers import numbers
+import tyro
+
+from tensorsim.commands.arguments import Option, numbers
 
 if TYPE_CHECKING:
     from tensorsim.config import SimulationConfig
@@ -24,27 +26,27 @@ RECEIVER_FIELDS = {
 class ReceiverOptions:
     """The receiver, the room and its other radars."""
 
-    receiver: Literal["ideal", "typical"] | None = None
+    receiver: Option[Literal["ideal", "typical"]] = None
     """An ideal receiver, or one with the phase noise, 12-bit converters, I/Q imbalance and offset of an integrated
     radar; the options below change single effects. Default: ideal."""
-    phase_noise_dbc_hz: float | None = None
+    phase_noise_dbc_hz: Option[float] = None
     """Phase noise of the oscillator 1 MHz from the carrier, such as -93. Default: none."""
-    iq_imbalance_db: float | None = None
+    iq_imbalance_db: Option[float] = None
     """Gain of Q over I. Default: 0."""
-    iq_phase_deg: float | None = None
+    iq_phase_deg: Option[float] = None
     """Degrees by which Q is not a quarter turn from I. Default: 0."""
-    dc_offset_db: float | None = None
+    dc_offset_db: Option[float] = None
     """Power of a constant offset over that of the people's echo. Default: none."""
-    real_receiver: bool | None = None
+    real_receiver: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
     """One channel in place of I and Q: spectra of a radar without range are mirror-symmetric. Default: two."""
-    adc_bits: int | None = None
+    adc_bits: Option[int] = None
     """Bits of the converters. Default: no quantisation."""
-    adc_headroom_db: float | None = None
+    adc_headroom_db: Option[float] = None
     """Full scale of the converters over the root mean square of what arrives at them; less saturates more. Default:
     12."""
-    clutter: Literal["none", "room"] | None = None
+    clutter: Option[Literal["none", "room"]] = None
     """Furniture and walls of a room before a sensor that vibrates. Default: none."""
-    interference: Annotated[tuple[float, float, float] | None, numbers("X Y Z")] = None
+    interference: Annotated[Option[tuple[float, float, float]], numbers("X Y Z")] = None
     """Another radar of the same band at this place in metres, with slower sweeps. Default: none."""
 
     def with_receiver(self, config: "SimulationConfig") -> "SimulationConfig":

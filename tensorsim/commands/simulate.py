@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from tensorsim.commands.arguments import Option, numbers
 from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.numbers import numbers
 from tensorsim.commands.options import (
     RadarOptions,
     Run,
@@ -69,38 +69,39 @@ class Simulate(NetworkOptions, RadarOptions):
     keypoints of a video, COCO or BlazePose, as .json, or a folder with one per frame."""
     out: Path
     """Folder for the results; its files appear together, when all are complete."""
-    person_height: tuple[float, ...] | None = None
+    person_height: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
     """Body heights in metres in order of appearance; the last one serves the rest. Default: 1.80 1.70."""
-    initial_distance: tuple[float, ...] | None = None
+    initial_distance: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
     """Distances of the people in metres when they first appear. Of a video they calibrate the focal length; captured
     motion is moved so that the first person starts there (default: where the file has it, if in front of the
     radar)."""
-    camera_fov: float | None = None
-    """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: 60."""
+    camera_fov: Option[float] = None
+    """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: estimated; with
+    --no-calibrate, and where nothing in the film tells, 60 along the longer side of the picture."""
     calibrate: bool = True
     """Estimate tilt, roll, height and field of view of the camera from the people of the film, unless --camera-fov or
     --initial-distance tells it. A --config says itself whether to."""
-    position: Literal["camera", "paper"] | None = None
+    position: Option[Literal["camera", "paper"]] = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
-    lifter: Literal["temporal", "nearest"] | None = None
+    lifter: Option[Literal["temporal", "nearest"]] = None
     """How key points become 3D: by a network that sees a window of time, or from the nearest poses of a library.
     Default: temporal."""
-    library: Path | None = None
+    library: Option[Path] = None
     """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
     per_person: bool = False
     """Where several people are in the scene, simulate and label each one alone as well: maps_person_N.npz and
     doppler_time_person_N.png, N as in the overlay."""
-    fps: float | None = None
+    fps: Option[float] = None
     """Frames per second, instead of what the file says."""
-    start: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    start: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
     """Where to start, in seconds of the film."""
-    end: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    end: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
     """Where to stop, in seconds of the film."""
     stride: int = 1
     """Keep every n-th frame."""
-    image_size: Annotated[tuple[int, int] | None, numbers("WIDTH HEIGHT", int)] = None
+    image_size: Annotated[Option[tuple[int, int]], numbers("WIDTH HEIGHT", int)] = None
     """Pixels of the pictures that keypoints were found in, where their file does not say."""
-    clip: str | None = None
+    clip: Option[str] = None
     """Which motion of a file with several: the name of an array, or subject and action as in "S1/Walking"."""
     heading: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
     """Turn of captured motion about the vertical in degrees, counter-clockwise seen from above."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
 from tensorsim.exceptions import TensorsimError
@@ -43,17 +44,17 @@ class TrainClassifier(TrainOptions):
         film_seed: of people, motion and noise of ``film_maps``.
     """
 
-    maps: Path | None = None
-    data: Path | None = None
+    maps: Option[Path] = None
+    data: Option[Path] = None
     labels: tuple[str, ...] = ()
     radars: tuple[str, ...] = ()
     network: Literal["spnet", "spgnet"] = "spnet"
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     people: int = 300
     snr: tuple[float, float] = (10.0, 50.0)
-    size: int | None = None
-    films: Path | None = None
-    film_maps: Path | None = None
+    size: Option[int] = None
+    films: Option[Path] = None
+    film_maps: Option[Path] = None
     film_people: int = 40
     learning_rate: float = 1.47e-3
     masks: tuple[float, float] = (0.0, 0.0)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.training import PeopleOptions, digest
 from tensorsim.exceptions import check_positive
 
@@ -26,7 +27,7 @@ class TrainDetector(PeopleOptions):
     """
 
     data: Path
-    teacher: Path | None = None
+    teacher: Option[Path] = None
     variant: Literal["nano-person", "small-person", "m-person"] = "small-person"
     steps: int = 5000
     batch: int = 16

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
 from tensorsim.exceptions import TensorsimError
@@ -24,7 +25,7 @@ class TrainEveryday(TrainOptions):
     """Of people, motion, cameras and errors of the pictures."""
     network: Literal["spnet", "spgnet"] = "spgnet"
     """SPGNet (s2p6) on 32x32 pictures, or SPNet."""
-    size: int | None = None
+    size: Option[int] = None
     """Height and width of the pictures, a divisor of 64; 32 for SPGNet and 64 for SPNet if not given."""
     learning_rate: float = 1e-3
     """The highest."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.training import PeopleOptions
 from tensorsim.exceptions import TensorsimError, check_positive
 
@@ -40,13 +41,13 @@ class TrainPose(PeopleOptions):
     network: Literal["hrnet", "cpm"] = "hrnet"
     size: tuple[int, int] = (128, 96)
     first_size: tuple[int, int] = (96, 64)
-    first_steps: int | None = None
-    width: int | None = None
+    first_steps: Option[int] = None
+    width: Option[int] = None
     steps: int = 12000
     batch: int = 32
     learning_rate: float = 2e-3
     augmentation: Literal["full", "mild"] = "full"
-    second_labels: Path | None = None
+    second_labels: Option[Path] = None
     validate_every: int = 500
     presence: bool = False
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 
@@ -20,7 +21,7 @@ class TrainOptions:
 
     out: Path
     """Folder for checkpoints, logs and best.safetensors."""
-    init: Path | None = None
+    init: Option[Path] = None
     """Weights to start from (.safetensors)."""
     seed: int = 0
     """Of everything random but the maps or rendered people of a folder."""
@@ -95,7 +96,7 @@ def digest(weights: Path | None) -> str | None:
 class PeopleOptions(TrainOptions):
     """How a network is trained on labelled and rendered people."""
 
-    cutouts: Path | None = None
+    cutouts: Option[Path] = None
     """Folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given."""
     rendered: int = 0
     """Number of rendered people; a core renders about five a second."""

@@ -1,8 +1,13 @@
-"""Options of several numbers."""
+"""How the command line reads options that need not be given, and options of several numbers."""
 
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import tyro
 from tyro.constructors import PrimitiveConstructorSpec
+
+_T = TypeVar("_T")
+#: An option that is None unless it is given: the help shows the default that its description names, not "None".
+Option = Annotated[_T | None, tyro.conf.DisallowNone, tyro.conf.arg(help_behavior_hint="")]
 
 
 def numbers(metavar: str, kind: type[float] = float) -> PrimitiveConstructorSpec[Any]:
