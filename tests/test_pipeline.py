@@ -367,7 +367,8 @@ def test_padded_frames_do_not_count() -> None:
         alone = graph(clips[clip : clip + 1, :count], FPS)
         people = alone.joints.shape[1]
         for name in ("boxes", "keypoints", "keypoint_scores", "joints", "valid"):
-            assert_same(getattr(out, name)[clip, :people, :count], getattr(alone, name)[0], atol=0.0)
+            # Products of matrices of other sizes may be rounded differently.
+            assert_same(getattr(out, name)[clip, :people, :count], getattr(alone, name)[0], atol=1e-5)
         last = int((count - 1) / FPS * RADAR.prf_hz) - 13  # fades out over 0.1 s; a clip's end is no leaving
         assert_same(out.range_time[clip, :, :last], alone.range_time[0, :, :last], atol=0.08)
     assert float(out.range_time[0, :, -40:].abs().max()) < 1e-6 * float(out.range_time[0].max())
@@ -384,7 +385,7 @@ def test_padded_frames_at_uneven_times_do_not_count() -> None:
     times_s = torch.arange(20) / FPS + 0.02 * torch.rand(2, 20)
     out = stage(clips, FPS, torch.tensor([12, 20]), times_s)
     alone = stage(clips[:1, :12], FPS, None, times_s[:1, :12])
-    assert_same(out.joints[:1, :1, : alone.joints.shape[2]], alone.joints, atol=0.0)
+    assert_same(out.joints[:1, :1, : alone.joints.shape[2]], alone.joints, atol=1e-5)
 
 
 def test_a_clip_without_people_gives_the_empty_scene_and_says_so() -> None:
