@@ -4,8 +4,6 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 
@@ -22,8 +20,6 @@ class LabelSet:
 
     Example:
         >>> labels = LabelSet(("waving", "walking"))
-        >>> labels.index("walking")
-        1
         >>> len(labels), list(labels)
         (2, ['waving', 'walking'])
     """
@@ -43,26 +39,6 @@ class LabelSet:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
-
-    def index(self, name: str) -> int:
-        """The output that stands for this class.
-
-        Raises:
-            TensorsimError: no such class.
-        """
-        if name not in self.names:
-            raise TensorsimError(f"class name: got {name!r}, expected one of {', '.join(self.names)}")
-        return self.names.index(name)
-
-    def most_likely(self, logits: Tensor) -> list[str]:
-        """Names of the largest of the logits (B, classes), one per row.
-
-        Raises:
-            TensorsimError: another number of classes.
-        """
-        if logits.dim() != 2 or logits.shape[1] != len(self):
-            raise TensorsimError(f"logits: got shape {list(logits.shape)}, expected (B, {len(self)})")
-        return [self.names[i] for i in logits.argmax(1).tolist()]
 
     def to_text(self) -> str:
         """As the header of a weight file stores it."""

@@ -12,7 +12,7 @@ import torch
 from tensorsim.config import FloorConfig, RadarConfig, ReceiverConfig, SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around, radial_speed
+from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
@@ -331,11 +331,6 @@ def test_display_rate_keeps_the_doppler_map():
 def mover(speed, prf_hz, scatterers=4):
     t = torch.arange(40).double() / prf_hz
     return torch.stack((0 * t, 4 + speed * t, 0 * t + 1.5), -1)[:, None].repeat(1, scatterers, 1)
-
-
-def test_radial_speed_is_half_the_rate_of_the_path():
-    radar = RadarConfig(tx_m=(0, 0, 1.5), rx_m=(0, 0, 1.5))
-    np.testing.assert_allclose(radial_speed(mover(2.5, 8192), radar), 2.5, rtol=1e-9)
 
 
 def test_motion_beyond_the_pulse_rate():

@@ -146,7 +146,6 @@ def test_own_classifiers_are_saved_with_their_class_names(tmp_path: Path) -> Non
     m = maps((2,))
     torch.testing.assert_close(loaded.picture(m), own.picture(m))
     torch.testing.assert_close(loaded(m), own(m), rtol=0.01, atol=0.01)
-    assert loaded.labels.most_likely(torch.tensor([[0.0, 1.0], [1.0, 0.0]])) == ["walking", "waving"]
     own.save_pretrained(tmp_path / "own.safetensors", class_names=("a", "b"))
     assert ActivityRecognizer.from_pretrained(RADAR, tmp_path / "own.safetensors").class_names == ("a", "b")
     with pytest.raises(TensorsimError, match="class_names: got 1, expected 2"):
@@ -163,9 +162,5 @@ def test_label_sets_refuse_what_is_not_one_name_per_class() -> None:
     for names in ((), ("a", "a"), ("a", ""), "walking"):
         with pytest.raises(TensorsimError, match="class_names: got"):
             LabelSet(names)  # type: ignore[arg-type]
-    with pytest.raises(TensorsimError, match="expected one of a, b"):
-        LabelSet(("a", "b")).index("c")
-    with pytest.raises(TensorsimError, match=r"expected \(B, 2\)"):
-        LabelSet(("a", "b")).most_likely(torch.zeros(1, 3))
     with pytest.raises(TensorsimError, match="expected a JSON list"):
         LabelSet.from_text("waving")

@@ -24,11 +24,6 @@ def mean_range(positions: Tensor, radar: RadarConfig) -> Tensor:
     return (leg_length(positions, tx, 0.0) + leg_length(positions, rx, 0.0)) / 2
 
 
-def radial_speed(positions: Tensor, radar: RadarConfig) -> Tensor:
-    """Rate of change of :func:`mean_range` in m/s, positive = receding: (..., M, S, 3) metres -> (..., M - 1, S)."""
-    return mean_range(positions, radar).diff(dim=-2) * radar.prf_hz
-
-
 def gate_around(positions: Tensor, radar: RadarConfig, margin_m: float = 0.5) -> tuple[float, float]:
     """The range gate (nearest, farthest) in metres that holds all scatterers, for ``range_gate_m`` of a simulator.
 
