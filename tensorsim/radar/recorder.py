@@ -27,6 +27,24 @@ def receiver_noise(scene: SceneConfig, echo: EchoSynthesizer) -> ReceiverNoise:
     )
 
 
+def stretches(
+    positions: Tensor, rcs: Tensor, ahead: Tensor | None, span: int
+) -> list[tuple[int, Tensor, Tensor, Tensor | None]]:
+    """A scene ``span`` pulses at a time: number of the first pulse, positions, RCS and way ahead, as views.
+
+    Args:
+        positions: (B, M, S, 3) m.
+        rcs: (B, M, S) m^2.
+        ahead: (B, M, S, 3) m, see :mod:`~tensorsim.radar.synthesis.engines`, or None.
+        span: pulses; the last stretch may be shorter.
+    """
+    parts: list[tuple[int, Tensor, Tensor, Tensor | None]] = []
+    for start in range(0, positions.shape[1], span):
+        way = None if ahead is None else ahead[:, start : start + span]
+        parts.append((start, positions[:, start : start + span], rcs[:, start : start + span], way))
+    return parts
+
+
 class Recorder(nn.Module):
     """Scatterers to range profiles as they are received, a piece of the clip at a time.
 
@@ -79,18 +97,16 @@ class Recorder(nn.Module):
 
     def echoes(self, positions: Tensor, rcs: Tensor, span: int) -> tuple[list[Tensor], Levels]:
         """Profiles free of noise, ``span`` pulses in each (none with a front end), and the levels of the clips."""
-        pulses = positions.shape[1]
-        ahead = self.echo.displacements(positions)
         pieces: list[Tensor] = []
         nothing = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
         levels = Levels(nothing, nothing)
-        for start in range(0, pulses, span):
-            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            way = None if ahead is None else ahead[:, start : start + span]
+        for start, points, sections, way in stretches(
+            positions, rcs, self.echo.displacements(positions), span
+        ):
             profiles, energies = self.survey(points, sections, start, way)
             if self.front_end is None:
                 pieces.append(profiles)
-            levels = self.add(levels, energies, pulses)
+            levels = self.add(levels, energies, positions.shape[1])
         return pieces, levels
 
     def add(self, levels: Levels, energies: Levels, pulses: int) -> Levels:
@@ -111,10 +127,7 @@ class Recorder(nn.Module):
         signal = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
         arriving = torch.zeros_like(signal)
         chunks: list[Tensor] = []
-        step = self.step(positions)
-        for start in range(0, positions.shape[1], step):
-            points, sections = positions[:, start : start + step], rcs[:, start : start + step]
-            way = None if ahead is None else ahead[:, start : start + step]
+        for start, points, sections, way in stretches(positions, rcs, ahead, self.step(positions)):
             if self.front_end is not None:
                 samples, reference = self.engine.samples(points, sections, first + start, way)
                 heard = energy(self.front_end.arriving(samples, first + start))
@@ -143,10 +156,7 @@ class Recorder(nn.Module):
         if self.front_end is not None:
             chunks: list[Tensor] = []
             energies = torch.zeros_like(levels.signal)
-            step = self.step(positions)
-            for start in range(0, positions.shape[1], step):
-                points, sections = positions[:, start : start + step], rcs[:, start : start + step]
-                way = None if ahead is None else ahead[:, start : start + step]
+            for start, points, sections, way in stretches(positions, rcs, ahead, self.step(positions)):
                 samples, _ = self.engine.samples(points, sections, first + start, way)
                 samples, drawn = self.front_end(samples, levels, first + start)
                 chunks.append(channels_as_bins(self.profile(samples)).transpose(1, 2))

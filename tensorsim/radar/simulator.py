@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import ProcessingConfig, RadarConfig, SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
-from tensorsim.errors import TensorsimError, is_exporting
+from tensorsim.errors import TensorsimError, check_scene, is_exporting
 from tensorsim.ops import flatten_batch, unflatten_batch
 from tensorsim.radar.options import configured, echo_of, refuse_conflicts
 from tensorsim.radar.processing.ambiguity import SpeedCheck, check_unambiguous
@@ -17,8 +17,8 @@ from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
 from tensorsim.radar.processing.ridges import RidgeExtractor, Ridges
-from tensorsim.radar.recorder import Recorder
-from tensorsim.radar.synthesis.echo import EchoSynthesizer, check_scene
+from tensorsim.radar.recorder import Recorder, stretches
+from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.radar.synthesis.front_end import Levels
 from tensorsim.radar.synthesis.noise import decibels
 from tensorsim.types import RadarMaps
@@ -174,10 +174,7 @@ class RadarSimulator(nn.Module):
         range_time: list[Tensor] = []
         range_time_mti: list[Tensor] = []
         doppler_times: list[Tensor] = []
-        ahead, span = self.echo.displacements(positions), self.span(positions)
-        for start in range(0, pulses, span):
-            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            way = None if ahead is None else ahead[:, start : start + span]
+        for start, points, sections, way in self._stretches(positions, rcs):
             fresh, noise_energy = self.recorder.received(points, sections, start, way, levels, echoes)
             piece = self._piece(fresh, points, sections, pending)
             range_time.append(self._shown(piece.profiles))
@@ -207,10 +204,7 @@ class RadarSimulator(nn.Module):
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         pending = self._nothing_pending(positions)
         parts: list[Tensor] = []
-        ahead, span = self.echo.displacements(positions), self.span(positions)
-        for start in range(0, positions.shape[1], span):
-            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            way = None if ahead is None else ahead[:, start : start + span]
+        for start, points, sections, way in self._stretches(positions, rcs):
             fresh, _ = self.recorder.received(points, sections, start, way, levels, echoes)
             piece = self._piece(fresh, points, sections, pending)
             parts.append(piece.doppler_time)
@@ -228,10 +222,7 @@ class RadarSimulator(nn.Module):
         positions, rcs = self._scene(positions, rcs)
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         parts: list[Tensor] = []
-        ahead, span = self.echo.displacements(positions), self.span(positions)
-        for start in range(0, positions.shape[1], span):
-            points, sections = positions[:, start : start + span], rcs[:, start : start + span]
-            way = None if ahead is None else ahead[:, start : start + span]
+        for start, points, sections, way in self._stretches(positions, rcs):
             parts.append(self.recorder.received(points, sections, start, way, levels, echoes)[0])
         profiles = torch.cat(parts, 1)
         if self.has_array:
@@ -244,6 +235,9 @@ class RadarSimulator(nn.Module):
         if not torch.jit.is_scripting() and not is_exporting():
             check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m, self.one_channel)
         return flatten_batch(positions, 3), flatten_batch(rcs, 2)
+
+    def _stretches(self, positions: Tensor, rcs: Tensor) -> list[tuple[int, Tensor, Tensor, Tensor | None]]:
+        return stretches(positions, rcs, self.echo.displacements(positions), self.span(positions))
 
     def span(self, positions: Tensor) -> int:
         """Pulses that are worked on, and for which noise is drawn, at a time; for positions (B, M, S, 3)."""
