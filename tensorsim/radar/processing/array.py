@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_min_rank, check_tensor
 from tensorsim.ops import safe_sqrt
+from tensorsim.radar.synthesis.dechirp import phasor
 
 
 class AngleMaps(NamedTuple):
@@ -65,10 +66,29 @@ def steering_vectors(
     return -(direction @ channels_m.T) / wavelength_m
 
 
+def array_steering(radar: RadarConfig, azimuth_rad: Tensor, elevation_rad: float) -> Tensor:
+    """:func:`steering_vectors` (D, V) of the channels of a radar, less whole cycles.
+
+    Raises:
+        TensorsimError: azimuths that are not a finite vector, an elevation that is not finite.
+    """
+    azimuth = torch.as_tensor(azimuth_rad).double()
+    if azimuth.dim() != 1 or azimuth.numel() == 0 or not bool(torch.isfinite(azimuth).all()):
+        raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
+    if not math.isfinite(elevation_rad):
+        raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
+    cycles = steering_vectors(virtual_elements(radar), azimuth, elevation_rad, radar.doppler_wavelength_m)
+    return cycles - cycles.round()
+
+
+def beam_weights(cycles: Tensor, dtype: torch.dtype) -> Tensor:
+    """Complex weights (D, V) of the conventional beamformer, from steering phases (D, V)."""
+    return phasor(cycles).to(dtype) / cycles.shape[1]
+
+
 def beam_power(profiles: Tensor, cycles: Tensor) -> Tensor:
     """``w^H C w`` of channels (..., V, X, Y) with steering phases (D, V): mean over Y -> (..., D, X)."""
-    angle = 2 * math.pi * cycles
-    weights = torch.complex(angle.cos(), angle.sin()).to(profiles.dtype) / cycles.shape[1]
+    weights = beam_weights(cycles, profiles.dtype)
     series = profiles.movedim(-3, -2)  # (..., X, V, Y)
     covariance = torch.matmul(series, series.mH) / series.shape[-1]
     power = (torch.matmul(weights.conj(), covariance) * weights).sum(-1).real  # (..., X, D)
@@ -131,16 +151,9 @@ class AngleMapper(nn.Module):
         super().__init__()
         if not radar.has_array:
             raise TensorsimError("radar: got one transmitter and one receiver, expected several: rx_m (A, 3)")
-        azimuth = torch.as_tensor(azimuth_rad).double()
-        if azimuth.dim() != 1 or azimuth.numel() == 0 or not bool(torch.isfinite(azimuth).all()):
-            raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
-        if not math.isfinite(elevation_rad):
-            raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
-        channels = virtual_elements(radar)
-        cycles = steering_vectors(channels, azimuth, elevation_rad, radar.doppler_wavelength_m)
-        self.register_buffer("cycles", cycles - cycles.round(), persistent=False)
-        self.register_buffer("azimuth_rad", azimuth, persistent=False)
-        self.channels = channels.shape[0]
+        self.register_buffer("cycles", array_steering(radar, azimuth_rad, elevation_rad), persistent=False)
+        self.register_buffer("azimuth_rad", torch.as_tensor(azimuth_rad).double(), persistent=False)
+        self.channels = self.cycles.shape[1]
 
     def forward(self, profiles: Tensor) -> AngleMaps:
         """(..., V, M, R) to range-angle (..., R, D) and azimuth-time (..., D, M)."""

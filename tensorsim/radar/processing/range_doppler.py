@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_size, check_tensor
-from tensorsim.radar.processing.array import row_spacing_m, steering_vectors, virtual_elements
+from tensorsim.errors import check_tensor
+from tensorsim.radar.processing.array import array_steering, beam_weights, row_spacing_m
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.point_cloud import PointCloud, Points
@@ -45,7 +45,6 @@ class RangeDopplerCube(DopplerFrames):
         """Profiles (..., V, M, R) to the cube (..., K, V, R, F)."""
         layout = f"(..., {self.channels} channels, pulses, range bins)"
         check_tensor(profiles, "profiles", layout, "complex", finite=False)
-        check_size(profiles, -3, self.channels, "profiles", layout)
         lead, bins = list(profiles.shape[:-3]), profiles.shape[-1]
         frames = self.series(profiles).unfold(-1, self.length, self.hop)  # (B V, R, K, L)
         spectrum = torch.view_as_complex(self.spectrum(frames)).conj().resolve_conj()
@@ -82,21 +81,14 @@ class RangeDopplerAngle(nn.Module):
         overlap: float = 0.9,
     ) -> None:
         super().__init__()
-        azimuth = torch.as_tensor(azimuth_rad).double()
-        if azimuth.dim() != 1 or azimuth.numel() == 0 or not bool(torch.isfinite(azimuth).all()):
-            raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
-        if not math.isfinite(elevation_rad):
-            raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
         self.cube = RangeDopplerCube(radar, window_s, overlap)
-        cycles = steering_vectors(virtual_elements(radar), azimuth, elevation_rad, radar.doppler_wavelength_m)
-        self.register_buffer("cycles", cycles - cycles.round(), persistent=False)
+        self.register_buffer("cycles", array_steering(radar, azimuth_rad, elevation_rad), persistent=False)
 
     def forward(self, profiles: Tensor) -> Tensor:
         """Profiles (..., V, M, R) to power (..., K, R, F, D)."""
         cube = self.cube(profiles).movedim(-3, -1)  # (..., K, R, F, V)
         # The cube is conjugated, and so are the steering vectors; a beam is the product with their conjugate.
-        angle = 2 * math.pi * self.cycles.double()
-        weights = torch.complex(angle.cos(), angle.sin()).to(cube.dtype) / self.cycles.shape[1]
+        weights = beam_weights(self.cycles.double(), cube.dtype)
         return torch.view_as_real(torch.matmul(cube, weights.transpose(0, 1))).square().sum(-1)
 
 
