@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, Vector
-from tensorsim.errors import check_positive
+from tensorsim.errors import check_positive, check_scene
 from tensorsim.motion.scatterers import check_antenna
 from tensorsim.radar.synthesis.dechirp import phasor
-from tensorsim.radar.synthesis.echo import check_scene
 from tensorsim.radar.synthesis.legs import leg_length
+from tensorsim.radar.synthesis.paths import radar_equation_amplitude
 
 
 def continuous_wave(path_m: Tensor, amplitude: Tensor, wavelength_m: float) -> Tensor:
@@ -59,8 +59,7 @@ class ContinuousWaveEcho(nn.Module):
         check_antenna("tx_m", tx_m)
         check_antenna("rx_m", rx_m)
         self.wavelength_m = SPEED_OF_LIGHT_M_S / carrier_hz
-        gain = 10 ** (antenna_gain_dbi / 10)
-        self.scale = gain * self.wavelength_m / (4 * math.pi) ** 1.5
+        self.gain = 10 ** (antenna_gain_dbi / 10)
         self.register_buffer("tx", torch.tensor(tx_m, dtype=torch.float64), persistent=False)
         self.register_buffer("rx", torch.tensor(rx_m, dtype=torch.float64), persistent=False)
         self.register_buffer("precision", torch.zeros(()), persistent=False)
@@ -68,9 +67,10 @@ class ContinuousWaveEcho(nn.Module):
     def forward(self, positions: Tensor, rcs: Tensor) -> Tensor:
         """Scatterers (..., M, S, 3) m with (..., M, S) m^2 to the baseband signal (..., M)."""
         rcs = check_scene(positions, rcs)
-        exact = positions.double()
         shortest_m = self.wavelength_m / (4 * math.pi)  # as everywhere: the radar equation ends there
-        there = leg_length(exact, self.tx.double(), shortest_m)
-        back = leg_length(exact, self.rx.double(), shortest_m)
-        amplitude = self.scale * rcs.double().clamp(min=0.0).sqrt() / (there * back)
+        there = leg_length(positions.double(), self.tx.double(), shortest_m)
+        back = leg_length(positions.double(), self.rx.double(), shortest_m)
+        amplitude = radar_equation_amplitude(
+            rcs.double(), there, back, self.wavelength_m, self.gain, self.gain
+        )
         return continuous_wave(there + back, amplitude.to(self.precision.dtype), self.wavelength_m)
