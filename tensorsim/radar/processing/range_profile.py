@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map, check_min_rank, check_positive, check_size
+from tensorsim.errors import TensorsimError, check_complex_map, check_min_rank, check_positive
 
 _WINDOWS = {
     "hamming": torch.hamming_window,
@@ -109,11 +109,7 @@ class RangeProfile(nn.Module):
 
     def forward(self, intermediate: Tensor) -> Tensor:
         """IF (..., M, N) to profiles (..., M, R)."""
-        check_complex_map(intermediate, "IF", "(..., pulses, samples)")
-        if intermediate.shape[-1] != self.samples:
-            raise TensorsimError(
-                f"IF: got shape {list(intermediate.shape)}, expected (..., pulses, {self.samples} samples)"
-            )
+        check_complex_map(intermediate, "IF", f"(..., pulses, {self.samples} samples)")
         window = self.window.to(torch.view_as_real(intermediate).dtype)
         return range_profile(intermediate, window, self.first_bin, self.last_bin)
 
@@ -152,9 +148,7 @@ class FollowingGate(nn.Module):
 
     def forward(self, profiles: Tensor, positions: Tensor, rcs: Tensor) -> Tensor:
         """Profiles (..., M, R) of positions (..., M, S, 3) and RCS (..., M, S)."""
-        layout = f"(..., pulses, {self.range_m.shape[0]} range bins)"
-        check_complex_map(profiles, "profiles", layout)
-        check_size(profiles, -1, self.range_m.shape[0], "profiles", layout)
+        check_complex_map(profiles, "profiles", f"(..., pulses, {self.range_m.shape[0]} range bins)")
         check_min_rank(positions, 3, "positions", "(..., pulses, scatterers, 3) metres")
         if positions.shape[:-2] != profiles.shape[:-1] or positions.shape[-1] != 3:
             raise TensorsimError(

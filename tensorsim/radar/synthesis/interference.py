@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map, check_size
+from tensorsim.errors import TensorsimError, check_complex_map
 from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 
 
@@ -69,9 +69,7 @@ class Interference(nn.Module):
 
     def forward(self, intermediate: Tensor, start: int = 0) -> Tensor:
         """IF of pulses ``start`` onwards to IF with interference."""
-        layout = f"(..., pulses, {self.samples} samples)"
-        check_complex_map(intermediate, "IF", layout)
-        check_size(intermediate, -1, self.samples, "IF", layout)
+        check_complex_map(intermediate, "IF", f"(..., pulses, {self.samples} samples)")
         device = intermediate.device
         pulse = (start + torch.arange(intermediate.shape[-2], dtype=torch.float64, device=device)).unsqueeze(
             -1

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map, check_size
+from tensorsim.errors import TensorsimError, check_complex_map
 from tensorsim.radar.synthesis.counter_noise import normal
 
 #: Single-sideband phase noise of integrated oscillators at 77 GHz (typical): offsets from the carrier, L there.
@@ -95,9 +95,7 @@ class PhaseNoise(nn.Module):
 
     def forward(self, intermediate: Tensor, start: int = 0) -> Tensor:
         """IF of pulses ``start`` onwards to IF with phase noise."""
-        layout = f"(..., pulses, {self.samples} samples)"
-        check_complex_map(intermediate, "IF", layout)
-        check_size(intermediate, -1, self.samples, "IF", layout)
+        check_complex_map(intermediate, "IF", f"(..., pulses, {self.samples} samples)")
         spectrum = self._drawn(self.seed, start, intermediate.shape[-2]) * 1j
         spectra = spectrum * self.deviation.double().unsqueeze(1)  # (2, M, half)
         rates = torch.fft.irfft(spectra, self.samples, norm="forward").to(torch.real(intermediate).dtype)
