@@ -115,18 +115,11 @@ class ReceiverNoise(nn.Module):
         super().__init__()
         if reference not in ("echo", "total", "absolute"):
             raise TensorsimError(f"reference: got {reference!r}, expected 'echo', 'total' or 'absolute'")
-        if snr_db is not None and not math.isfinite(snr_db):
-            raise TensorsimError(f"snr_db: got {snr_db}, expected a finite number of dB or None for no noise")
-        for name, value in (
-            ("snr_db", 0.0 if snr_db is None else snr_db),
-            ("noise_figure_db", noise_figure_db),
-        ):
-            if math.isfinite(value):
-                check_range(value, "ratio of powers", name)
+        if snr_db is not None:
+            check_range(snr_db, "ratio of powers", "snr_db")
+        check_range(noise_figure_db, "ratio of powers", "noise_figure_db")
         if not (math.isfinite(empty_power) and empty_power >= 0):
             raise TensorsimError(f"empty_power: got {empty_power}, expected a finite power >= 0")
-        if not math.isfinite(noise_figure_db):
-            raise TensorsimError(f"noise_figure_db: got {noise_figure_db}, expected a finite number of dB")
         check_positive(bandwidth_hz, "bandwidth_hz")
         check_positive(transmit_power_w, "transmit_power_w")
         thermal = BOLTZMANN_J_PER_K * REFERENCE_TEMPERATURE_K * bandwidth_hz * 10 ** (noise_figure_db / 10)
