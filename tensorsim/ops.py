@@ -14,6 +14,11 @@ def unflatten_batch(x: Tensor, lead: list[int]) -> Tensor:
     return x.reshape(lead + list(x.shape[1:]))
 
 
+def of_person(values: Tensor, person: Tensor) -> Tensor:
+    """Values (N,) by order of person, for people with these numbers (...): the last one serves all further people."""
+    return values[person.clamp(max=values.shape[0] - 1)]
+
+
 def safe_sqrt(x: Tensor) -> Tensor:
     """Square root whose gradient at 0 is 0 instead of infinite."""
     if not x.requires_grad:

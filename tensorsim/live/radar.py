@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.errors import TensorsimError
+from tensorsim.ops import of_person
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.simulator import Pending
@@ -166,9 +167,9 @@ class LiveRadar:
         fade = (
             torch.stack([cubic_b_spline(p.presence, u) for p in shown]) if shown else u.new_zeros(0, len(u))
         )
-        scale = self.stage.rcs_scale
-        order = torch.tensor([p.order for p in shown], dtype=torch.int64).clamp(max=scale.shape[0] - 1)
-        fade = fade * scale[order].sqrt()[:, None] * self.stage.heard(joints)
+        order = torch.tensor([p.order for p in shown], dtype=torch.int64)
+        scale = of_person(self.stage.rcs_scale, order).sqrt()[:, None]
+        fade = fade * scale * self.stage.heard(joints)
         points, rcs = self.stage.scatterers(joints[None], fade[None])
         return points, rcs
 

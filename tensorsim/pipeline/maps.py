@@ -19,6 +19,7 @@ from tensorsim.motion.savgol import SavitzkyGolay
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade
 from tensorsim.motion.sway import PosturalSway
 from tensorsim.motion.vital_signs import VitalSigns
+from tensorsim.ops import of_person
 from tensorsim.protocols import check_instance, check_part
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.types import RadarMaps
@@ -185,8 +186,8 @@ class PoseToDoppler(nn.Module):
         for motion in self.small_motions:
             positions = motion(positions, start)
         # Scatterers scale cross sections with the square of the presence.
-        person = person.clamp(max=self.rcs_scale.shape[0] - 1)
-        presence = presence * self.rcs_scale[person].sqrt().unsqueeze(-1) * self.heard(positions)
+        scale = of_person(self.rcs_scale, person).sqrt().unsqueeze(-1)
+        presence = presence * scale * self.heard(positions)
         points, rcs = self.scatterers(positions, presence)
         return points, rcs
 

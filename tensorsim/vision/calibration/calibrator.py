@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError, check_key_points, check_per_person, check_positive
+from tensorsim.ops import of_person
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
     LEAN,
@@ -259,7 +260,7 @@ class CameraCalibrator(nn.Module):
         told = independent[:, 0, 0] * upright.sum(dim=-1)
         most = told.argsort(descending=True, stable=True)[: self.most_people].sort()[0]
 
-        stature = self.stature[torch.arange(people, device=valid.device).clamp(max=self.stature.shape[0] - 1)]
+        stature = of_person(self.stature, torch.arange(people, device=valid.device))
         ends, upright, walking, independent = ends[most], upright[most], walking[most], independent[most]
         stature, cycles_hz, rhythm = stature[most], cycles_hz[most], rhythm[most]
         middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64, device=valid.device)

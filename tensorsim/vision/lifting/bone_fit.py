@@ -29,6 +29,7 @@ from tensorsim.errors import (
     check_positive,
     is_exporting,
 )
+from tensorsim.ops import of_person
 from tensorsim.vision.lifting.bone_branches import choose_branches
 from tensorsim.vision.lifting.bone_cost import (
     FREE_JOINTS,
@@ -149,8 +150,8 @@ class BoneFit(nn.Module):
         people, frames = joints.shape[-4], joints.shape[-3]
         sight = joints.reshape(-1, frames, 14, 3).double() - self.camera
         distance = sight.square().sum(dim=-1).sqrt().clamp(min=1e-3)
-        person = torch.arange(people, device=joints.device).clamp(max=self.heights.shape[0] - 1)
-        tall = self.heights[person].expand(joints.shape[:-3]).reshape(-1)
+        tall = of_person(self.heights, torch.arange(people, device=joints.device))
+        tall = tall.expand(joints.shape[:-3]).reshape(-1)
         lines = (sight / distance[..., None]).index_select(2, self.free)
         given = distance.index_select(2, self.free)
         visible = seen.reshape(-1, frames, 14).index_select(2, self.free)

@@ -10,6 +10,7 @@ from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError, check_finite, check_per_person, check_points, check_positive
 from tensorsim.geometry.camera import back_project, camera_to_world
+from tensorsim.ops import of_person
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.floor import (
     floor_under,
@@ -294,8 +295,7 @@ class MetricPose(nn.Module):
 
     def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
         """A value per person, (P, 1): the last one serves all further people."""
-        person = torch.arange(like.shape[-4], device=like.device).clamp(max=values.shape[0] - 1)
-        return values.to(like.dtype)[person][:, None]
+        return of_person(values.to(like.dtype), torch.arange(like.shape[-4], device=like.device))[:, None]
 
     def _focal_from(
         self, distance: Tensor, height: Tensor, scale: Tensor, offset: Tensor, valid: Tensor, fps: float

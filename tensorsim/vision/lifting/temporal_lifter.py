@@ -24,6 +24,7 @@ from tensorsim.errors import (
     check_size,
 )
 from tensorsim.geometry.camera import camera_to_world, project
+from tensorsim.ops import of_person
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.sight import (
     RADIUS,
@@ -286,12 +287,10 @@ class TemporalLifter(nn.Module):
 
     def _height_of_each(self, like: Tensor) -> Tensor:
         """Standing height of each track, (S,), of (..., P, T, N, D)."""
-        people = like.shape[-4]
-        person = torch.arange(people, device=like.device).clamp(max=self.heights.shape[0] - 1)
         clips = 1
         for size in like.shape[:-4]:
             clips *= size
-        return self.heights[person].repeat(clips)
+        return of_person(self.heights, torch.arange(like.shape[-4], device=like.device)).repeat(clips)
 
     def _focal_px(self, image_width: int) -> float:
         focal = self.focal_px
