@@ -3,7 +3,7 @@
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
 
@@ -11,16 +11,45 @@ from tensorsim.config import CameraConfig
 NEAR_M = 0.1
 
 
+class Pinhole(nn.Module):
+    """A camera inside of stages, which script.
+
+    Args:
+        camera: its configuration.
+
+    Attributes:
+        pose: (3, 4) float64, see :func:`camera_to_world`.
+    """
+
+    pose: Tensor
+    focal_px: float | None
+    center_px: tuple[float, float] | None
+
+    def __init__(self, camera: CameraConfig) -> None:
+        super().__init__()
+        self.focal_px, self.center_px = camera.focal_px, camera.center_px
+        self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
+        self.register_buffer("pose", camera_to_world(camera), persistent=False)
+
+    def focal_length(self, width: int) -> float:
+        """Focal length in pixels for images of ``width`` pixels, from the field of view unless it is given."""
+        focal = self.focal_px
+        return width / 2 / self.half_width if focal is None else focal
+
+    def principal_point(self, height: int, width: int) -> tuple[float, float]:
+        """Principal point (u, v) in pixels: the centre of the image unless it is given. Pixel centres are integers."""
+        center = self.center_px
+        return ((width - 1) / 2, (height - 1) / 2) if center is None else center
+
+
 def focal_length(camera: CameraConfig, width: int) -> float:
-    """Focal length in pixels for images of ``width`` pixels, from the field of view unless it is given."""
-    if camera.focal_px is not None:
-        return camera.focal_px
-    return width / 2 / math.tan(camera.horizontal_fov_rad / 2)
+    """See :meth:`Pinhole.focal_length`."""
+    return Pinhole(camera).focal_length(width)
 
 
 def principal_point(camera: CameraConfig, height: int, width: int) -> tuple[float, float]:
-    """Principal point (u, v) in pixels: the centre of the image unless it is given. Pixel centres are integers."""
-    return ((width - 1) / 2, (height - 1) / 2) if camera.center_px is None else camera.center_px
+    """See :meth:`Pinhole.principal_point`."""
+    return Pinhole(camera).principal_point(height, width)
 
 
 def camera_to_world(camera: CameraConfig) -> Tensor:

@@ -1,15 +1,14 @@
 """From joints in the image and their library depths to joints in the world, in metres."""
 
-import math
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
+from tensorsim.config.people import PANEL_DISTANCES_M
 from tensorsim.errors import TensorsimError, check_finite, check_per_person, check_points, check_positive
-from tensorsim.geometry.camera import back_project, camera_to_world
+from tensorsim.geometry.camera import Pinhole, back_project
 from tensorsim.ops import of_person
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.floor import (
@@ -29,9 +28,6 @@ from tensorsim.vision.smoothing.along_time import (
     nearest_valid,
     robust_smooth,
 )
-
-#: Initial distances of the original's panel by person; the paper's mode cannot do without.
-PANEL_DISTANCES_M = (4.00, 0.50)
 
 
 def metres_per_pixel(height_m: Tensor, height_px: Tensor) -> Tensor:
@@ -144,9 +140,6 @@ class MetricPose(nn.Module):
 
     heights: Tensor
     distances: Tensor
-    camera_pose: Tensor
-    focal_px: float | None
-    center_px: tuple[float, float] | None
 
     def __init__(
         self,
@@ -175,16 +168,13 @@ class MetricPose(nn.Module):
         for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
             check_positive(getattr(self, name), f"MetricPose.{name}")
         camera = CameraConfig() if camera is None else camera
-        self.camera = camera
-        self.focal_px, self.center_px = camera.focal_px, camera.center_px
-        self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
+        self.camera, self.pinhole = camera, Pinhole(camera)
         self.distance_gives_focal = initial_distance_m is not None
         distances = PANEL_DISTANCES_M if initial_distance_m is None else initial_distance_m
         for name, values in (("person_height_m", person_height_m), ("initial_distance_m", distances)):
             check_per_person(values, f"MetricPose.{name}")
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
         self.register_buffer("distances", torch.tensor(distances, dtype=torch.float64), persistent=False)
-        self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
 
     def seen_by(self, camera: CameraConfig) -> "MetricPose":
         """The same for another camera."""
@@ -223,7 +213,7 @@ class MetricPose(nn.Module):
             # The fitted scale is that at the mean depth of the joints, not of the hips.
             offset = fill_gaps((weights * lifted.depth).sum(dim=-1), valid)
             scale = fill_gaps(lifted.scale, valid).clamp(min=1e-3)
-            focal = torch.full_like(scale, self._focal_px(image_width))
+            focal = torch.full_like(scale, self.pinhole.focal_length(image_width))
             if self.distance_gives_focal:
                 focal = self._focal_from(distance, height, scale, offset, valid, fps)
             # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
@@ -239,7 +229,7 @@ class MetricPose(nn.Module):
             whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid & many)
             whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
-            center = self._center_px(keypoints, image_height, image_width)
+            center = torch.tensor(self.pinhole.principal_point(image_height, image_width)).to(keypoints)
             hips_range = camera_range(focal, height, scale) - height * offset
             image = torch.where(seen[..., None], keypoints, lifted.keypoints)
             depth = height[..., None] * lifted.depth
@@ -276,22 +266,12 @@ class MetricPose(nn.Module):
     def _pose(self, keypoints: Tensor, camera_pose: Tensor | None) -> Tensor:
         """World-from-camera pose, broadcast to (..., P, T, 3, 4)."""
         if camera_pose is None:
-            return self.camera_pose.to(keypoints.dtype)
+            return self.pinhole.pose.to(keypoints.dtype)
         expected = list(keypoints.shape[:-4])
         expected.extend([keypoints.shape[-3], 3, 4])
         if list(camera_pose.shape) != expected:
             raise TensorsimError(f"camera_pose: got shape {list(camera_pose.shape)}, expected {expected}")
         return camera_pose.to(keypoints.dtype).unsqueeze(-4)
-
-    def _center_px(self, like: Tensor, image_height: int, image_width: int) -> Tensor:
-        center = self.center_px
-        if center is None:
-            center = ((image_width - 1) / 2, (image_height - 1) / 2)
-        return torch.tensor(center).to(like)
-
-    def _focal_px(self, image_width: int) -> float:
-        focal = self.focal_px
-        return image_width / 2 / self.half_width if focal is None else focal
 
     def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
         """A value per person, (P, 1): the last one serves all further people."""

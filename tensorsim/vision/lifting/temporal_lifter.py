@@ -23,7 +23,7 @@ from tensorsim.errors import (
     check_positive,
     check_size,
 )
-from tensorsim.geometry.camera import camera_to_world, project
+from tensorsim.geometry.camera import Pinhole, project
 from tensorsim.ops import of_person
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.sight import (
@@ -96,12 +96,9 @@ class TemporalLifter(nn.Module):
     """
 
     heights: Tensor
-    camera_pose: Tensor
     bones: Tensor
     other_keypoint: Tensor
     other_joint: Tensor
-    focal_px: float | None
-    center_px: tuple[float, float] | None
 
     def __init__(
         self,
@@ -124,11 +121,8 @@ class TemporalLifter(nn.Module):
         #: Frames before and after one that have a say in its result.
         # The size of the body is about its averaged direction, that of its bones is averaged afterwards.
         self.reach = self.network.reach + 3 * RADIUS
-        camera = CameraConfig() if camera is None else camera
-        self.focal_px, self.center_px = camera.focal_px, camera.center_px
-        self.half_width = math.tan(camera.horizontal_fov_rad / 2)  # of the image, in focal lengths
+        self.pinhole = Pinhole(CameraConfig() if camera is None else camera)
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
-        self.register_buffer("camera_pose", camera_to_world(camera), persistent=False)
         self.register_buffer("bones", torch.tensor(BONES).T, persistent=False)
         self.register_buffer("other_keypoint", torch.tensor(MIRRORED), persistent=False)
         self.register_buffer("other_joint", torch.tensor(MIRRORED_JOINTS), persistent=False)
@@ -190,7 +184,7 @@ class TemporalLifter(nn.Module):
         spread = math.sqrt(2.0) * height[..., None, None] * torch.cat(spreads, dim=1).exp()
         off = math.sqrt(2.0) * torch.cat(ranges, dim=1).exp() * root[..., :2].square().sum(dim=-1).sqrt()
         deviation = along_axes(spread[..., 0], spread[..., 1], azimuth[..., None, :])
-        place = self.camera_pose[:, 3].to(dtype)
+        place = self.pinhole.pose[:, 3].to(dtype)
         return TemporalPose(
             (points - root[..., None, :]).to(keypoints.dtype).unflatten(0, lead),
             (root + place).to(keypoints.dtype).unflatten(0, lead),
@@ -212,9 +206,9 @@ class TemporalLifter(nn.Module):
             weights: (..., P, T, 14) their scores, those that MetricPose is given.
             image_height, image_width: of the picture, pixels.
         """
-        focal = self._focal_px(image_width)
-        center = self._center_px(image_height, image_width)
-        pose = self.camera_pose.to(found.root.dtype)
+        focal = self.pinhole.focal_length(image_width)
+        center = self.pinhole.principal_point(image_height, image_width)
+        pose = self.pinhole.pose.to(found.root.dtype)
         pixels, reach = project(found.joints + found.root[..., None, :], focal, center, pose)
         reach = reach.clamp(min=0.1)
         hips = 0.5 * (reach[..., 8:9] + reach[..., 11:12])
@@ -247,7 +241,7 @@ class TemporalLifter(nn.Module):
         tracks = keypoints.shape[0]
         joints, joint_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         one = torch.ones(tracks, dtype=keypoints.dtype, device=keypoints.device)
-        center, pose = self._center_px(rows, columns), self.camera_pose.to(keypoints.dtype)
+        center, pose = self.pinhole.principal_point(rows, columns), self.pinhole.pose.to(keypoints.dtype)
         sight = level_sight(
             keypoints,
             scores,
@@ -255,7 +249,7 @@ class TemporalLifter(nn.Module):
             joint_scores,
             boxes,
             valid,
-            self._focal_px(columns) * one,
+            self.pinhole.focal_length(columns) * one,
             torch.stack([center[0] * one, center[1] * one], dim=-1),
             pose[:, :3].expand(tracks, 3, 3),
             torch.stack([columns * one, rows * one], dim=-1),
@@ -291,14 +285,6 @@ class TemporalLifter(nn.Module):
         for size in like.shape[:-4]:
             clips *= size
         return of_person(self.heights, torch.arange(like.shape[-4], device=like.device)).repeat(clips)
-
-    def _focal_px(self, image_width: int) -> float:
-        focal = self.focal_px
-        return image_width / 2 / self.half_width if focal is None else focal
-
-    def _center_px(self, image_height: int, image_width: int) -> tuple[float, float]:
-        center = self.center_px
-        return ((image_width - 1) / 2, (image_height - 1) / 2) if center is None else center
 
     @classmethod
     def from_pretrained(

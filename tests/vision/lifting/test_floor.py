@@ -317,7 +317,7 @@ def on_floor(world: Tensor, by_size: Tensor) -> tuple[Tensor, ...]:
     ones = torch.ones(1, len(world), dtype=torch.float64)
     return module._on_floor(
         by_size[None], image[None], TALL * lifted.depth[None], 900.0 * ones, torch.tensor([640.0, 360.0]).double(),
-        module.camera_pose, torch.full((1, 1), TALL, dtype=torch.float64), ones[..., None].expand(1, -1, 14) > 0,
+        module.pinhole.pose, torch.full((1, 1), TALL, dtype=torch.float64), ones[..., None].expand(1, -1, 14) > 0,
         ones > 0, FPS,
     )  # fmt: skip
 

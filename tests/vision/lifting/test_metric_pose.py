@@ -532,13 +532,6 @@ def test_the_focal_length_comes_from_the_first_half_second(fps: float) -> None:
     torch.testing.assert_close(focal, torch.full_like(scale, middle * (4.0 / 1.6 + 0.1)))
 
 
-def test_pictures_have_their_centre_in_the_middle_of_the_pixels() -> None:
-    """Pixel centres are at integers: 0 to 639 and 0 to 479."""
-    like = torch.zeros(1, dtype=torch.float64)
-    assert MetricPose()._center_px(like, 480, 640).tolist() == [319.5, 239.5]
-    assert MetricPose()._focal_px(640) == pytest.approx(320 / math.tan(math.pi / 6))
-
-
 def test_usual_settings() -> None:
     module = MetricPose()
     assert module.heights.tolist() == [1.80, 1.70]
@@ -547,7 +540,7 @@ def test_usual_settings() -> None:
     assert (module.range_smoothing_s, module.floor_window_s) == (0.3, 1.5)
     other = MetricPose(None, (1.6,), (3.0,), 0.4, "paper", 0.2, 1.0, True)
     seen_by = other.seen_by(CameraConfig(focal_px=900.0))
-    assert (seen_by.focal_px, seen_by.heights.tolist(), seen_by.distances.tolist()) == (900.0, [1.6], [3.0])
+    assert (seen_by.camera.focal_px, seen_by.heights.tolist(), seen_by.distances.tolist()) == (900.0, [1.6], [3.0])
     assert (seen_by.keypoint_threshold, seen_by.mode, seen_by.calibrated) == (0.4, "paper", True)
     assert (seen_by.range_smoothing_s, seen_by.floor_window_s) == (0.2, 1.0)
     assert MetricPose().seen_by(CameraConfig()).distance_gives_focal is False
