@@ -109,6 +109,20 @@ def check_size(x: Tensor, dim: int, size: int, name: str, layout: str) -> None:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {layout}")
 
 
+def check_shape(x: Tensor, shape: list[int], name: str) -> None:
+    """Refuse a tensor of another shape."""
+    if list(x.shape) != shape:
+        raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {shape}")
+
+
+def check_mask(x: Tensor, shape: list[int], name: str) -> None:
+    """Refuse anything but a boolean tensor of this shape."""
+    if x.dtype != torch.bool or list(x.shape) != shape:
+        raise TensorsimError(
+            f"{name}: got {x.dtype} of shape {list(x.shape)}, expected bool of shape {shape}"
+        )
+
+
 def check_points(x: Tensor, rank: int, count: int, coordinates: int, name: str, layout: str) -> None:
     """Refuse anything but real (..., count, coordinates) of at least this rank."""
     check_floating(x, name)
@@ -120,12 +134,8 @@ def check_points(x: Tensor, rank: int, count: int, coordinates: int, name: str, 
 def check_key_points(keypoints: Tensor, scores: Tensor, valid: Tensor, rank: int, layout: str) -> None:
     """Refuse anything but finite key points (..., T, 17, 2), scores (..., T, 17) and valid (..., T), bool."""
     check_points(keypoints, rank, 17, 2, "keypoints", layout)
-    if list(scores.shape) != list(keypoints.shape[:-1]):
-        raise TensorsimError(f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}")
-    if list(valid.shape) != list(keypoints.shape[:-2]) or valid.dtype != torch.bool:
-        raise TensorsimError(
-            f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(keypoints.shape[:-2])}"
-        )
+    check_shape(scores, list(keypoints.shape[:-1]), "scores")
+    check_mask(valid, list(keypoints.shape[:-2]), "valid")
     check_finite(keypoints, "keypoints")
     check_finite(scores, "scores")
 

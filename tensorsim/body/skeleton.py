@@ -10,7 +10,13 @@ from torch import Tensor
 
 from tensorsim.body.proportions import NOSE_FORWARD, NOSE_UP
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
-from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, check_tensor
+from tensorsim.errors import (
+    check_finite,
+    check_points,
+    check_positive,
+    check_shape,
+    check_tensor,
+)
 
 #: Arms and legs by the indices of their joints, upper segment first.
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
@@ -115,8 +121,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
     """
     layout = "(..., 17, 2) COCO key points in pixels"
     check_points(keypoints, 2, 17, 2, "keypoints", layout)
-    if scores.shape != keypoints.shape[:-1]:
-        raise TensorsimError(f"scores: got shape {list(scores.shape)}, expected {list(keypoints.shape[:-1])}")
+    check_shape(scores, list(keypoints.shape[:-1]), "scores")
     check_finite(keypoints, "keypoints")
     check_finite(scores, "scores")
     check_positive(threshold, "threshold")

@@ -3,11 +3,8 @@
 import torch
 from torch import Tensor
 
-from tensorsim.errors import TensorsimError, check_min_rank
+from tensorsim.errors import check_mask, check_min_rank
 from tensorsim.vision.smoothing.along_time import seen_beside
-
-#: Frames after which motion beyond the first or last frame of a run has slowed down to a third.
-_SLOWING = 6.0
 
 
 def continued(joints: Tensor, valid: Tensor) -> Tensor:
@@ -28,10 +25,7 @@ def continued(joints: Tensor, valid: Tensor) -> Tensor:
         TensorsimError: wrong shapes, or valid not boolean.
     """
     check_min_rank(joints, 3, "joints", "(..., T, J, 3)")
-    if valid.dtype != torch.bool or valid.shape != joints.shape[:-2]:
-        raise TensorsimError(
-            f"valid: got {valid.dtype} of shape {list(valid.shape)}, expected bool (..., T) {list(joints.shape[:-2])}"
-        )
+    check_mask(valid, list(joints.shape[:-2]), "valid")
     if bool(valid.all()):
         return joints
     frames = joints.shape[-3]
@@ -47,7 +41,7 @@ def continued(joints: Tensor, valid: Tensor) -> Tensor:
     return torch.where(valid[..., None, None], joints, moved)
 
 
-def _beyond(joints: Tensor, valid: Tensor, edge: Tensor, sense: int, slowing: float = _SLOWING) -> Tensor:
+def _beyond(joints: Tensor, valid: Tensor, edge: Tensor, sense: int) -> Tensor:
     """Motion that goes on beyond the frames ``edge`` (..., T), forwards (``sense`` 1) or backwards (-1) in time."""
     frames = valid.shape[-1]
     last = edge.clamp(0, frames - 1)
@@ -57,5 +51,6 @@ def _beyond(joints: Tensor, valid: Tensor, edge: Tensor, sense: int, slowing: fl
     step = at_last - joints.gather(-3, previous[..., None, None].expand(shape))
     known = valid.gather(-1, previous) & (previous != last)
     since = (torch.arange(frames, device=valid.device) - edge).abs().to(joints.dtype)
+    slowing = 6.0  # frames after which the speed has fallen to a third
     way = slowing * (1 - torch.exp(-since / slowing)) * known
     return at_last + way[..., None, None] * step

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tensorsim.config import CameraConfig
 from tensorsim.device import one_thread
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_not_empty
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_mask, check_not_empty
 from tensorsim.render.body import REFERENCE_HEIGHT_M, Body, build_body
 from tensorsim.render.cast import View, Volumes, cast
 from tensorsim.render.look import Look, Surface, paint
@@ -113,10 +113,7 @@ class PersonRenderer:
         joints = _checked(joints)
         people, times = joints.shape[:2]
         present = torch.ones(people, times, dtype=torch.bool) if valid is None else valid.cpu()
-        if present.shape != (people, times) or present.dtype != torch.bool:
-            raise TensorsimError(
-                f"valid: got {present.dtype} of shape {list(present.shape)}, expected bool {[people, times]}"
-            )
+        check_mask(present, [people, times], "valid")
         generator = torch.Generator().manual_seed(seed)
         view = View.of_camera(self.camera, self.height, self.width, joints)
         light = Light.draw(self.camera.yaw_rad, generator)

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import TensorsimError, check_mask, check_positive
 from tensorsim.ops import flatten_batch
 
 
@@ -99,11 +99,7 @@ class PointCloud(nn.Module):
                 f"cube: got shape {list(cube.shape)} of {cube.dtype}, expected complex (..., antennas, range, Doppler)"
             )
         lead = list(cube.shape[:-3])
-        if list(detected.shape) != lead + list(cube.shape[-2:]) or detected.dtype != torch.bool:
-            raise TensorsimError(
-                f"detected: got shape {list(detected.shape)} of {detected.dtype}, expected bool "
-                f"{lead + list(cube.shape[-2:])}"
-            )
+        check_mask(detected, lead + list(cube.shape[-2:]), "detected")
         power = cube.abs().square().mean(-3)
         chosen = detected & local_maxima(power.detach()) if self.peaks_only else detected
         cells, doppler_bins = power.shape[-2] * power.shape[-1], power.shape[-1]

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from tensorsim.body.proportions import ANKLE_HEIGHT, FLESH
 from tensorsim.errors import (
-    TensorsimError,
     check_finite,
+    check_mask,
     check_per_person,
     check_points,
     check_positive,
@@ -126,12 +126,8 @@ class BoneFit(nn.Module):
 
     def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
         """Joints, which of them are seen and frame rate -> joints."""
-        layout = "(..., P, T, 14, 3) joints in metres"
-        check_points(joints, 4, 14, 3, "joints", layout)
-        if seen.dtype != torch.bool or seen.shape != joints.shape[:-1]:
-            raise TensorsimError(
-                f"seen: got {seen.dtype} of {list(seen.shape)}, expected bool of {list(joints.shape[:-1])}"
-            )
+        check_points(joints, 4, 14, 3, "joints", "(..., P, T, 14, 3) joints in metres")
+        check_mask(seen, list(joints.shape[:-1]), "seen")
         check_finite(joints, "joints")
         check_positive(fps, "fps")
         if joints.shape[-3] < 4 or joints.numel() == 0:

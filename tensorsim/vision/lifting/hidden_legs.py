@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.gait import boulic_gait, cycle_s
 from tensorsim.body.skeleton import mid_hips
-from tensorsim.errors import TensorsimError, check_points, check_positive
+from tensorsim.errors import TensorsimError, check_mask, check_points, check_positive
 from tensorsim.vision.smoothing.along_time import local_linear
 
 #: Harmonics of the angles of a gait cycle.
@@ -64,11 +64,8 @@ class HiddenLegs(nn.Module):
     def forward(self, joints: Tensor, seen: Tensor, valid: Tensor, fps: float) -> Tensor:
         """Joints, which of them are seen, frames with a person, frame rate -> joints."""
         check_points(joints, 3, 14, 3, "joints", "(..., T, 14, 3) metres")
-        for name, mask, shape in (("seen", seen, joints.shape[:-1]), ("valid", valid, joints.shape[:-2])):
-            if mask.dtype != torch.bool or list(mask.shape) != list(shape):
-                raise TensorsimError(
-                    f"{name}: got {mask.dtype} of shape {list(mask.shape)}, expected bool of shape {list(shape)}"
-                )
+        check_mask(seen, list(joints.shape[:-1]), "seen")
+        check_mask(valid, list(joints.shape[:-2]), "valid")
         check_positive(fps, "fps")
         if joints.numel() == 0:
             return joints

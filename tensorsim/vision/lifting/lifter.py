@@ -11,7 +11,14 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_points, check_positive, is_exporting
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_points,
+    check_positive,
+    check_shape,
+    is_exporting,
+)
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.pose_library import load_pose_library, standardise_poses
 from tensorsim.vision.lifting.pose_search import PoseSearch, normalise_weights
@@ -48,10 +55,7 @@ def check_to_lift(keypoints: Tensor, weights: Tensor) -> None:
         TensorsimError: other shapes, NaN, negative weights, or no frames.
     """
     check_points(keypoints, 3, 14, 2, "keypoints", "(..., T, 14, 2) joints in pixels")
-    if weights.shape != keypoints.shape[:-1]:
-        raise TensorsimError(
-            f"weights: got shape {list(weights.shape)}, expected {list(keypoints.shape[:-1])}"
-        )
+    check_shape(weights, list(keypoints.shape[:-1]), "weights")
     if keypoints.shape[-3] < 1:
         raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
     check_finite(keypoints, "keypoints")

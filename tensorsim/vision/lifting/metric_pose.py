@@ -7,7 +7,15 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.config.people import PANEL_DISTANCES_M
-from tensorsim.errors import TensorsimError, check_finite, check_per_person, check_points, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_mask,
+    check_per_person,
+    check_points,
+    check_positive,
+    check_shape,
+)
 from tensorsim.geometry.camera import Pinhole, back_project
 from tensorsim.ops import of_person
 from tensorsim.types import Lifted
@@ -269,8 +277,7 @@ class MetricPose(nn.Module):
             return self.pinhole.pose.to(keypoints.dtype)
         expected = list(keypoints.shape[:-4])
         expected.extend([keypoints.shape[-3], 3, 4])
-        if list(camera_pose.shape) != expected:
-            raise TensorsimError(f"camera_pose: got shape {list(camera_pose.shape)}, expected {expected}")
+        check_shape(camera_pose, expected, "camera_pose")
         return camera_pose.to(keypoints.dtype).unsqueeze(-4)
 
     def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
@@ -350,17 +357,11 @@ def _check(
     layout = "(..., P, T, 14, 2) joints in pixels"
     check_points(keypoints, 4, 14, 2, "keypoints", layout)
     shape = keypoints.shape
-    for name, size, expected in (
-        ("scores", scores.shape, shape[:-1]),
-        ("lifted.depth", lifted.depth.shape, shape[:-1]),
-        ("lifted.scale", lifted.scale.shape, shape[:-2]),
-        ("lifted.keypoints", lifted.keypoints.shape, shape),
-        ("valid", valid.shape, shape[:-2]),
-    ):
-        if list(size) != list(expected):
-            raise TensorsimError(f"{name}: got shape {list(size)}, expected {list(expected)}")
-    if valid.dtype != torch.bool:
-        raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
+    check_shape(scores, list(shape[:-1]), "scores")
+    check_shape(lifted.depth, list(shape[:-1]), "lifted.depth")
+    check_shape(lifted.scale, list(shape[:-2]), "lifted.scale")
+    check_shape(lifted.keypoints, list(shape), "lifted.keypoints")
+    check_mask(valid, list(shape[:-2]), "valid")
     if shape[-3] < 1:
         raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
     check_finite(keypoints, "keypoints")

@@ -18,10 +18,11 @@ from tensorsim.errors import (
     check_count,
     check_finite,
     check_floating,
+    check_mask,
     check_per_person,
     check_points,
     check_positive,
-    check_size,
+    check_shape,
 )
 from tensorsim.geometry.camera import Pinhole, project
 from tensorsim.ops import of_person
@@ -331,16 +332,9 @@ def _check(keypoints: Tensor, scores: Tensor, boxes: Tensor, valid: Tensor) -> N
     """Refuse inputs that do not fit together."""
     check_points(keypoints, 4, 17, 2, "keypoints", "(..., P, T, 17, 2) COCO key points in pixels")
     frames = list(keypoints.shape[:-2])
-    for name, size, expected in (
-        ("scores", list(scores.shape), list(keypoints.shape[:-1])),
-        ("boxes", list(boxes.shape[:-1]), frames),
-        ("valid", list(valid.shape), frames),
-    ):
-        if size != expected:
-            raise TensorsimError(f"{name}: got shape {size}, expected {expected}")
-    check_size(boxes, -1, 4, "boxes", "(..., P, T, 4) xyxy pixels")
-    if valid.dtype != torch.bool:
-        raise TensorsimError(f"valid: got {valid.dtype}, expected bool")
+    check_shape(scores, list(keypoints.shape[:-1]), "scores")
+    check_shape(boxes, frames + [4], "boxes")  # noqa: RUF005 (TorchScript)
+    check_mask(valid, frames, "valid")
     if keypoints.shape[-3] < 1:
         raise TensorsimError(f"keypoints: got shape {list(keypoints.shape)}, expected at least 1 frame")
     for name, values in (("keypoints", keypoints), ("scores", scores), ("boxes", boxes)):

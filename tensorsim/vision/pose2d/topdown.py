@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import MIRRORED
 from tensorsim.config import COCO_KEYPOINTS
-from tensorsim.errors import TensorsimError, check_finite, check_rank, check_size, is_exporting
+from tensorsim.errors import TensorsimError, check_finite, check_mask, check_rank, check_size, is_exporting
 from tensorsim.vision.pose2d.crops import BoxCrop, check_boxes, crop_to_image
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 
@@ -135,11 +135,7 @@ class TopDownPose(nn.Module):
             raise TensorsimError(
                 f"TopDownPose: got boxes for {boxes.shape[0]} images, expected for {images.shape[0]}"
             )
-        if valid.dtype != torch.bool or valid.shape != boxes.shape[:2]:
-            raise TensorsimError(
-                f"TopDownPose valid: got {valid.dtype} of shape {list(valid.shape)}, "
-                f"expected bool of shape {list(boxes.shape[:2])}, one per box"
-            )
+        check_mask(valid, list(boxes.shape[:2]), "TopDownPose valid")
         people = boxes[valid]
         check_boxes(people, "TopDownPose boxes")
         image_of = valid.nonzero()[:, 0]

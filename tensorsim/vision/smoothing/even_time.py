@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_rank
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_shape
 from tensorsim.types import Tracks
 
 
@@ -38,10 +38,8 @@ def to_even_time(
     """
     clips, frames = tracks.valid.shape[0], tracks.valid.shape[2]
     check_floating(times_s, "times_s")
-    check_rank(times_s, 2, "times_s", "(B, T) seconds")
+    check_shape(times_s, [clips, frames], "times_s")
     check_finite(times_s, "times_s")
-    if times_s.shape[0] != clips or times_s.shape[1] != frames:
-        raise TensorsimError(f"times_s: got shape {list(times_s.shape)}, expected [{clips}, {frames}]")
     if bool((times_s.diff(dim=1) <= 0).any()):
         raise TensorsimError("times_s: got times that do not increase from frame to frame, expected them to")
     since = (times_s - times_s[:, :1]).to(keypoints.device, torch.float64)

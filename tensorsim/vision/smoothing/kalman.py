@@ -17,6 +17,7 @@ from tensorsim.errors import (
     TensorsimError,
     check_finite,
     check_floating,
+    check_mask,
     check_min_rank,
     check_positive,
     check_size,
@@ -256,10 +257,7 @@ class KalmanSmoother(nn.Module):
             raise TensorsimError(f"joints: got shape {list(joints.shape)}, expected at least one frame")
         if valid is None:
             valid = torch.ones(joints.shape[:-1], dtype=torch.bool, device=joints.device)
-        if valid.dtype != torch.bool or valid.shape != joints.shape[:-1]:
-            raise TensorsimError(
-                f"valid: got {valid.dtype} of {list(valid.shape)}, expected bool of {list(joints.shape[:-1])}"
-            )
+        check_mask(valid, list(joints.shape[:-1]), "valid")
         check_finite(torch.where(valid.unsqueeze(-1), joints, 0.0), "joints where valid")
         tracks, seen = joints.transpose(-2, -3), valid.transpose(-1, -2)
         r = self._measurement_noise(tracks, seen, noise_std_m)

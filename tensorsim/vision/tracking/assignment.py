@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_rank
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_mask, check_rank
 
 
 def assign(cost: Tensor, allowed: Tensor, unassigned_cost: float) -> Tensor:
@@ -34,10 +34,7 @@ def assign(cost: Tensor, allowed: Tensor, unassigned_cost: float) -> Tensor:
     """
     check_floating(cost, "cost")
     check_rank(cost, 2, "cost", "(n, m)")
-    if allowed.dtype != torch.bool or allowed.shape != cost.shape:
-        raise TensorsimError(
-            f"allowed: got {allowed.dtype} of {list(allowed.shape)}, expected bool of {list(cost.shape)}"
-        )
+    check_mask(allowed, list(cost.shape), "allowed")
     if not math.isfinite(unassigned_cost):
         raise TensorsimError(f"unassigned_cost: got {unassigned_cost}, expected a finite number")
     check_finite(torch.where(allowed, cost, 0.0), "cost where allowed")

@@ -89,7 +89,10 @@ class TestBoneFit(StageTester):
             ((joints[..., :13, :], seen), r"expected \(\.\.\., P, T, 14, 3\)"),
             ((joints[..., :2], seen), r"expected \(\.\.\., P, T, 14, 3\)"),
             ((joints * float("nan"), seen), "joints: got NaN"),
-            ((joints, seen[..., :3]), r"seen: got torch.bool of \[2, 7, 3\], expected bool of \[2, 7, 14\]"),
+            (
+                (joints, seen[..., :3]),
+                r"got torch.bool of shape \[2, 7, 3\], expected bool of shape \[2, 7, 14\]",
+            ),
             ((joints, seen.float()), "seen: got torch.float32"),
         ]
 
