@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tensorsim.exceptions import TensorsimError as TensorsimError
 from tensorsim.exceptions import TensorsimWarning as TensorsimWarning
+from tensorsim.exceptions import check_count as check_count
 from tensorsim.exceptions import check_positive as check_positive
 from tensorsim.exceptions import collected_warnings as collected_warnings
 from tensorsim.exceptions import first_line as first_line
@@ -246,12 +247,6 @@ def check_interval(value: object, least: float, most: float, name: str) -> None:
     if len(numbers) != 2 or not least <= numbers[0] <= numbers[1] <= most:
         within = f"within {least} to {most}" if math.isfinite(most) else f"from {least} or more"
         raise TensorsimError(f"{name}: got {value!r}, expected an ascending range {within}")
-
-
-def check_count(value: int, least: int, most: int, name: str) -> None:
-    """Refuse what is no integer from ``least`` to ``most``."""
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise TensorsimError(f"{name}: got {value}, expected an integer from {least} to {most}")
 
 
 def check_per_person(values: object, name: str) -> None:

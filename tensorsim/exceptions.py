@@ -1,9 +1,11 @@
 """Exceptions of tensorsim, without torch: the command line says what is wrong with its options before it loads that."""
 
+import math
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from numbers import Integral
 from typing import Any
 
 
@@ -19,6 +21,15 @@ def check_positive(value: float, name: str) -> None:
     """Refuse a number that is not finite and above zero."""
     if not (value > 0.0 and value < float("inf")):
         raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
+
+
+def check_count(value: object, name: str, least: int = 1, most: float = math.inf) -> int:
+    """The integer ``value`` from ``least`` to ``most`` as Python's own; anything else, also a bool, is refused."""
+    count = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
+    if count is None or not least <= count <= most:
+        within = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
+        raise TensorsimError(f"{name}: got {value!r}, expected an integer {within}")
+    return count
 
 
 def first_line(error: BaseException) -> str:

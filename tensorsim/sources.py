@@ -16,7 +16,7 @@ from tensorsim.data.coco import Keypoints2D
 from tensorsim.data.motion_files import load_motion, place
 from tensorsim.data.skeletons import Motion
 from tensorsim.data.video import VideoReader
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import TensorsimError, check_count, check_positive
 from tensorsim.geometry.framing import camera_on, keypoint_boxes, seen_keypoints
 from tensorsim.pipeline import VideoToPose
 from tensorsim.pipeline.reach import NEAREST_M
@@ -90,8 +90,7 @@ class Cut(NamedTuple):
         Raises:
             TensorsimError: a stride below 1, an end that is not above the start, or fewer than 2 frames left.
         """
-        if self.stride < 1:
-            raise TensorsimError(f"stride: got {self.stride}, expected 1 or more")
+        check_count(self.stride, "stride")
         start = 0.0 if self.start_s is None else self.start_s
         end = math.inf if self.end_s is None else self.end_s
         if not 0 <= start < end:

@@ -1,16 +1,18 @@
 """Every stage refuses what it cannot use: types, layouts, dtypes, values; quickly."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 import tensorsim as ts
 from tensorsim.body.skeleton import body_to_coco
-from tensorsim.errors import TensorsimError, check_finite, check_tensor
+from tensorsim.errors import TensorsimError, check_count, check_finite, check_tensor
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
 
 RADAR = ts.RadarConfig.through_wall()
@@ -124,3 +126,12 @@ def test_counts_without_end_are_refused_at_once() -> None:
         with pytest.raises(TensorsimError, match="got"):
             make()
     assert time.process_time() - start < 1.0
+
+
+def test_counts_are_integers_and_become_pythons() -> None:
+    assert type(check_count(np.int64(3), "x", 3, 3)) is int
+    for value in (True, 2.5, "2", 0, np.bool_(True), math.nan):
+        with pytest.raises(TensorsimError, match=r"^x: got .*, expected an integer of at least 1$"):
+            check_count(value, "x")
+    with pytest.raises(TensorsimError, match=r"^x: got 7, expected an integer from 2 to 6$"):
+        check_count(7, "x", 2, 6)

@@ -448,8 +448,8 @@ def test_refuses_bad_intervals() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"frames_per_batch": "8"}, "frames_per_batch: got '8', expected an integer from 1"),
-        ({"detection_interval": 2.5}, r"detection_interval: got 2\.5, expected an integer from 1"),
+        ({"frames_per_batch": "8"}, "frames_per_batch: got '8', expected an integer of at least 1"),
+        ({"detection_interval": 2.5}, r"detection_interval: got 2\.5, expected an integer of at least 1"),
         ({"fewest_joints": 15}, "fewest_joints: got 15, expected an integer from 1 to 14"),
         ({"keypoint_threshold": 2.0}, r"keypoint_threshold: got 2\.0, expected a score in \(0, 1\)"),
         ({"person_height_m": 1.75}, r"person_height_m: got 1\.75, expected a tuple of one number per person"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tensorsim.commands.arguments import Option
-from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
 
 if TYPE_CHECKING:
     from tensorsim.data.sets.engines import Engine
@@ -41,8 +41,7 @@ class DatasetBuild:
 
     def run(self) -> None:
         """Do it."""
-        if self.workers < 1:
-            raise TensorsimError(f"--workers: got {self.workers}, expected at least 1")
+        check_count(self.workers, "--workers")
         if self.address is not None and self.engine != "ray":
             raise TensorsimError("--address: got one without --engine ray, expected both")
         if self.out.exists() and not self.out.is_dir():

@@ -5,7 +5,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_count
 
 if TYPE_CHECKING:
     from tensorsim.evaluation.camera import CameraErrors
@@ -46,8 +46,7 @@ class EvaluateCamera:
             raise TensorsimError(
                 "evaluate camera: got no tilt, height or field of view, expected at least one each"
             )
-        if self.walks < 1:
-            raise TensorsimError(f"walks: got {self.walks}, expected at least 1")
+        check_count(self.walks, "walks")
 
         from tensorsim.evaluation import camera as cameras
 

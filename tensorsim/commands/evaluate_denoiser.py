@@ -6,7 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_count
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,7 @@ class EvaluateDenoiser:
         check_seed(self.seed)
         counts = {"--clips": self.clips, "--scenes": len(self.scenes), "--snr": len(self.snr)}
         for name, count in counts.items():
-            if count < 1:
-                raise TensorsimError(f"{name}: got {count}, expected at least 1")
+            check_count(count, name)
         if self.out is not None and (self.out.is_dir() or not self.out.parent.is_dir()):
             raise TensorsimError(
                 f"--out: got {self.out}, expected the name of a file in a folder that is there"

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
-from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +57,7 @@ class EvaluateFilms(NetworkOptions):
         check_seed(self.seed)
         if self.out.exists() and not self.out.is_dir():
             raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
-        if self.stride < 1:
-            raise TensorsimError(f"--stride: got {self.stride}, expected 1 or more")
+        check_count(self.stride, "--stride")
         if len(self.scenes) == 0:
             raise TensorsimError("--scenes: got none, expected at least one")
         networks = default_networks(self.detector, self.pose)

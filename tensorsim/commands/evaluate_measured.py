@@ -6,7 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_count
 from tensorsim.files import complete_file, write_json
 
 
@@ -45,8 +45,7 @@ class EvaluateMeasured:
         """Do it."""
         check_seed(self.seed)
         for name, count in (("--clips", self.clips), ("--steps", self.steps), ("--repeats", self.repeats)):
-            if count < 1:
-                raise TensorsimError(f"{name}: got {count}, expected at least 1")
+            check_count(count, name)
         if self.out.exists() and not self.out.is_dir():
             raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
         folders = [self.train] if self.test is None else [self.train, self.test]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from tensorsim.commands.arguments import Option
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_count
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,7 @@ class RunExperiment:
         for option, folder in (("--out", self.out), ("--cache", self.cache)):
             if folder is not None and folder.exists() and not folder.is_dir():
                 raise TensorsimError(f"{option}: {folder} is a file, expected a folder")
-        if self.jobs < 1:
-            raise TensorsimError(f"--jobs: got {self.jobs}, expected at least 1")
+        check_count(self.jobs, "--jobs")
         config = configuration(self.name, self.quick, self.config, self._settings())
         work = Work(self.out / "work" if self.cache is None else self.cache, self.jobs, self.quiet)
         report = run_experiment(self.name, self.out, config, work)

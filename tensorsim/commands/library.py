@@ -8,7 +8,7 @@ import tyro
 
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_count
 
 #: What motion files are called.
 SUFFIXES = (".bvh", ".npz")
@@ -45,8 +45,8 @@ class BuildLibrary:
         check_seed(self.seed)
         if self.generate < 0:
             raise TensorsimError(f"--generate: got {self.generate}, expected a number of poses")
-        if self.most is not None and self.most < 1:
-            raise TensorsimError(f"--most: got {self.most}, expected at least 1")
+        if self.most is not None:
+            check_count(self.most, "--most")
         if self.out.suffix != ".safetensors" or self.out.is_dir():
             raise TensorsimError(f"--out: got {self.out}, expected the name of a .safetensors file")
 

@@ -2,10 +2,10 @@
 
 import dataclasses
 import math
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any, get_args
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.limits import check_range
 
 Vector = tuple[float, float, float]
@@ -80,12 +80,8 @@ def require_choices(config: Any, **choices: Any) -> None:
             )
 
 
-def require_counts(config: Any, *names: str) -> None:
-    """Refuse fields of a configuration that are not integers of at least 1; those of NumPy become Python's."""
+def require_counts(config: Any, *names: str, least: int = 1, most: float = math.inf) -> None:
+    """Refuse fields that are not integers from ``least`` to ``most``; integers of NumPy become Python's."""
     for name in names:
-        value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-            raise TensorsimError(
-                f"{type(config).__name__}.{name}: got {value!r}, expected an integer of at least 1"
-            )
-        object.__setattr__(config, name, int(value))
+        value = check_count(getattr(config, name), f"{type(config).__name__}.{name}", least, most)
+        object.__setattr__(config, name, value)

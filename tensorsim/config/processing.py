@@ -10,7 +10,7 @@ from tensorsim.config.checks import (
     require_counts,
     require_positive,
 )
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.errors import TensorsimError
 
 RangeWindow = Literal["hamming", "hann", "blackman"]
 Mti = Literal["two-pulse", "n-pulse", "mean", "high-pass"]
@@ -67,8 +67,8 @@ class ProcessingConfig:
             require_choices(self, range_window=RangeWindow)
         if self.engine not in ("time", "range-bins"):
             raise TensorsimError(f"engine: got {self.engine!r}, expected 'time' or 'range-bins'")
-        require_counts(self, "ridge_count", "pulse_chunk", "energy_stride")
-        check_count(self.ridge_count, 1, 6, "ProcessingConfig.ridge_count")
+        require_counts(self, "ridge_count", most=6)
+        require_counts(self, "pulse_chunk", "energy_stride")
         require_positive("ProcessingConfig", window_s=self.window_s)
         if not (is_finite(self.overlap) and 0 <= self.overlap < 1):
             raise TensorsimError(f"overlap: got {self.overlap!r}, expected a number in [0, 1)")

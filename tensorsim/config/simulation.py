@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from tensorsim.config.checks import require_counts
 from tensorsim.config.documents import from_document, suggestion, to_document
 from tensorsim.config.limited_yaml import dump_limited_yaml
 from tensorsim.config.people import PANEL_DISTANCES_M, PoseConfig, SmoothingConfig, TrackerConfig
@@ -57,10 +58,7 @@ class SimulationConfig:
                     f"SimulationConfig.{name}: got {getattr(self, name)!r}, expected a {kind.__name__}"
                 )
         self.scene.check_engine(self.processing.engine)
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
-            raise TensorsimError(
-                f"SimulationConfig.seed: got {self.seed!r}, expected an integer from 0 to 2^32 - 1"
-            )
+        require_counts(self, "seed", least=0, most=2**32 - 1)
 
     @classmethod
     def free_space(cls) -> "SimulationConfig":

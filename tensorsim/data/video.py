@@ -313,8 +313,6 @@ def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: i
     if fps is not None:
         check_positive(fps, "fps")
         check_range(fps, "frame rate", "fps")
-    if stride < 1:
-        raise TensorsimError(f"stride: got {stride}, expected 1 or more")
     check_range(stride, "stride", "stride")
     if not 0 <= start_s < math.inf:
         raise TensorsimError(f"start_s: got {start_s}, expected a number of seconds from 0 on")

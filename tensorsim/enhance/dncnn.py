@@ -51,8 +51,8 @@ class DnCNN(nn.Module):
 
     def __init__(self, depth: int = 20, channels: int = 64, batch_norm: bool = True) -> None:
         super().__init__()
-        check_count(depth, 2, MAX_DEPTH, "DnCNN depth")
-        check_count(channels, 1, MAX_CHANNELS, "DnCNN channels")
+        check_count(depth, "DnCNN depth", 2, MAX_DEPTH)
+        check_count(channels, "DnCNN channels", 1, MAX_CHANNELS)
         self.depth = depth
         self.reach = depth
         self.channels = channels
@@ -183,8 +183,7 @@ class MapDenoiser(nn.Module):
 
     def __init__(self, network: DnCNN | PeronaMalik, tile: int = 1024, scale: str = "peak") -> None:
         super().__init__()
-        if tile < 1:
-            raise TensorsimError(f"MapDenoiser.tile: got {tile} columns, expected at least 1")
+        check_count(tile, "MapDenoiser.tile")
         if scale not in SCALES:
             raise TensorsimError(f"MapDenoiser.scale: got {scale!r}, expected one of {SCALES}")
         self.network = network

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_floating,
     check_min_rank,
@@ -86,8 +87,7 @@ def ksvd_denoise(
     check_rank(image, 2, "ksvd_denoise", "(H, W)")
     check_finite(image, "ksvd_denoise")
     for name, number in (("side", side), ("iterations", iterations), ("training_patches", training_patches)):
-        if number < 1:
-            raise TensorsimError(f"ksvd_denoise: got {name} {number}, expected at least 1")
+        check_count(number, f"ksvd_denoise.{name}")
     if sigma is not None and not 0 <= sigma < math.inf:
         raise TensorsimError(f"ksvd_denoise: got sigma {sigma}, expected a finite number >= 0 or None")
     if min(image.shape) < side:

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_floating,
     check_min_rank,
@@ -57,8 +58,7 @@ class PeronaMalik(nn.Module):
 
     def __init__(self, iterations: int = 5, threshold: float = 0.1, conductance: str = "exponential") -> None:
         super().__init__()
-        if iterations < 1:
-            raise TensorsimError(f"PeronaMalik.iterations: got {iterations}, expected at least 1")
+        check_count(iterations, "PeronaMalik.iterations")
         check_positive(threshold, "PeronaMalik.threshold")
         if conductance not in CONDUCTANCES:
             raise TensorsimError(

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import PoseConfig
 from tensorsim.config.people import Lifting
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_count
 from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captured_clips
 from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
@@ -140,8 +140,7 @@ class TruthLoop:
             "jobs": self.jobs,
         }
         for name, count in counts.items():
-            if count < 1:
-                raise TensorsimError(f"{name}: got {count}, expected at least 1")
+            check_count(count, name)
         if "c" in self.sources and (self.detector is None or self.pose is None):
             raise TensorsimError("setting c: got no networks, expected a detector and a pose network")
 

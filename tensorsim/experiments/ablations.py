@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES, SceneConfig, SimulationConfig
 from tensorsim.enhance.choice import DENOISERS, map_denoiser
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_count
 from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
@@ -199,8 +199,7 @@ class DenoiserConfig:
             "columns": self.columns,
         }
         for what, count in counts.items():
-            if count < 1:
-                raise TensorsimError(f"{what}: got {count}, expected at least 1")
+            check_count(count, what)
 
 
 def denoiser_report(config: DenoiserConfig, work: Work) -> Report:

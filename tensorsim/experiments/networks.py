@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.experiments import figures
 from tensorsim.experiments.pictures import INPUTS
 from tensorsim.experiments.trials import Trial, run_trials
@@ -107,8 +107,7 @@ def check_trainings(networks: Sequence[str], scenes: Sequence[str], seeds: int) 
         if scene not in SCENES:
             raise TensorsimError(f"scenes: got {scene!r}, expected one of {', '.join(SCENES)}")
     for what, count in (("networks", len(networks)), ("scenes", len(scenes)), ("seeds", seeds)):
-        if count < 1:
-            raise TensorsimError(f"{what}: got {count}, expected at least 1")
+        check_count(count, what)
 
 
 def protocol(clips: int, test_clips: int, size: int, epochs: int, seeds: int) -> str:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.evaluation.labelled_films import read_labels
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
 from tensorsim.evaluation.measured.training import fit_pictures, predict, square
@@ -76,8 +76,7 @@ class RealConfig:
             ("seeds", self.seeds, 1), ("film_seeds", self.film_seeds, 1), ("groups", self.groups, 5),
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
-            if count < least:
-                raise TensorsimError(f"{what}: got {count}, expected at least {least}")
+            check_count(count, what, least)
         if self.size < 32 or self.size % 16:
             raise TensorsimError(f"size: got {self.size}, expected a multiple of 16, at least 32")
         if self.films and self.size not in (32, 64):

@@ -12,7 +12,7 @@ from tensorsim.body.kinematics import forward_kinematics, rotation
 from tensorsim.body.proportions import ANKLE_HEIGHT, FLESH, Proportions
 from tensorsim.body.skeleton import mirror
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import TensorsimError, check_count, check_positive
 from tensorsim.motion.act import Act
 from tensorsim.motion.feet import LEFT_LEG, RIGHT_LEG, place_ankles
 from tensorsim.motion.people import People, PeopleConfig, draw_people
@@ -217,8 +217,7 @@ class ActivityGenerator:
                     f"activity: got {activity!r}, expected a name, an index, or a tensor of indices"
                 )
             count = 1 if batch is None else batch
-            if count < 1:
-                raise TensorsimError(f"batch: got {count}, expected at least 1")
+            check_count(count, "batch")
             activity = torch.full((count,), int(activity), dtype=torch.int64)
         if activity.dtype not in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64) or (
             activity.dim() != 1 or activity.shape[0] == 0

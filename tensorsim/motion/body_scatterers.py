@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.proportions import ANKLE_HEIGHT, TRUNK
 from tensorsim.config import JOINTS, Vector
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import check_count, check_positive
 from tensorsim.motion.limb_scatterers import POINTS, SEGMENTS, TOES, bisector, toes_of, unit
 from tensorsim.motion.rough_surface import cylinder_rcs, patch_rcs, skin_reflectivity
 from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
@@ -130,8 +130,7 @@ class BodyScatterers(nn.Module):
         check_antenna("rx_m", rx_m)
         check_positive(carrier_hz, "carrier_hz")
         check_positive(height_m, "height_m")
-        if per_segment < 1:
-            raise TensorsimError(f"per_segment: got {per_segment}, expected at least 1")
+        check_count(per_segment, "per_segment", 1, 1000)
         self.per_segment = per_segment
         self.points_per_person = 1 + 10 * per_segment + ROWS * COLUMNS
         self.toes_m = TOES * height_m

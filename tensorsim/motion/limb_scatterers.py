@@ -148,7 +148,7 @@ class LimbScatterers(nn.Module):
         check_antenna("tx_m", tx_m)
         check_antenna("rx_m", rx_m)
         check_positive(height_m, "height_m")
-        check_count(per_segment, 1, 1000, "per_segment")
+        check_count(per_segment, "per_segment", 1, 1000)
         if not 0 < reflectivity <= 1:
             raise TensorsimError(f"reflectivity: got {reflectivity}, expected above 0, at most 1")
         self.toes_m = TOES * height_m

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tensorsim.body.proportions import Proportions
 from tensorsim.config.checks import is_finite
-from tensorsim.errors import TensorsimError, check_interval, check_positive
+from tensorsim.errors import TensorsimError, check_count, check_interval, check_positive
 
 #: Numbers of a movement (angles, moments) that vary from person to person, at most.
 VARIED_NUMBERS = 24
@@ -143,8 +143,7 @@ def nominal_people(count: int, height_m: float = 1.75, speed_m_s: float = 1.1) -
     Raises:
         TensorsimError: a count below 1, a height or a speed that is not positive.
     """
-    if count < 1:
-        raise TensorsimError(f"nominal_people: got count {count}, expected at least 1")
+    check_count(count, "nominal_people.count")
     check_positive(height_m, "height_m")
     check_positive(speed_m_s, "speed_m_s")
 
@@ -173,8 +172,7 @@ def draw_people(count: int, config: PeopleConfig, generator: torch.Generator) ->
     Raises:
         TensorsimError: a count below 1.
     """
-    if count < 1:
-        raise TensorsimError(f"draw_people: got count {count}, expected at least 1")
+    check_count(count, "draw_people.count")
 
     def uniform(low: float, high: float, *tail: int) -> Tensor:
         return low + (high - low) * torch.rand(count, *tail, generator=generator, dtype=torch.float64)

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.proportions import SHANK, THIGH
 from tensorsim.config import JOINTS
-from tensorsim.errors import TensorsimError, check_points, check_positive
+from tensorsim.errors import check_count, check_points, check_positive
 from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
@@ -57,8 +57,7 @@ class PosturalSway(nn.Module):
     ) -> None:
         super().__init__()
         check_positive(rate_hz, "rate_hz")
-        if people < 1:
-            raise TensorsimError(f"people: got {people}, expected at least 1")
+        check_count(people, "people")
         self.rate_hz, self.people, self.mass_height_m = float(rate_hz), people, MASS_HEIGHT_M
         self.forwards = RandomProcess(sway_spectrum, BAND_HZ, forward_rms_m, people, 2 * seed)
         self.sideways = RandomProcess(sway_spectrum, BAND_HZ, sideways_rms_m, people, 2 * seed + 1)

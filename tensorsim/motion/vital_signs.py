@@ -6,7 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import JOINTS
-from tensorsim.errors import TensorsimError, check_floating, check_interval, check_points, check_positive
+from tensorsim.errors import (
+    check_count,
+    check_floating,
+    check_interval,
+    check_points,
+    check_positive,
+)
 from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 
@@ -62,8 +68,7 @@ class VitalSigns(nn.Module):
         ranges = {"breath_m": breath_m, "breath_hz": breath_hz, "heart_m": heart_m, "heart_hz": heart_hz}
         for name, bounds in ranges.items():
             check_interval(bounds, 0, math.inf, name)
-        if people < 1:
-            raise TensorsimError(f"people: got {people}, expected at least 1")
+        check_count(people, "people")
         generator = torch.Generator().manual_seed(seed)
         draw = torch.rand(3, 2, people, generator=generator, dtype=torch.float64)
         both = torch.tensor(((breath_m, heart_m), (breath_hz, heart_hz)), dtype=torch.float64)

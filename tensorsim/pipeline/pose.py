@@ -1,7 +1,6 @@
 """Video -> people with smooth 3D joints: detection, tracking, 2D pose, lifting, position, smoothing."""
 
 import copy
-from numbers import Integral
 from typing import Final
 
 import torch
@@ -84,13 +83,9 @@ class VideoToPose(nn.Module):
         bone_fit: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        for name, value in (
-            ("detection_interval", detection_interval),
-            ("frames_per_batch", frames_per_batch),
-        ):
-            if not isinstance(value, Integral) or value < 1:
-                raise TensorsimError(f"{name}: got {value!r}, expected an integer from 1")
-        check_count(fewest_joints, 1, 14, "fewest_joints")
+        self.detection_interval = check_count(detection_interval, "detection_interval")
+        self.frames_per_batch = check_count(frames_per_batch, "frames_per_batch")
+        self.fewest_joints = check_count(fewest_joints, "fewest_joints", 1, 14)
         if not 0 < keypoint_threshold < 1:
             raise TensorsimError(f"keypoint_threshold: got {keypoint_threshold}, expected a score in (0, 1)")
         self.detector = check_part(detector, "detector")
@@ -123,8 +118,6 @@ class VideoToPose(nn.Module):
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.hidden_legs = HiddenLegs()
         self.keypoint_threshold = keypoint_threshold
-        self.detection_interval = int(detection_interval)
-        self.fewest_joints = fewest_joints
         self.brief_gap_s = brief_gap_s
         #: Who is hidden for longer is gone until they are seen again.
         self.longest_gap_s = 1.0
@@ -136,7 +129,6 @@ class VideoToPose(nn.Module):
         self.top_speed_m_s = 12.0
         #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
         self.least_score = 0.5
-        self.frames_per_batch = int(frames_per_batch)
 
     @classmethod
     def from_config(

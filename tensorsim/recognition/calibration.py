@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating
+from tensorsim.errors import TensorsimError, check_count, check_finite, check_floating
 
 
 def _check(logits: Tensor, labels: Tensor) -> None:
@@ -86,8 +86,7 @@ def reliability(probabilities: Tensor, labels: Tensor, bins: int = 10) -> Reliab
             than one bin.
     """
     _check(probabilities, labels)
-    if bins < 1:
-        raise TensorsimError(f"bins: got {bins}, expected at least 1")
+    check_count(bins, "bins")
     if bool(((probabilities < 0) | (probabilities > 1 + 1e-5)).any()):
         raise TensorsimError(
             f"probabilities: got {float(probabilities.min()):.4g} to {float(probabilities.max()):.4g}, expected 0 to 1"

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_floating,
     check_min_rank,
@@ -100,8 +101,7 @@ class MapToImage(nn.Module):
             raise TensorsimError(
                 f"MapToImage.span: got {span}, expected two finite numbers, the lower one first"
             )
-        if size < 1:
-            raise TensorsimError(f"MapToImage.size: got {size}, expected at least 1")
+        check_count(size, "MapToImage.size")
         if scale not in SCALES:
             raise TensorsimError(f"MapToImage.scale: got {scale!r}, expected one of {SCALES}")
         check_positive(range_db, "MapToImage.range_db")

@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader, Dataset, default_collate
 from tqdm import tqdm
 
 from tensorsim.device import rank_and_processes, usable_device
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.files import complete_file
 from tensorsim.weights import save_weights
 
@@ -112,8 +112,7 @@ class LoopConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every", "validate_every", "log_every"):
-            if getattr(self, name) < 1:
-                raise TensorsimError(f"LoopConfig: got {name} {getattr(self, name)}, expected at least 1")
+            check_count(getattr(self, name), f"LoopConfig.{name}")
         if self.workers < 0:
             raise TensorsimError(f"LoopConfig: got workers {self.workers}, expected at least 0")
         if not 0 <= self.ema_decay < 1:

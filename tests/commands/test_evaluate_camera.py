@@ -41,4 +41,6 @@ def test_no_camera_is_refused(options: str, capsys: pytest.CaptureFixture[str]) 
         cli.main(f"evaluate camera {options}".split())
     assert stop.value.code == 2
     message = capsys.readouterr().err
-    assert "evaluate camera: got no" in message or "walks: got 0, expected at least 1" in message
+    assert (
+        "evaluate camera: got no" in message or "walks: got 0, expected an integer of at least 1" in message
+    )

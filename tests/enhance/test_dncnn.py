@@ -290,7 +290,7 @@ def test_refuses_bad_settings() -> None:
     ):
         with pytest.raises(TensorsimError, match=f"DnCNN {message}, expected an integer from"):
             DnCNN(*arguments)
-    with pytest.raises(TensorsimError, match="tile: got 0 columns"):
+    with pytest.raises(TensorsimError, match="tile: got 0, expected an integer"):
         MapDenoiser(small(), tile=0)
     with pytest.raises(TensorsimError, match="scale: got 'sqrt', expected one of"):
         MapDenoiser(small(), scale="sqrt")

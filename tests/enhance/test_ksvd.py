@@ -65,8 +65,8 @@ def test_a_map_has_no_gradient() -> None:
         ({"image": torch.zeros(12, 12), "atoms": 60}, "got 60 atoms, expected a square number"),
         ({"image": torch.zeros(12, 12), "sigma": -1.0}, "got sigma -1.0, expected a finite number >= 0"),
         ({"image": torch.zeros(12, 12), "sigma": float("nan")}, "got sigma nan"),
-        ({"image": torch.zeros(12, 12), "side": 0}, "got side 0, expected at least 1"),
-        ({"image": torch.zeros(12, 12), "iterations": 0}, "got iterations 0"),
+        ({"image": torch.zeros(12, 12), "side": 0}, "side: got 0, expected an integer of at least 1"),
+        ({"image": torch.zeros(12, 12), "iterations": 0}, "iterations: got 0"),
     ],
 )
 def test_refuses_bad_input(arguments: dict[str, Any], message: str) -> None:

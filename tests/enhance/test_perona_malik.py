@@ -86,7 +86,7 @@ def test_brightness_is_kept() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"iterations": 0}, "got 0, expected at least 1"),
+        ({"iterations": 0}, "got 0, expected an integer of at least 1"),
         ({"threshold": 0.0}, "expected a positive finite number"),
         ({"conductance": "tukey"}, "got 'tukey', expected one of"),
     ],

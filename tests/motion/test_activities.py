@@ -476,7 +476,7 @@ def test_people_do_not_depend_on_the_default_dtype() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((0,), "count 0"), ((1, -1.0), "height_m: got -1.0"), ((1, 1.7, 0.0), "speed_m_s: got 0.0")],
+    [((0,), "count: got 0"), ((1, -1.0), "height_m: got -1.0"), ((1, 1.7, 0.0), "speed_m_s: got 0.0")],
 )
 def test_nominal_people_refuses(arguments: tuple[Any, ...], message: str) -> None:
     with pytest.raises(TensorsimError, match=message):
@@ -489,7 +489,7 @@ def test_only_names_have_an_index() -> None:
 
 
 def test_nobody_cannot_be_drawn() -> None:
-    with pytest.raises(TensorsimError, match="got count 0"):
+    with pytest.raises(TensorsimError, match="count: got 0"):
         draw_people(0, PeopleConfig(), torch.Generator())
 
 

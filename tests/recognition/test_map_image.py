@@ -154,7 +154,7 @@ def test_ridges_as_a_map() -> None:
         ({"axis": torch.zeros(4)}, "expected .* ascending"),
         ({"axis": torch.tensor([0.0, 1.0, 5.0])}, "axis: got steps from 1 to 4, expected equal ones"),
         ({"span": (1.0, 1.0)}, "the lower one first"),
-        ({"size": 0}, "got 0, expected at least 1"),
+        ({"size": 0}, "got 0, expected an integer of at least 1"),
         ({"scale": "log"}, "got 'log', expected one of"),
         ({"range_db": 0.0}, "expected a positive finite number"),
     ],

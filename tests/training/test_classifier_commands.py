@@ -81,6 +81,6 @@ def test_refuses_before_anything_is_made(options: dict[str, Any], message: str, 
 def test_refuses_a_batch_of_nothing_before_maps_are_made(tmp_path: Path) -> None:
     mine = command(tmp_path)
     object.__setattr__(mine, "batch", 0)
-    with pytest.raises(TensorsimError, match="got batch 0, expected at least 1"):
+    with pytest.raises(TensorsimError, match="batch: got 0, expected an integer of at least 1"):
         mine.run()
     assert not list(tmp_path.iterdir())

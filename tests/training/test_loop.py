@@ -195,7 +195,7 @@ def test_processes_divide_each_batch_among_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps 0, expected at least 1"),
+        ({"steps": 0}, "steps: got 0, expected an integer of at least 1"),
         ({"ema_decay": 1.0}, "ema_decay 1.0"),
         ({"precision": "half"}, "precision 'half'"),
         ({"workers": -1}, "workers -1"),

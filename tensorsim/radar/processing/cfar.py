@@ -116,7 +116,7 @@ class CfarDetector(nn.Module):
             raise TensorsimError(f"CfarDetector.method: got {method!r}, expected one of {METHODS}")
         if any(edge not in EDGES for edge in edges):
             raise TensorsimError(f"CfarDetector.edges: got {edges}, expected two of {EDGES}")
-        check_count(looks, 1, 2**16, "looks")
+        check_count(looks, "looks")
         if looks > 1 and method == "ordered-statistic":
             raise TensorsimError(f"looks: got {looks} with the method {method!r}, expected 1")
         self.guard_rows, self.guard_columns = guard

@@ -105,7 +105,7 @@ class RidgeExtractor(nn.Module):
 
     def __init__(self, count: int = 3) -> None:
         super().__init__()
-        check_count(count, 1, 6, "count")
+        check_count(count, "count", 1, 6)
         self.count = count
         orders = torch.tensor(list(itertools.permutations(range(count))))
         self.register_buffer("orders", orders, persistent=False)
@@ -186,7 +186,7 @@ class PathRidgeExtractor(nn.Module):
     ) -> None:
         super().__init__()
         for name, value, least in (("count", count, 1), ("max_jump", max_jump, 1), ("band", band, 0)):
-            check_count(value, least, MAX_BINS, name)
+            check_count(value, name, least, MAX_BINS)
         check_positive(penalty_db, "penalty_db")
         check_positive(floor_db, "floor_db")
         self.count, self.band = count, band

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_min_rank, check_positive
+from tensorsim.errors import check_count, check_min_rank, check_positive
 from tensorsim.ops import safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.doppler import DopplerFrames
 
@@ -69,8 +69,7 @@ class SynchrosqueezedMap(DopplerFrames):
         super().__init__(radar, window_s, overlap)
         check_positive(threshold_db, "threshold_db")
         if hop is not None:
-            if hop < 1:
-                raise TensorsimError(f"hop: got {hop}, expected at least 1 pulse")
+            check_count(hop, "hop")
             self.hop = hop
             self.frame_rate_hz = self.prf_hz / hop
         self.threshold = 10 ** (-threshold_db / 20)

@@ -162,10 +162,9 @@ class RangeBinSynthesizer(nn.Module):
         energy_stride: int = 1,
     ) -> None:
         super().__init__()
-        check_count(energy_stride, 1, 2**31, "energy_stride")
-        self.energy_stride = energy_stride
+        self.energy_stride = check_count(energy_stride, "energy_stride")
         if near_bins is not None:
-            check_count(near_bins, 1, 2**31, "near_bins")
+            check_count(near_bins, "near_bins")
         if echo.paths.airy or echo.paths.has_array:
             raise TensorsimError(
                 "echo: got a wall with incidence 'airy' or several antennas, expected one antenna of each kind and "

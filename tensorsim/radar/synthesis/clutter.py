@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank
+from tensorsim.errors import TensorsimError, check_count, check_floating, check_min_rank
 from tensorsim.motion.random_process import RandomProcess
 
 Range = tuple[float, float]
@@ -58,8 +58,7 @@ class RoomClutter(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if count < 1:
-            raise TensorsimError(f"count: got {count}, expected at least 1")
+        check_count(count, "count")
         ranges = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "rcs_m2": rcs_m2}
         for name, (low, high) in ranges.items():
             if not -math.inf < low <= high < math.inf:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
-from tensorsim.errors import TensorsimError, check_scatterers, check_scene
+from tensorsim.errors import TensorsimError, check_count, check_scatterers, check_scene
 from tensorsim.ops import flatten_batch, unflatten_batch
 from tensorsim.radar.synthesis.dechirp import beat_sum, dispersed_sum
 from tensorsim.radar.synthesis.paths import Paths, PropagationPaths, Resonance, chosen_paths
@@ -101,8 +101,7 @@ class EchoSynthesizer(nn.Module):
         wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
-        if pulse_chunk < 1:
-            raise TensorsimError(f"pulse_chunk: got {pulse_chunk}, expected at least 1")
+        check_count(pulse_chunk, "pulse_chunk")
         names = chosen_paths(multipath, leakage, wall_echo, direct, floor is not None, paths)
         wall = place_wall(wall, radar)
         self.paths = PropagationPaths(

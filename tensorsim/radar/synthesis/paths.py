@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.ops import safe_sqrt
 from tensorsim.radar.synthesis.legs import TracedLegs, flipped, leg_length, mirror_image, passes_face
 from tensorsim.radar.synthesis.wall import wall_tensors
@@ -207,8 +207,7 @@ class PropagationPaths(TracedLegs):
             raise TensorsimError(
                 "wall_paths: got 'paper' with incidence 'airy', which sums all bounces; expected 'normal' or 'oblique'"
             )
-        if bounces < 1:
-            raise TensorsimError(f"bounces: got {bounces}, expected at least 1")
+        check_count(bounces, "bounces")
         self._shape_legs(radar, wall, incidence, polarization, floor, antenna)
         self.paper = wall_paths == "paper"
         self.attenuates = wall_attenuation

@@ -6,7 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_not_empty, check_rank, check_size, is_exporting
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_not_empty,
+    check_rank,
+    check_size,
+    is_exporting,
+)
 from tensorsim.geometry.boxes import (
     distances_to_boxes,
     letterbox,
@@ -75,8 +82,7 @@ class RTMDet(nn.Module):
                     f"RTMDet.{name}: got {getattr(self, name)}, expected a number from 0 to 1"
                 )
         for name in ("max_detections", "nms_pre"):
-            if getattr(self, name) < 1:
-                raise TensorsimError(f"RTMDet.{name}: got {getattr(self, name)}, expected at least 1")
+            check_count(getattr(self, name), f"RTMDet.{name}")
         if self.input_size < 32 or self.input_size % 32:
             raise TensorsimError(
                 f"RTMDet.input_size: got {self.input_size}, expected a positive multiple of 32"

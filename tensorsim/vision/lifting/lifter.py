@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_points,
     check_positive,
@@ -145,8 +146,7 @@ class NearestPoseLifter(nn.Module):
         super().__init__()
         poses = load_pose_library() if library is None else standardise_poses(library)
         for name, value in (("yaws", yaws), ("neighbours", neighbours), ("chunk", chunk)):
-            if value < 1:
-                raise TensorsimError(f"NearestPoseLifter.{name}: got {value}, expected at least 1")
+            check_count(value, f"NearestPoseLifter.{name}")
         if neighbours > poses.shape[0] * yaws:
             raise TensorsimError(
                 f"NearestPoseLifter.neighbours: got {neighbours}, expected at most "

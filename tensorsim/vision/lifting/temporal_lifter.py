@@ -112,7 +112,7 @@ class TemporalLifter(nn.Module):
     ) -> None:
         super().__init__()
         check_positive(keypoint_threshold, "TemporalLifter.keypoint_threshold")
-        check_count(frames_per_block, 1, 2**31, "TemporalLifter.frames_per_block")
+        check_count(frames_per_block, "TemporalLifter.frames_per_block")
         check_per_person(person_height_m, "TemporalLifter.person_height_m")
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block

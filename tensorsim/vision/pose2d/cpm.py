@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tensorsim.config import COCO_KEYPOINTS
-from tensorsim.errors import TensorsimError, check_floating, check_rank, check_size
+from tensorsim.errors import TensorsimError, check_count, check_floating, check_rank, check_size
 from tensorsim.vision.pose2d.hrnet import IMAGENET_MEAN, IMAGENET_STD, normalise
 
 
@@ -109,8 +109,7 @@ class CPM(nn.Module):
 
     def __init__(self, stages: int = 6, input_size: tuple[int, int] = (256, 192), width: int = 128) -> None:
         super().__init__()
-        if stages < 1:
-            raise TensorsimError(f"CPM: got {stages} stages, expected at least 1")
+        check_count(stages, "CPM.stages")
         if len(input_size) != 2 or not all(n > 0 and n % 8 == 0 for n in input_size):
             raise TensorsimError(f"CPM: got input_size {input_size}, expected (H, W), multiples of 8")
         if width < 4 or width % 4:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_floating, check_min_rank, check_positive
+from tensorsim.errors import TensorsimError, check_count, check_floating, check_min_rank, check_positive
 
 METHODS = ("expected", "dark", "quarter")
 
@@ -231,8 +231,7 @@ class HeatmapDecoder(nn.Module):
             raise TensorsimError(
                 f"HeatmapDecoder: got kernel_size {kernel_size}, expected a positive odd number"
             )
-        if stride < 1:
-            raise TensorsimError(f"HeatmapDecoder: got stride {stride}, expected at least 1")
+        check_count(stride, "HeatmapDecoder.stride")
         self.method = method
         self.stride = stride
         self.sharpness, self.tolerance = float(sharpness), float(tolerance)

@@ -7,7 +7,15 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import MIRRORED
 from tensorsim.config import COCO_KEYPOINTS
-from tensorsim.errors import TensorsimError, check_finite, check_mask, check_rank, check_size, is_exporting
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_finite,
+    check_mask,
+    check_rank,
+    check_size,
+    is_exporting,
+)
 from tensorsim.vision.pose2d.crops import BoxCrop, check_boxes, crop_to_image
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 
@@ -99,8 +107,7 @@ class TopDownPose(nn.Module):
         stand_up: bool = False,
     ) -> None:
         super().__init__()
-        if crops_per_batch < 1:
-            raise TensorsimError(f"TopDownPose: got crops_per_batch {crops_per_batch}, expected at least 1")
+        check_count(crops_per_batch, "TopDownPose.crops_per_batch")
         if crop_size is None:
             crop_size = getattr(network, "input_size", (256, 192))
         self.crop = BoxCrop(crop_size, padding)

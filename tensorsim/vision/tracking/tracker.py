@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_floating,
     check_positive,
@@ -124,8 +125,7 @@ class GNNTracker(nn.Module):
     ) -> None:
         super().__init__()
         for name, count in (("max_tracks", max_tracks), ("min_hits", min_hits)):
-            if count < 1:
-                raise TensorsimError(f"GNNTracker.{name}: got {count}, expected at least 1")
+            check_count(count, f"GNNTracker.{name}")
         _check_window("confirm_hits", confirm_hits, confirm_window)
         _check_window("delete_misses", delete_misses, delete_window)
         check_positive(assignment_threshold, "GNNTracker.assignment_threshold")
