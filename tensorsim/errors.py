@@ -249,6 +249,12 @@ def check_interval(value: object, least: float, most: float, name: str) -> None:
         raise TensorsimError(f"{name}: got {value!r}, expected an ascending range {within}")
 
 
+def check_score(value: object, name: str) -> None:
+    """Refuse what is no number between 0 and 1: a threshold of scores, which all or none would pass."""
+    if not isinstance(value, Real) or not 0 < float(value) < 1:
+        raise TensorsimError(f"{name}: got {value!r}, expected a score in (0, 1)")
+
+
 def check_per_person(values: object, name: str) -> None:
     """Refuse what is no tuple or list of positive finite numbers, one per person."""
     if not isinstance(values, tuple | list):

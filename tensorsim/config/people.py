@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from tensorsim.config.camera import CameraConfig
-from tensorsim.config.checks import is_finite, require_choices, require_counts, require_positive
-from tensorsim.errors import TensorsimError, check_per_person
+from tensorsim.config.checks import require_choices, require_counts, require_positive
+from tensorsim.errors import TensorsimError, check_per_person, check_score
 
 Position = Literal["camera", "paper"]
 Lifting = Literal["temporal", "nearest"]
@@ -134,10 +134,7 @@ class PoseConfig:
             raise TensorsimError(
                 f"PoseConfig.people: got {self.people!r}, expected 'all', 'moving', 'nearest' or a number from 1"
             )
-        if not (is_finite(self.keypoint_threshold) and 0 < self.keypoint_threshold < 1):
-            raise TensorsimError(
-                f"PoseConfig.keypoint_threshold: got {self.keypoint_threshold!r}, expected a score in (0, 1)"
-            )
+        check_score(self.keypoint_threshold, "PoseConfig.keypoint_threshold")
         for name in ("person_height_m", "person_weight_kg", "initial_distance_m"):
             if getattr(self, name) is not None:
                 check_per_person(getattr(self, name), f"PoseConfig.{name}")

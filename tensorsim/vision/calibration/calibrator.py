@@ -7,7 +7,14 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
-from tensorsim.errors import TensorsimError, check_count, check_key_points, check_per_person, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_key_points,
+    check_per_person,
+    check_positive,
+    check_score,
+)
 from tensorsim.ops import of_person
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
@@ -162,7 +169,7 @@ class CameraCalibrator(nn.Module):
         super().__init__()
         check_per_person(person_height_m, "CameraCalibrator.person_height_m")
         check_positive(height_sd_m, "CameraCalibrator.height_sd_m")
-        check_positive(keypoint_threshold, "CameraCalibrator.keypoint_threshold")
+        check_score(keypoint_threshold, "CameraCalibrator.keypoint_threshold")
         check_count(most_frames, "CameraCalibrator.most_frames")
         self.height_sd_m = height_sd_m
         self.keypoint_threshold = keypoint_threshold

@@ -14,6 +14,7 @@ from tensorsim.errors import (
     check_per_person,
     check_points,
     check_positive,
+    check_score,
     check_shape,
 )
 from tensorsim.geometry.camera import Pinhole, back_project
@@ -173,8 +174,9 @@ class MetricPose(nn.Module):
             0.25  # squared error of the lifted pose over the spread of the joints; good ones have 0.01
         )
         self.least_size = 0.65  # of the size in reliable frames: below, a part was taken for a whole body
-        for name in ("keypoint_threshold", "range_smoothing_s", "floor_window_s"):
-            check_positive(getattr(self, name), f"MetricPose.{name}")
+        check_score(keypoint_threshold, "MetricPose.keypoint_threshold")
+        check_positive(range_smoothing_s, "MetricPose.range_smoothing_s")
+        check_positive(floor_window_s, "MetricPose.floor_window_s")
         camera = CameraConfig() if camera is None else camera
         self.camera, self.pinhole = camera, Pinhole(camera)
         self.distance_gives_focal = initial_distance_m is not None

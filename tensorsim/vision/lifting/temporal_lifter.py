@@ -22,6 +22,7 @@ from tensorsim.errors import (
     check_per_person,
     check_points,
     check_positive,
+    check_score,
     check_shape,
 )
 from tensorsim.geometry.camera import Pinhole, project
@@ -111,7 +112,7 @@ class TemporalLifter(nn.Module):
         camera_known: bool = True,
     ) -> None:
         super().__init__()
-        check_positive(keypoint_threshold, "TemporalLifter.keypoint_threshold")
+        check_score(keypoint_threshold, "TemporalLifter.keypoint_threshold")
         check_count(frames_per_block, "TemporalLifter.frames_per_block")
         check_per_person(person_height_m, "TemporalLifter.person_height_m")
         self.network = TemporalNet() if network is None else network

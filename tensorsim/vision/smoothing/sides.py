@@ -7,7 +7,7 @@ exchange jumps: the vector from the right to the left ankle turns round from one
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import check_key_points, check_positive
+from tensorsim.errors import check_key_points, check_positive, check_score
 
 
 def viterbi_two_states(stay: Tensor, change: Tensor, second: float) -> Tensor:
@@ -68,7 +68,7 @@ class SteadySides(nn.Module):
         super().__init__()
         check_positive(change, "SteadySides.change")
         check_positive(exchanged, "SteadySides.exchanged")
-        check_positive(threshold, "SteadySides.threshold")
+        check_score(threshold, "SteadySides.threshold")
         self.change, self.exchanged, self.threshold = change, exchanged, threshold
 
     def forward(self, keypoints: Tensor, scores: Tensor, valid: Tensor, fps: float) -> tuple[Tensor, Tensor]:
