@@ -14,6 +14,7 @@ from tensorsim.errors import (
     check_positive,
     check_rank,
     check_replaced,
+    check_score,
     check_size,
     is_autocast,
 )
@@ -86,8 +87,7 @@ class VideoToPose(nn.Module):
         self.detection_interval = check_count(detection_interval, "detection_interval")
         self.frames_per_batch = check_count(frames_per_batch, "frames_per_batch")
         self.fewest_joints = check_count(fewest_joints, "fewest_joints", 1, 14)
-        if not 0 < keypoint_threshold < 1:
-            raise TensorsimError(f"keypoint_threshold: got {keypoint_threshold}, expected a score in (0, 1)")
+        check_score(keypoint_threshold, "keypoint_threshold")
         self.detector = check_part(detector, "detector")
         self.pose = top_down(pose)
         self.tracker = check_part(GNNTracker() if tracker is None else tracker, "tracker")
@@ -113,8 +113,9 @@ class VideoToPose(nn.Module):
         known = metric_pose.camera if isinstance(metric_pose, MetricPose) else CameraConfig()
         self.camera_m = known.position_m
         self.sides = SteadySides(threshold=keypoint_threshold)
-        self.bone_fit = bone_fit if bone_fit is not None else _AsPlaced()
-        check_instance(self.bone_fit, nn.Module, "bone_fit")
+        if bone_fit is not None:
+            check_instance(bone_fit, nn.Module, "bone_fit")
+        self.bone_fit = bone_fit
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         self.hidden_legs = HiddenLegs()
         self.keypoint_threshold = keypoint_threshold
@@ -408,7 +409,8 @@ class VideoToPose(nn.Module):
         if self.temporal is None:
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
-        joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
+        if self.bone_fit is not None:
+            joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
         # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
         hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
         hidden = hidden & crossed_within(mid_hips(joints), usable, self.hidden_speed_m_s / fps)
@@ -434,10 +436,3 @@ def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> Tempora
         camera, heights = metric_pose.camera, tuple(metric_pose.heights.tolist())
     lifter = TemporalLifter.from_pretrained(None, camera, heights, keypoint_threshold)
     return lifter.double().requires_grad_(False)
-
-
-class _AsPlaced(nn.Module):
-    """No :class:`~tensorsim.vision.lifting.bone_fit.BoneFit`."""
-
-    def forward(self, joints: Tensor, seen: Tensor, fps: float) -> Tensor:
-        return joints
