@@ -4,7 +4,7 @@ The ranges are wide: they keep out slips of the unit and numbers with which noth
 radars or people.
 """
 
-import math
+from numbers import Real
 from typing import NamedTuple
 
 from tensorsim.exceptions import TensorsimError
@@ -60,10 +60,10 @@ def check_range(value: float, quantity: str, option: str) -> None:
         option: what the value was given as, such as ``"--fps"`` or ``"RadarConfig.prf_hz"``.
 
     Raises:
-        TensorsimError: NaN, or a value that the range does not contain.
+        TensorsimError: no number, NaN, or a value that the range does not contain.
     """
     low, high, unit = RANGES[quantity]
-    if math.isnan(value) or not low <= value <= high:
-        raise TensorsimError(
-            f"{option}: got {value:.6g}, expected {quantity} from {low:g} to {high:g} {unit}"
-        )
+    number = isinstance(value, Real)
+    if not (number and low <= value <= high):
+        got = f"{value:.6g}" if number else repr(value)
+        raise TensorsimError(f"{option}: got {got}, expected {quantity} from {low:g} to {high:g} {unit}")

@@ -3,7 +3,14 @@
 import math
 from dataclasses import dataclass
 
-from tensorsim.config.checks import Vector, is_finite, make_plain, require_positive, require_vector
+from tensorsim.config.checks import (
+    Vector,
+    is_finite,
+    make_plain,
+    require_finite,
+    require_positive,
+    require_vector,
+)
 from tensorsim.errors import TensorsimError
 
 
@@ -50,8 +57,4 @@ class CameraConfig:
             raise TensorsimError(
                 f"CameraConfig.center_px: got {center!r}, expected two finite numbers (u, v) or None"
             )
-        for name in ("pitch_rad", "yaw_rad", "roll_rad"):
-            if not is_finite(getattr(self, name)):
-                raise TensorsimError(
-                    f"CameraConfig.{name}: got {getattr(self, name)}, expected finite radians"
-                )
+        require_finite(self, "pitch_rad", "yaw_rad", "roll_rad")

@@ -23,15 +23,18 @@ def require_positive(owner: str, **values: float) -> None:
             raise TensorsimError(f"{owner}.{name}: got {value!r}, expected a positive finite number")
 
 
-def require_dielectric(owner: str, relative_permittivity: float, loss_tangent: float) -> None:
-    """Refuse a permittivity below 1 or a negative loss tangent."""
-    for name, value, least in (
-        ("relative_permittivity", relative_permittivity, 1),
-        ("loss_tangent", loss_tangent, 0),
-    ):
-        if not (is_finite(value) and value >= least):
-            raise TensorsimError(f"{owner}.{name}: got {value}, expected a finite number >= {least}")
-        check_range(value, name.replace("_", " "), f"{owner}.{name}")
+def require_finite(config: Any, *names: str) -> None:
+    """Refuse fields of a configuration that are not finite numbers."""
+    for name in names:
+        value = getattr(config, name)
+        if not is_finite(value):
+            raise TensorsimError(f"{type(config).__name__}.{name}: got {value!r}, expected a finite number")
+
+
+def require_ranges(config: Any, **quantities: str) -> None:
+    """Refuse fields of a configuration outside of the range of their quantity, see :mod:`tensorsim.limits`."""
+    for name, quantity in quantities.items():
+        check_range(getattr(config, name), quantity, f"{type(config).__name__}.{name}")
 
 
 def as_plain(value: Any) -> Any:

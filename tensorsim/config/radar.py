@@ -2,14 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from tensorsim.config.checks import (
-    Vector,
-    is_finite,
-    listed,
-    make_plain,
-    require_position,
-    require_positive,
-)
+from tensorsim.config.checks import Vector, listed, make_plain, require_position, require_ranges
 from tensorsim.errors import TensorsimError
 from tensorsim.limits import check_range
 
@@ -44,32 +37,20 @@ class RadarConfig:
 
     def __post_init__(self) -> None:
         make_plain(self)
-        require_positive(
-            "RadarConfig",
-            carrier_hz=self.carrier_hz,
-            bandwidth_hz=self.bandwidth_hz,
-            chirp_s=self.chirp_s,
-            prf_hz=self.prf_hz,
-            sample_rate_hz=self.sample_rate_hz,
+        require_ranges(
+            self,
+            carrier_hz="carrier frequency",
+            bandwidth_hz="bandwidth",
+            chirp_s="chirp duration",
+            prf_hz="pulse repetition frequency",
+            sample_rate_hz="sample rate",
+            antenna_gain_dbi="gain",
+            isolation_db="gain",
         )
-        for name, quantity in (
-            ("carrier_hz", "carrier frequency"),
-            ("bandwidth_hz", "bandwidth"),
-            ("chirp_s", "chirp duration"),
-            ("prf_hz", "pulse repetition frequency"),
-            ("sample_rate_hz", "sample rate"),
-        ):
-            check_range(getattr(self, name), quantity, f"RadarConfig.{name}")
         for tx in self.tx_positions_m:
             require_position("RadarConfig", tx_m=tx)
         for rx in self.rx_positions_m:
             require_position("RadarConfig", rx_m=rx)
-        for name in ("antenna_gain_dbi", "isolation_db"):
-            if not is_finite(getattr(self, name)):
-                raise TensorsimError(
-                    f"RadarConfig.{name}: got {getattr(self, name)!r}, expected a finite number of dB"
-                )
-            check_range(getattr(self, name), "gain", f"RadarConfig.{name}")
         check_range(self.samples_per_chirp, "samples per chirp", "RadarConfig: sample_rate_hz times chirp_s")
         turns = len(self.tx_positions_m)
         check_range(turns * len(self.rx_positions_m), "antennas", "RadarConfig: tx_m times rx_m")

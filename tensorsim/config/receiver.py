@@ -8,11 +8,12 @@ from tensorsim.config.checks import (
     is_finite,
     make_plain,
     require_counts,
+    require_finite,
     require_position,
     require_positive,
+    require_ranges,
 )
 from tensorsim.errors import TensorsimError
-from tensorsim.limits import check_range
 
 
 @dataclass(frozen=True)
@@ -46,24 +47,14 @@ class ReceiverConfig:
 
     def __post_init__(self) -> None:
         make_plain(self)
-        for name in (
-            "phase_noise_dbc_hz",
-            "iq_imbalance_db",
-            "iq_phase_rad",
-            "dc_offset_db",
-            "adc_headroom_db",
-        ):
-            value = getattr(self, name)
-            if value is not None and not is_finite(value):
-                raise TensorsimError(f"ReceiverConfig.{name}: got {value!r}, expected a finite number")
-        for name in ("iq_imbalance_db", "adc_headroom_db"):
-            check_range(getattr(self, name), "gain", f"ReceiverConfig.{name}")
+        require_finite(self, "iq_phase_rad")
+        require_ranges(self, iq_imbalance_db="gain", adc_headroom_db="gain")
         for name in ("phase_noise_dbc_hz", "dc_offset_db"):
             if getattr(self, name) is not None:
-                check_range(getattr(self, name), "ratio of powers", f"ReceiverConfig.{name}")
+                require_ranges(self, **{name: "ratio of powers"})
         if self.adc_bits is not None:
             require_counts(self, "adc_bits")
-            check_range(self.adc_bits, "bits of a converter", "ReceiverConfig.adc_bits")
+            require_ranges(self, adc_bits="bits of a converter")
 
     @classmethod
     def typical(cls) -> "ReceiverConfig":
@@ -138,9 +129,5 @@ class InterferenceConfig:
         make_plain(self)
         require_position("InterferenceConfig", position_m=self.position_m)
         require_positive("InterferenceConfig", chirp_ratio=self.chirp_ratio)
-        for name in ("power_ratio_db", "delay_s"):
-            if not is_finite(getattr(self, name)):
-                raise TensorsimError(
-                    f"InterferenceConfig.{name}: got {getattr(self, name)!r}, expected a finite number"
-                )
-        check_range(self.power_ratio_db, "ratio of powers", "InterferenceConfig.power_ratio_db")
+        require_finite(self, "delay_s")
+        require_ranges(self, power_ratio_db="ratio of powers")

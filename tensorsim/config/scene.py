@@ -3,12 +3,17 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tensorsim.config.checks import is_finite, make_plain, require_choices, require_counts, require_positive
+from tensorsim.config.checks import (
+    make_plain,
+    require_choices,
+    require_counts,
+    require_positive,
+    require_ranges,
+)
 from tensorsim.config.radar import RadarConfig
 from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.limits import check_range
 
 WallPaths = Literal["series", "paper"]
 Incidence = Literal["normal", "oblique", "airy"]
@@ -104,11 +109,9 @@ class SceneConfig:
                 f"SceneConfig.paths: got names of paths and {', '.join(switched)}, expected one or the other"
             )
         require_counts(self, "bounces")
-        for name in ("noise_figure_db", *(["snr_db"] if self.snr_db is not None else [])):
-            value = getattr(self, name)
-            if not is_finite(value):
-                raise TensorsimError(f"SceneConfig.{name}: got {value!r}, expected a finite number of dB")
-            check_range(value, "ratio of powers", f"SceneConfig.{name}")
+        require_ranges(self, noise_figure_db="ratio of powers")
+        if self.snr_db is not None:
+            require_ranges(self, snr_db="ratio of powers")
         require_positive("SceneConfig", transmit_power_w=self.transmit_power_w)
 
     @property

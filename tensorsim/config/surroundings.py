@@ -6,8 +6,8 @@ from tensorsim.config.checks import (
     Vector,
     is_finite,
     make_plain,
-    require_dielectric,
     require_position,
+    require_ranges,
     require_vector,
 )
 from tensorsim.errors import TensorsimError
@@ -40,7 +40,7 @@ class WallConfig:
             )
         for value in self.size_m:
             check_range(value, "length", "WallConfig.size_m")
-        require_dielectric("WallConfig", self.relative_permittivity, self.loss_tangent)
+        require_ranges(self, relative_permittivity="relative permittivity", loss_tangent="loss tangent")
 
     @property
     def refractive_index(self) -> complex:
@@ -67,6 +67,6 @@ class FloorConfig:
 
     def __post_init__(self) -> None:
         make_plain(self)
-        require_dielectric("FloorConfig", self.relative_permittivity, self.loss_tangent)
+        require_ranges(self, relative_permittivity="relative permittivity", loss_tangent="loss tangent")
         if self.reflection is not None and not (is_finite(self.reflection) and -1 <= self.reflection <= 1):
             raise TensorsimError(f"FloorConfig.reflection: got {self.reflection}, expected between -1 and 1")

@@ -99,7 +99,7 @@ def test_names() -> None:
         (lambda: ts.RadarConfig(carrier_hz="77e9"), "carrier_hz: got '77e9'"),  # type: ignore[arg-type]
         (lambda: ts.RadarConfig(isolation_db=None), "isolation_db: got None"),  # type: ignore[arg-type]
         (lambda: ts.WallConfig(center_m=3.0), "center_m: got 3.0"),  # type: ignore[arg-type]
-        (lambda: ts.WallConfig(loss_tangent="no"), "loss_tangent: got no"),  # type: ignore[arg-type]
+        (lambda: ts.WallConfig(loss_tangent="no"), "loss_tangent: got 'no', expected loss tangent"),  # type: ignore[arg-type]
         (lambda: FloorConfig(reflection="no"), "reflection: got no"),  # type: ignore[arg-type]
         (lambda: ts.SceneConfig(bounces=0), "SceneConfig.bounces: got 0, expected an integer of at least 1"),
         (lambda: ts.SceneConfig(bounces=1.5), "bounces: got 1.5"),  # type: ignore[arg-type]

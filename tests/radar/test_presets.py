@@ -163,7 +163,7 @@ def test_several_receivers_become_tuples(tmp_path: Path) -> None:
         ("tx_m: [0, left, 1]", r"tx_m: got 'left', expected a number"),
         ("tx_m: [0, 1]", r"radar.yaml: RadarConfig.tx_m: got \(0.0, 1.0\), expected three finite numbers"),
         ("rx_m: [[0, 0, 1], [0, 1]]", r"RadarConfig.rx_m: got \(0.0, 1.0\)"),
-        ("prf_hz: -1", r"radar.yaml: RadarConfig.prf_hz: got -1.0, expected a positive finite number"),
+        ("prf_hz: -1", r"radar.yaml: RadarConfig.prf_hz: got -1, expected pulse repetition frequency from 1"),
         ("prf_hz: nan", r"RadarConfig.prf_hz: got nan"),
         ("wall: {relative_permittivity: 0.5}", r"yaml: wall: WallConfig.relative_permittivity: got 0.5"),
         ("wall:", r"yaml: wall: got None, expected keys with values"),
