@@ -19,6 +19,11 @@ def of_person(values: Tensor, person: Tensor) -> Tensor:
     return values[person.clamp(max=values.shape[0] - 1)]
 
 
+def unit(x: Tensor) -> Tensor:
+    """Vectors (..., D) scaled to length 1; finite, with a finite gradient, where they are 0."""
+    return x / x.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+
+
 def safe_sqrt(x: Tensor) -> Tensor:
     """Square root whose gradient at 0 is 0 instead of infinite."""
     if not x.requires_grad:

@@ -43,6 +43,11 @@ def mid_hips(joints: Tensor) -> Tensor:
     )  # literals: TorchScript reads no constants of modules
 
 
+def lowest_ankle(joints: Tensor) -> Tensor:
+    """Height of the lower ankle: (..., 14, 3) -> (...)."""
+    return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])
+
+
 def bone_lengths(joints: Tensor, ends: Tensor) -> Tensor:
     """Lengths (..., 12) of the bones of bodies (..., 14, 3).
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body, mid_hips
-from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside, lowered, lowest_ankle
+from tensorsim.body.skeleton import coco_to_body, lowest_ankle, mid_hips
+from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside, lowered
 from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict, kalman_update
 
 #: Variance of a position of which nothing is known, in variances of a measurement.

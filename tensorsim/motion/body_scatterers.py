@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from tensorsim.body.proportions import ANKLE_HEIGHT, TRUNK
 from tensorsim.config import JOINTS, Vector
 from tensorsim.errors import check_count, check_positive
-from tensorsim.motion.limb_scatterers import POINTS, SEGMENTS, TOES, bisector, toes_of, unit
+from tensorsim.motion.limb_scatterers import POINTS, SEGMENTS, TOES, bisector, toes_of
 from tensorsim.motion.rough_surface import cylinder_rcs, patch_rcs, skin_reflectivity
 from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
+from tensorsim.ops import unit
 
 #: The torso is an elliptical cylinder: semi-axes to the right and forward, in body heights, from the neck to this
 #: many lengths of the line to the middle of the hips.

@@ -14,6 +14,7 @@ from tensorsim.body.proportions import ANKLE_HEIGHT, SHANK, THIGH, TRUNK, UPPER_
 from tensorsim.config import JOINTS, Vector
 from tensorsim.errors import TensorsimError, check_count, check_positive
 from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
+from tensorsim.ops import unit
 
 #: From the ankle forward to the toes (a foot is 0.152 long).
 TOES = 0.12
@@ -57,11 +58,6 @@ SEGMENTS = (
     *_limbs("right"),
     *_limbs("left"),
 )
-
-
-def unit(x: Tensor) -> Tensor:
-    """Vectors (..., 3) scaled to length 1; finite, with a finite gradient, where they are 0."""
-    return x / x.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
 
 
 def toes_of(knee: Tensor, ankle: Tensor, right: Tensor, toes_m: float, sole_m: float) -> Tensor:

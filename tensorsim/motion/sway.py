@@ -4,10 +4,12 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.body.proportions import SHANK, THIGH
+from tensorsim.body.skeleton import lowest_ankle
 from tensorsim.config import JOINTS
 from tensorsim.errors import check_count, check_points, check_positive
 from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
+from tensorsim.ops import unit
 
 #: Height of the centre of mass over the ankles, of a body of 1.75 m; sway is quoted there.
 MASS_HEIGHT_M = (SHANK + THIGH + 0.03) * 1.75
@@ -72,10 +74,8 @@ class PosturalSway(nn.Module):
         along = self.forwards(time_s, own)[:, who].T.to(joints.dtype)[..., None, None]  # (P, T, 1, 1)
         aside = self.sideways(time_s, own)[:, who].T.to(joints.dtype)[..., None, None]
 
-        across = (self.right.to(joints.dtype) @ joints)[..., :2]
-        across = across / across.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+        across = unit((self.right.to(joints.dtype) @ joints)[..., :2])
         ahead = torch.stack((-across[..., 1], across[..., 0]), -1)  # a quarter turn to the left of right
-        floor = torch.minimum(joints[..., 10, 2], joints[..., 13, 2])  # literals: ankles, for TorchScript
-        lever = (joints[..., 2:] - floor[..., None, None]).clamp_min(0.0) / self.mass_height_m
+        lever = (joints[..., 2:] - lowest_ankle(joints)[..., None, None]).clamp_min(0.0) / self.mass_height_m
         shift = lever * (along * ahead + aside * across)
         return joints + torch.cat((shift, torch.zeros_like(lever)), -1)

@@ -15,6 +15,7 @@ from tensorsim.errors import (
 )
 from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
+from tensorsim.ops import unit
 
 Range = tuple[float, float]
 #: Deviation of the instant of a breath or beat from an even rhythm, in cycles, and how fast it changes in Hz.
@@ -107,6 +108,5 @@ class VitalSigns(nn.Module):
         ]  # (P, T, 1, 1)
 
         up, right = self.trunk.to(joints.dtype) @ joints, self.right.to(joints.dtype) @ joints
-        ahead = torch.cross(up, right, dim=-1)
-        ahead = ahead / ahead.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+        ahead = unit(torch.cross(up, right, dim=-1))
         return joints + self.neck.to(joints.dtype) * chest * ahead

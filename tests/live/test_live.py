@@ -19,7 +19,7 @@ from torch import Tensor
 
 import tensorsim as ts
 from tensorsim import cli, plot
-from tensorsim.body.skeleton import coco_to_body
+from tensorsim.body.skeleton import coco_to_body, lowest_ankle
 from tensorsim.commands import live as live_command
 from tensorsim.data.video import VideoReader
 from tensorsim.data.video_writer import write_video
@@ -33,7 +33,7 @@ from tensorsim.live.tracking import OnlineTracker
 from tensorsim.live.view import MAP_HEIGHT, STRIP_HEIGHT, LiveView
 from tensorsim.recognition.timeline import WINDOW_S
 from tensorsim.types import Detections
-from tensorsim.vision.lifting.metric_pose import lowered, lowest_ankle
+from tensorsim.vision.lifting.metric_pose import lowered
 from tensorsim.vision.lifting.pose_library import load_pose_library
 from tensorsim.vision.smoothing.kalman import KalmanSmoother, smooth_constant_velocity
 from tensorsim.vision.smoothing.outliers import limit_speed

@@ -9,13 +9,8 @@ that rests on the floor has about as much flesh around it.
 import torch
 from torch import Tensor
 
-from tensorsim.body.skeleton import mid_hips
+from tensorsim.body.skeleton import lowest_ankle, mid_hips
 from tensorsim.vision.smoothing.along_time import fill_gaps, local_linear, masked_median, running_quantile
-
-
-def lowest_ankle(joints: Tensor) -> Tensor:
-    """Height of the lower ankle (joints 10 and 13): (..., 14, 3) -> (...)."""
-    return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])
 
 
 def lowered(joints: Tensor, drop: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import mid_hips
+from tensorsim.body.skeleton import lowest_ankle, mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.config.people import PANEL_DISTANCES_M
 from tensorsim.errors import (
@@ -25,7 +25,6 @@ from tensorsim.vision.lifting.floor import (
     fused_range,
     looks_bent,
     lowered,
-    lowest_ankle,
     on_the_same_floor,
     range_on_floor,
     upright_share,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
-from tensorsim.body.skeleton import mid_hips
+from tensorsim.body.skeleton import lowest_ankle, mid_hips
 from tensorsim.config import CameraConfig
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.floor import (
@@ -15,7 +15,6 @@ from tensorsim.vision.lifting.floor import (
     fused_range,
     looks_bent,
     lowered,
-    lowest_ankle,
     on_the_same_floor,
     range_on_floor,
     upright_share,

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.proportions import ANKLE_HEIGHT
-from tensorsim.body.skeleton import mid_hips
+from tensorsim.body.skeleton import lowest_ankle, mid_hips
 from tensorsim.config import JOINTS, CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world
@@ -20,7 +20,6 @@ from tensorsim.vision.lifting.metric_pose import (
     MetricPose,
     accumulated_displacement,
     camera_range,
-    lowest_ankle,
     metres_per_pixel,
 )
 from tests.stage import StageTester
@@ -540,7 +539,11 @@ def test_usual_settings() -> None:
     assert (module.range_smoothing_s, module.floor_window_s) == (0.3, 1.5)
     other = MetricPose(None, (1.6,), (3.0,), 0.4, "paper", 0.2, 1.0, True)
     seen_by = other.seen_by(CameraConfig(focal_px=900.0))
-    assert (seen_by.camera.focal_px, seen_by.heights.tolist(), seen_by.distances.tolist()) == (900.0, [1.6], [3.0])
+    assert (seen_by.camera.focal_px, seen_by.heights.tolist(), seen_by.distances.tolist()) == (
+        900.0,
+        [1.6],
+        [3.0],
+    )
     assert (seen_by.keypoint_threshold, seen_by.mode, seen_by.calibrated) == (0.4, "paper", True)
     assert (seen_by.range_smoothing_s, seen_by.floor_window_s) == (0.2, 1.0)
     assert MetricPose().seen_by(CameraConfig()).distance_gives_focal is False
