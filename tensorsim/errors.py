@@ -20,7 +20,7 @@ from tensorsim.exceptions import first_line as first_line
 
 
 def check_is_tensor(x: Any, name: str) -> None:
-    """Refuse what is no ordinary tensor with values; not called in a scripted graph, whose types are fixed."""
+    """Refuse anything but an ordinary tensor with values; not called in a scripted graph, whose types are fixed."""
     if not isinstance(x, Tensor):
         hint = ", as torch.from_numpy gives it" if type(x).__module__ == "numpy" else ""
         raise TensorsimError(f"{name}: got {type(x).__name__}, expected a tensor{hint}")
@@ -241,7 +241,7 @@ def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
 
 
 def check_interval(value: object, least: float, most: float, name: str) -> None:
-    """Refuse what is no pair of finite numbers, the first not above the second, from ``least`` to ``most``."""
+    """Refuse anything but two finite numbers from ``least`` to ``most``, the first not above the second."""
     pair = value if isinstance(value, tuple | list) and len(value) == 2 else ()
     numbers = [float(x) for x in pair if isinstance(x, Real) and math.isfinite(x)]
     if len(numbers) != 2 or not least <= numbers[0] <= numbers[1] <= most:
@@ -250,13 +250,13 @@ def check_interval(value: object, least: float, most: float, name: str) -> None:
 
 
 def check_score(value: object, name: str) -> None:
-    """Refuse what is no number between 0 and 1: a threshold of scores, which all or none would pass."""
+    """Refuse anything but a number between 0 and 1: all scores, or none, would pass another threshold."""
     if not isinstance(value, Real) or not 0 < float(value) < 1:
         raise TensorsimError(f"{name}: got {value!r}, expected a score in (0, 1)")
 
 
 def check_per_person(values: object, name: str) -> None:
-    """Refuse what is no tuple or list of positive finite numbers, one per person."""
+    """Refuse anything but a tuple or list of positive finite numbers, one per person."""
     if not isinstance(values, tuple | list):
         raise TensorsimError(f"{name}: got {values!r}, expected a tuple of one number per person")
     if len(values) == 0:

@@ -23,7 +23,7 @@ _watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
 
 
 class ProgressBar(tqdm):  # type: ignore[misc]  # tqdm has no types
-    """A bar whose steps a watcher hears of as well, also where the bar is not shown."""
+    """A bar that tells a watcher of its steps, even where the bar itself is hidden."""
 
     done = 0
 

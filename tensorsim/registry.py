@@ -139,7 +139,7 @@ def _videopose(frames: int, kind: str, sha256: str, error_mm: str, joints: str) 
     )
 
 
-#: Published by others. Eight digits of SHA-256 are part of their file names; a whole digest is that of a copy at hand
+#: Published by others. Eight digits of SHA-256 are part of their file names; a whole digest is that of a copy
 #: that gives the published accuracy.
 PUBLISHED: tuple[ModelEntry, ...] = (
     _coco_rtmdet("tiny", "20220902_112414", "78e30dcc", "41.1"),

@@ -119,7 +119,7 @@ def keypoint_source(
     Args:
         path: see :func:`~tensorsim.data.blazepose.load_keypoints`.
         stage: its networks are not used.
-        fps: frames per second; no such file tells them.
+        fps: frames per second; no such file states them.
         size: (height, width) of the pictures; None where the file says it.
         cut: the frames to keep.
         calibrate: estimate the camera from the people in place of that of the stage.

@@ -151,7 +151,7 @@ class Filmed(NamedTuple):
 
 
 def film_person(activity: int, frames: int, seed: int) -> Filmed:
-    """Render a person who does an activity, in so many frames."""
+    """Render a person that does an activity, in this many frames."""
     import torch
 
     from tensorsim.geometry.framing import camera_on

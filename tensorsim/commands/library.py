@@ -18,8 +18,8 @@ SUFFIXES = (".bvh", ".npz")
 class BuildLibrary:
     """Build a pool of poses for lifting, from motion files or from tensorsim's own generator.
 
-    Poses are brought to one body height, one heading (the lifter turns them to all) and both sides; of poses that
-    are nearly alike one is kept.
+    Poses are scaled to one body height and turned to one heading (the lifter turns them to all), each with its mirror
+    image; of poses that are nearly alike one is kept.
     """
 
     sources: tyro.conf.Positional[tuple[Path, ...]] = ()

@@ -135,5 +135,5 @@ class TrainPose(PeopleOptions):
 
 
 def some(persons: "list[Person]", most: int = 240) -> "list[Person]":
-    """At most so many of the people, evenly spread: shards of unlike pictures follow each other."""
+    """At most this many of the people, evenly spread: shards of unlike pictures follow each other."""
     return persons[:: math.ceil(len(persons) / most)]

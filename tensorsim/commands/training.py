@@ -54,7 +54,7 @@ class TrainOptions:
         )
 
     def epochs_loop(self, epochs: int, samples: int, batch: int, ema_decay: float) -> "LoopConfig":
-        """The loop of so many epochs of ``samples`` training samples, measured after each."""
+        """The loop of this many epochs of ``samples`` training samples, measured after each."""
         epoch = max(1, samples // max(1, batch))
         return self.loop(
             steps=epochs * epoch,

@@ -30,9 +30,9 @@ class TrackerConfig:
         min_box_px: smallest width and height of a detection in pixels (panel: minimum detection size, 5 x 5).
         max_tracks: people at a time (panel: maximum number of tracks, 5).
         confirm_hits: detections that confirm a track (panel: confirmation threshold, 2 of 5) ...
-        confirm_window: ... within so many frames in which the detector ran.
+        confirm_window: ... within this many frames in which the detector ran.
         delete_misses: misses that end a track (panel: deletion threshold, 23 of 23) ...
-        delete_window: ... within so many frames in which the detector ran.
+        delete_window: ... within this many frames in which the detector ran.
         assignment_threshold: largest squared Mahalanobis distance of an assignment (panel: 150).
         process_noise: density of the acceleration noise of a box, size^2 / frame^3 (panel: process noise, 0.001).
         measurement_noise: variance of a detected coordinate, size^2 (panel: Kalman measurement noise, 0.01).
@@ -152,7 +152,7 @@ class SmoothingConfig:
 
     Attributes:
         mode: ``"rts"`` smooths in both directions; ``"forward"`` is the paper's Kalman filter, which lags.
-        brief_gap_s: a joint that is hidden for at most so many seconds is predicted by the smoother.
+        brief_gap_s: a joint that is hidden for at most this many seconds is predicted by the smoother.
         resampling: ``"spline"`` (twice differentiable) or ``"linear"``, the paper's.
         smoothing_ratio: length of a Savitzky-Golay filter at pulse rate in seconds (panel: smoothing ratio, 0.25);
             None leaves it out.

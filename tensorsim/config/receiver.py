@@ -83,7 +83,7 @@ class ReceiverConfig:
 
 @dataclass(frozen=True)
 class ClutterConfig:
-    """The furniture and walls of a room before a sensor that vibrates, see :class:`tensorsim.radar.RoomClutter`.
+    """The furniture and walls of a room in front of a sensor that vibrates, see :class:`tensorsim.radar.RoomClutter`.
 
     Attributes:
         reflectors: their number.
@@ -111,9 +111,9 @@ class InterferenceConfig:
 
     Attributes:
         position_m: where it stands.
-        chirp_ratio: length of its sweeps over that of the own; the slopes differ, and the sweeps cross. Its sweeps
+        chirp_ratio: length of its sweeps over that of this radar; the slopes differ, and the sweeps cross. Its sweeps
             follow one another almost without a pause.
-        power_ratio_db: its transmit power over the own.
+        power_ratio_db: its transmit power over that of this radar.
         delay_s: time at which its first sweep arrives.
 
     Raises:

@@ -76,7 +76,7 @@ class SimulationConfig:
 
         Rectangular range window; STFT of the sum of range bins' magnitudes; only ``T1^2`` of the bounces in the wall,
         and the propagation phase of the wall counted twice; noise relative to the total power; metres per pixel from
-        the frame at hand, position by increments, each frame matched alone to its nearest pose; a Kalman filter
+        the current frame, position by increments, each frame matched alone to its nearest pose; a Kalman filter
         without smoothing, straight lines between frames and a Savitzky-Golay filter over a quarter of a second. Bodies
         that neither sway nor breathe, an empty room, and an ideal receiver.
 

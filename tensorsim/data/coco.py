@@ -16,7 +16,7 @@ from tensorsim.files import reading
 from tensorsim.limits import check_range
 from tensorsim.vision.tracking.assignment import assign
 
-#: Who was never seen before is as far away as somebody who moved by so many body sizes.
+#: Somebody never seen before is as far away as a person that moved by this many body sizes.
 _NEW = 2.0
 
 

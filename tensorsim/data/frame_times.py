@@ -5,7 +5,7 @@ from torch import Tensor
 
 from tensorsim.vision.smoothing.even_time import even_count
 
-#: Frames whose times differ from even ones by more than so many seconds and so many frames are at uneven times.
+#: Frames whose times differ from even ones by more than this many seconds and this many frames are at uneven times.
 _UNEVEN_S, _UNEVEN_FRAMES = 0.05, 1.5
 
 

@@ -19,7 +19,7 @@ from tensorsim.threads import ahead
 
 #: Memory for the frames of a film that is passed over several times: enough for 12 s of 720p at 30 frames per second.
 KEPT_MB = 1000.0
-#: A file that announces so many frames per second has a broken header (1000 and 90000 are clock rates).
+#: A file that announces this many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
 
 #: First bytes of films, and where they are: FFmpeg would also open playlists, which name further files and addresses.
@@ -53,8 +53,8 @@ class VideoReader:
         fps: frames per second of the film, instead of those that the file announces.
         start_s, end_s: keep the frames from ``start_s`` on that are before ``end_s``, in seconds of the film.
         stride: keep every stride-th of them.
-        kept_mb: a film whose frames fit into so many megabytes stays in memory after the first pass, and is not decoded
-            again for passes in chunks of the same size or a divisor of it.
+        kept_mb: a film whose frames fit into this many megabytes stays in memory after the first pass, and is not
+            decoded again for passes in chunks of the same size or a divisor of it.
 
     Attributes:
         path: of the file.
@@ -322,7 +322,7 @@ def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: i
 
 
 def _check_is_film(path: Path) -> None:
-    """Refuse what is no file, or begins like no film."""
+    """Refuse a path that is not a file, and a file that does not begin like a film."""
     if not path.exists():
         raise TensorsimError(f"{path}: no such file, expected a video")
     if not path.is_file():

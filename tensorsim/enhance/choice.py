@@ -43,5 +43,5 @@ def check_denoiser(choice: str | None) -> None:
     if choice is None or choice in DENOISERS or Path(choice).is_file():
         return
     if Path(choice).suffix:
-        raise TensorsimError(f"denoiser: got {choice!r}, which is no file, expected weights or a name")
+        raise TensorsimError(f"denoiser: got {choice!r}, which is not a file, expected weights or a name")
     find(choice, "DnCNN")

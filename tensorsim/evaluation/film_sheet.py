@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS, _ROWS = 4, 2
-#: At most so many people stand in the legend.
+#: Most people in the legend.
 _NAMED = 5
 
 

@@ -110,7 +110,7 @@ class CausalPose(nn.Module):
             scores: (P, 17).
             boxes: (P, 4) pixels, ``xyxy``; the size of a body that the left or right edge of the picture cuts counts
                 little.
-            there: (P,) bool, whose key points these are; the others are predicted.
+            there: (P,) bool, the people with key points; the others are predicted.
             height, width: of the picture.
         """
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)

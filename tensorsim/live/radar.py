@@ -141,7 +141,7 @@ class LiveRadar:
                 self.people[number] = _Person(place.expand(4, 14, 3), torch.zeros(4).double(), number)
         for number, person in list(self.people.items()):
             place, there = joints.get(number, (person.joints[-1], False))
-            # Who was absent appears where they are now once nothing is heard of them where they were.
+            # People that were absent appear where they are now once nothing is heard of them where they were.
             silent = float(person.presence.amax()) == 0
             if there and silent:
                 person.joints = place.expand(4, 14, 3)

@@ -173,7 +173,7 @@ class LiveSimulator:
         return self._after(None)
 
     def _after(self, frame: Tensor | None) -> LiveFrame:
-        """What a frame adds whose detections are tracked."""
+        """What a frame adds once its detections are tracked."""
         people = self._people(frame)
         joints = {p.number - 1: (p.joints.double(), p.present) for p in people}
         new = self.radar.push(joints)

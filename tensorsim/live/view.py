@@ -22,7 +22,7 @@ class LiveView:
     weak as it is.
 
     Args:
-        simulator: whose frames are drawn.
+        simulator: the source of the frames.
         style: colours and dynamic range.
         top_speed_m_s: the map shows Doppler of speeds up to this.
     """

@@ -19,7 +19,7 @@ def continued(joints: Tensor, valid: Tensor) -> Tensor:
         valid: (..., T) bool.
 
     Returns:
-        (..., T, J, 3), equal to ``joints`` where valid; zeros for who is never there.
+        (..., T, J, 3), equal to ``joints`` where valid; zeros for people that are never there.
 
     Raises:
         TensorsimError: wrong shapes, or valid not boolean.

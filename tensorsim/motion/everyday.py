@@ -43,7 +43,7 @@ def fall_any_way(time: Tensor, who: People) -> Act:
     give = bell(time, 0.0 * v(1.0), v(1.3) / tempo)
     overhead = (share_of(who, 29.0) < 0.6) & (torch.cos(way) > 0)
     flexion, abduction = arms_on_floor(way, v(30.0), overhead)
-    # Who lies on the back has the knees up and the arms folded.
+    # People that lie on their back have the knees up and the arms folded.
     supine = 0.5 * (1 - torch.cos(way))
     fold = v(50.0) * supine.square()
     bent = v(35.0) * supine * down
@@ -71,7 +71,7 @@ def fall_on_knees(time: Tensor, who: People) -> Act:
     drop, wait, over = v(0.55) / tempo, v(0.25), v(0.7) / tempo
     kneel = landing(time / drop)
     prone = minimum_jerk(((time - 1.2 * drop - wait) / over).clamp(0.0, 1.0))
-    # As who crawls, or flat.
+    # On hands and knees, or flat.
     on_hands = share_of(who, 13.0) < 0.3
     lean, bent, knees, arms, elbows = (
         torch.where(on_hands, one, other)

@@ -206,6 +206,6 @@ def draw_people(count: int, config: PeopleConfig, generator: torch.Generator) ->
         ),
         gait_phase=uniform(0, 1),
         factor=1 + uniform(-config.variation, config.variation, VARIED_NUMBERS),
-        # One tempo for all is not drawn, so that whoever goes on with the generator finds it where it was.
+        # One tempo for all is not drawn: the generator stays where it was for the next draw.
         tempo=uniform(slowest, fastest) if slowest < fastest else torch.full_like(height, slowest),
     )

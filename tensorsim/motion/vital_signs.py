@@ -88,7 +88,7 @@ class VitalSigns(nn.Module):
     def displacement_m(self, time_s: Tensor, people: int | None = None) -> Tensor:
         """Chest displacement (..., people) in metres, forward positive, at times (...) in seconds.
 
-        ``people`` are the first so many; the default is all.
+        Those of the first ``people``; the default is all.
         """
         check_floating(time_s, "time_s")
         own = self.people if people is None else min(people, self.people)

@@ -28,8 +28,8 @@ from tensorsim.types import RadarMaps
 class PoseToDoppler(nn.Module):
     """Joints at video rate -> maps of the radar: resample to the pulse rate, place scatterers, simulate.
 
-    Several people of a clip are one scene: their scatterers are summed in one echo. Who is far beyond the range axis is
-    not heard (:meth:`heard`).
+    Several people of a clip are one scene: their scatterers are summed in one echo. People far beyond the range axis
+    are not heard (:meth:`heard`).
 
     Args:
         simulator: scatterers -> maps.
@@ -202,7 +202,7 @@ class PoseToDoppler(nn.Module):
         distance = torch.linalg.vector_norm(mid_hips(joints) - self.radar_m.to(joints), dim=-1)
         filtered_m = 1.5 * self.reach_m
         beyond = ((distance - filtered_m) / (self.unheard_m - filtered_m)).clamp(0.0, 1.0)
-        # Exactly 0 there: who is not heard does not set the level of the noise.
+        # Exactly 0 there: people that are not heard do not set the level of the noise.
         return torch.where(beyond < 1, 0.5 + 0.5 * torch.cos(math.pi * beyond), 0.0)
 
     def denoise(self, maps: RadarMaps) -> RadarMaps:

@@ -120,9 +120,9 @@ class VideoToPose(nn.Module):
         self.hidden_legs = HiddenLegs()
         self.keypoint_threshold = keypoint_threshold
         self.brief_gap_s = brief_gap_s
-        #: Who is hidden for longer is gone until they are seen again.
+        #: People hidden for longer are gone until they are seen again.
         self.longest_gap_s = 1.0
-        #: Who would have moved faster while hidden, in m/s, is gone after ``brief_gap_s`` already.
+        #: People that would have moved faster while hidden, in m/s, are gone after ``brief_gap_s`` already.
         self.hidden_speed_m_s = 3.0
         #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
         self.noise_share = 0.03
@@ -320,7 +320,7 @@ class VideoToPose(nn.Module):
         return torch.cat(keypoints), torch.cat(scores)
 
     def is_person(self, scores: Tensor, valid: Tensor, fps: float) -> Tensor:
-        """Whether the pose network sees a person in a quarter of the frames of a track, or for a second on end.
+        """Whether the pose network sees a person in a quarter of the frames of a track, or for a whole second.
 
         Somebody who lies after a fall has low scores, perhaps for most of a long film.
 
@@ -414,7 +414,7 @@ class VideoToPose(nn.Module):
         # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
         hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
         hidden = hidden & crossed_within(mid_hips(joints), usable, self.hidden_speed_m_s / fps)
-        # Who is followed up to the left or right edge of the picture, and comes back from there, was beside it.
+        # Somebody followed up to the left or right edge of the picture, and back from there, was beside it.
         hidden = hidden & ~gaps_with(cut_off_beside(tracks.boxes, width) & tracks.valid, usable)
         there = usable | brief_gaps(usable, int(self.brief_gap_s * fps)) | hidden
         # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there

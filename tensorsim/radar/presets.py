@@ -158,7 +158,7 @@ def radar_scene(name_or_path: str) -> SceneConfig:
     if Path(name_or_path).is_file():
         return load_scene_yaml(name_or_path)
     raise TensorsimError(
-        f"radar: got {name_or_path!r}, which is no file, expected one or a preset"
+        f"radar: got {name_or_path!r}, which is not a file, expected one or a preset"
         f"{suggestion(name_or_path, list(PRESETS))} ({', '.join(PRESETS)})"
     )
 

@@ -110,7 +110,7 @@ class Recorder(nn.Module):
         return pieces, levels
 
     def add(self, levels: Levels, energies: Levels, pulses: int) -> Levels:
-        """Mean powers of clips of so many pulses, with the energies of another piece."""
+        """Mean powers of clips of this many pulses, with the energies of another piece."""
         samples = pulses * self.samples
         signal = levels.signal + energies.signal.to(levels.signal) / samples
         return Levels(signal, levels.arriving + energies.arriving.to(levels.arriving) / samples)

@@ -1,4 +1,4 @@
-"""Crops of rendered people, as pose networks get them: pictures to look at where no films are at hand."""
+"""Crops of rendered people, as pose networks get them: pictures to look at where there are no films."""
 
 import torch
 from torch import Tensor

@@ -177,7 +177,7 @@ class PersonRenderer:
         light: Light,
         scene: Scene,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Linear RGB (H * W, 3), whose each pixel is (-1 for nobody's) and the depth of people in it."""
+        """Linear RGB (H * W, 3), the person in each pixel (-1: nobody) and the depth of people there."""
         if not who:
             nobody = torch.full_like(scene.depth, -1, dtype=torch.int64)
             return scene.shade + scene.lamp, nobody, torch.full_like(scene.depth, math.inf)

@@ -15,7 +15,7 @@ from tensorsim.training.denoiser import simulate_pair
 
 #: PSNR of magnitudes over their peak; of decibels cut off 40 dB below it; speed errors of Doppler-time maps.
 COLUMNS = ("PSNR dB", "PSNR of dB map", "envelope m/s", "ridges m/s")
-#: Range-time maps are cut to so many columns: the slow rivals take minutes for all 32 767 of free space.
+#: Range-time maps are cut to this many columns: the slow rivals take minutes for all 32 767 of free space.
 _COLUMNS_AT_MOST = 1024
 Key = tuple[str, str, float, str]
 #: By name; None does nothing.

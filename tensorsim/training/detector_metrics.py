@@ -174,7 +174,7 @@ def calibrate(
 
 
 def _matches(boxes: Tensor, truth: Tensor) -> Tensor:
-    """(n, m) bool, which detections overlap whom by at least one half."""
+    """(n, m) bool, which detections overlap which people by at least one half."""
     return box_iou(boxes[:, None], truth[None]) >= 0.5
 
 

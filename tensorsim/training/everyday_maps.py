@@ -218,7 +218,7 @@ def make_group(index: int, settings: EverydaySettings, maker: ClipMaker, radars:
                     body = list(BODIES)[int(torch.multinomial(shares, 1, generator=generator))]
                     seed = int(one(0.0, 2.0**20))
                     seen = radars(clip, body, bool(one(0.0, 1.0) < 0.5), seed)
-                    # Who is beyond the range axis of a radar teaches nothing.
+                    # Somebody beyond the range axis of a radar teaches nothing.
                     if bool((seen.flatten(1).amax(-1) > 0).all()):
                         pictures.append(seen)
             labels += [activity] * (len(pictures) - len(labels))

@@ -25,7 +25,7 @@ _ERROR = (0.7,) * 5 + (0.9,) * 2 + (1.2,) * 2 + (1.5,) * 2 + (1.2,) * 2 + (1.0,)
 #: Scores of key points that are found well, measured on films: of the head, of shoulders to ankles.
 USUAL_SCORES = (0.92,) * 5 + (0.80,) * 12
 #: Body heights from the outermost key points to the left, top, right and bottom of the boxes that the detector finds,
-#: measured on rendered films: of who is upright, and of who lies.
+#: measured on rendered films: of people that are upright, and that lie.
 _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
 #: Key points that are mistaken for one another: (right, left) of arms, of legs, and all.
 _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
@@ -219,7 +219,7 @@ def _missed(
     # Bodies come out a little small: faces low and ankles high, by 1 % on rendered films.
     size = -0.010 + 0.012 * draw.normal(1, 1, 1)
     error = error + size * (points - points.mean(dim=2, keepdim=True)) / unit[..., None, None]
-    # Who lies is found worse than who stands, in half of the windows much worse.
+    # People are found less well lying than standing, in half of the windows much less.
     worse = 1 + draw.number(0.0, 1.0, 1) * torch.where(draw.chance(0.5), 1.0, 4.0)[:, None] * tilted
     error = error * worse[..., None, None]
     found = points + unit[..., None, None] * error

@@ -151,7 +151,7 @@ def person_loss(
     which part of the body is out of sight. Where the same keypoint of somebody else is, zeros count as much as the
     peak does.
 
-    Where ``sided`` is false, left and right may have been confused by who labelled: then the loss against labels
+    Where ``sided`` is false, left and right may have been confused by the annotators: then the loss against labels
     with sides exchanged is taken instead if it is less than half as large, which a network reaches only once it
     can distinguish the sides by itself.
 

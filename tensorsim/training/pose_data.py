@@ -100,7 +100,7 @@ CUT_AUGMENTATION = replace(MILD_AUGMENTATION, cut=0.75, repeat=0.0)
 
 
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
-    """The people of pictures with at least so many labelled COCO keypoints and such a longest side."""
+    """The people of pictures with at least this many labelled COCO keypoints and a longest side of at least this."""
     found = []
     for sample in samples:
         for index, keypoints in enumerate(sample.keypoints):
@@ -140,7 +140,7 @@ def upright(persons: Sequence[Person], most_deg: float = 30.0) -> list[Person]:
 
 
 def large(persons: Sequence[Person], least: int = 8, share: float = 0.25) -> list[Person]:
-    """Those of the people with so many labelled COCO keypoints and at least that share of their picture's height."""
+    """The people with at least this many labelled COCO keypoints and at least this share of their picture's height."""
     return [
         person
         for person in persons

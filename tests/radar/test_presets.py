@@ -191,7 +191,9 @@ def test_refuses_what_is_no_text_and_no_file(tmp_path: Path) -> None:
         load_radar_yaml(tmp_path / "binary.yaml")
     with pytest.raises(TensorsimError, match=r"none.yaml: No such file"):
         load_radar_yaml(tmp_path / "none.yaml")
-    with pytest.raises(TensorsimError, match=r"got 'ti-awr1834', which is no file, .* perhaps 'ti-awr1843'"):
+    with pytest.raises(
+        TensorsimError, match=r"got 'ti-awr1834', which is not a file, .* perhaps 'ti-awr1843'"
+    ):
         radar_scene("ti-awr1834")
 
 

@@ -184,5 +184,5 @@ class Experiment:
 
 
 def _seen(augment: Augment) -> Augment:
-    """The same change of pictures, which are then brought to the size that the network sees."""
+    """The same change of pictures, which are then resized to what the network sees."""
     return lambda pictures, generator: square(augment(pictures, generator), SIZE)

@@ -1,4 +1,4 @@
-"""Echoes before a radar of one constant frequency: no range, one complex number at each instant."""
+"""Echoes in front of a radar of one constant frequency: no range, one complex number at each instant."""
 
 import math
 

@@ -54,7 +54,7 @@ class FrontEnd(nn.Module):
     """From the IF that arrives to the samples that are recorded.
 
     In the order of a receiver: phase noise, interference, thermal noise, unequal I and Q, constant offset, converters,
-    one channel in place of two. Phase noise of the echo cancels in part, as it comes from the own oscillator; that of
+    one channel in place of two. Phase noise of the echo cancels in part, as it comes from the same oscillator; that of
     the interference does not. Offset and full scale of the converters are relative to the mean powers of the whole
     clip. Phase noise and interference depend on the number of the pulse, so that pieces of a clip give what the whole
     gives; all antennas and all clips of a batch have the same.

@@ -13,8 +13,8 @@ from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 class Interference(nn.Module):
     """Adds the chirps of another FMCW radar to the IF, where they pass through the receiver's band.
 
-    Own sweep and foreign one beat at the difference of their momentary frequencies; what is within half the sample
-    rate of zero is in the IF, a chirp in itself that spreads over all range bins, and what lies beyond is filtered
+    The two sweeps beat at the difference of their instantaneous frequencies; what is within half the sample rate
+    of zero is in the IF, a chirp in itself that spreads over all range bins, and what lies beyond is filtered
     out. One path, direct and in air, whatever walls the scene has: amplitude ``sqrt(Pt2 / Pt1 Gt Gr) lambda /
     (4 pi R)`` (Friis). See Brooker, *Mutual interference of millimeter-wave radar systems*, IEEE Trans. Electromagn.
     Compat. 49, 2007.

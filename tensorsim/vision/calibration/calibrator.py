@@ -132,8 +132,8 @@ class CameraCalibrator(nn.Module):
     beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15 degrees
     along the longer side of the picture); somebody who walks through the scene tells everything. The height of the
     camera goes with that of the people. However long somebody stays at one place, that is one observation: errors of
-    key points there do not average out. Who does not move at all while somebody else does may be a thing that looks
-    like a person, and tells nothing.
+    key points there do not average out. Somebody that never moves while others do may be a thing that looks like a
+    person, and tells nothing.
 
     Args:
         person_height_m: standing heights by order of person; the last one serves all further people.

@@ -78,7 +78,7 @@ def steadily(upright: Tensor, valid: Tensor, fps: float, share: float = 0.8) -> 
 
 
 def still_beside_others(ends: Tensor, valid: Tensor, least: float = 0.04) -> Tensor:
-    """Who does not move at all while somebody else does: a thing, or a picture of somebody, that looks like a person.
+    """Which people never move while others do: things, or pictures of people, that look like a person.
 
     Ankles and shoulders of a body stay within ``least`` of its size in the image about one place in nine of ten frames.
     Where nobody moves more than that, nobody is said to be still.
@@ -149,8 +149,8 @@ def cadence(
 ) -> tuple[Tensor, Tensor]:
     """Cycles of two steps per second, from how far the ankles are apart in the picture.
 
-    That distance, squared, has two periods a cycle, whichever ankle is ahead: networks confuse left and right, and who
-    turns round swaps them. The cadence is the peak of its periodogram.
+    That distance, squared, has two periods a cycle, whichever ankle is ahead: networks confuse left and right, and
+    people that turn round swap them. The cadence is the peak of its periodogram.
 
     Args:
         keypoints: (..., T, 17, 2).

@@ -59,7 +59,7 @@ class BoneFit(nn.Module):
         trust: weight of the given distances; below 1, as their errors are alike in several frames.
         floor_m: standard deviation of the height of the lowest joint over the floor; for ankles see ``standing_m``.
         steps: of Levenberg-Marquardt, while bones may still stretch much and when they no longer may.
-        rounds: at most so many times other branches are tried.
+        rounds: how often other branches are tried, at most.
 
     Shape:
         joints (..., P, T, 14, 3) in world metres, seen (..., P, T, 14) bool and frames per second -> joints, moved

@@ -1,7 +1,7 @@
 """Nearest-match lifting: 3D poses for 2D joints, from a pool of 3D poses projected along depth.
 
 Every pose of the pool is projected along depth and compared with the joints in the image after both are
-centred and brought to unit scale, as the paper does; here with a weight per joint, so that hidden joints do
+centred and scaled to unit size, as the paper does; here with a weight per joint, so that hidden joints do
 not count.
 """
 

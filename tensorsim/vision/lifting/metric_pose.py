@@ -135,8 +135,8 @@ class MetricPose(nn.Module):
     Shape:
         joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
         (..., P, T) bool, image height and width in pixels, frames per second, where the camera moves its
-        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward), and where it is known whom the left
-        or right edge of the picture cuts off (..., P, T) bool, whose size does not count -> world joints
+        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward), and where it is known the
+        people cut off by its left or right edge (..., P, T) bool, whose size does not count -> world joints
         (..., P, T, 14, 3) in metres and whether each was seen (..., P, T, 14). What was not seen is filled: a
         hidden joint from the pose that the lifter found, an invalid or discarded frame from the nearest other one;
         people without any are zeros. Differentiable.
@@ -228,7 +228,7 @@ class MetricPose(nn.Module):
             # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
             # reliable: those frames follow the others.
             many = seen.sum(dim=-1) >= self.whole_body_joints
-            # Of who is cut off by the left or right edge of the picture, the network puts what is beyond at the edge.
+            # Where the left or right edge of the picture cuts a body off, the network puts what is beyond at the edge.
             across = keypoints[..., 0] / max(image_width - 1, 1)
             beside = (across < 0.01) | (across > 0.99)
             beyond = (seen & beside).any(dim=-1)

@@ -133,7 +133,7 @@ def _exchange(source: int, target: int, width: int) -> nn.Module:
 
 
 class _Fusion(nn.ModuleList):
-    """The sum of all branches, each brought to the resolution and channels of branch ``target``."""
+    """The sum of all branches, each resampled to the resolution and channels of branch ``target``."""
 
     def __init__(self, branches: int, target: int, width: int) -> None:
         super().__init__(_exchange(source, target, width) for source in range(branches))

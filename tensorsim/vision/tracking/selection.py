@@ -12,14 +12,14 @@ MOVING_M = 0.25
 
 
 def select_people(pose: Pose, mode: str, fps: float) -> Pose:
-    """The people of one clip that count; the others are not valid any more, numbers stay.
+    """The people of one clip that count; the others become invalid, and numbers stay.
 
     Args:
         pose: of one clip (B = 1).
-        mode: ``"all"``; ``"moving"``, whose hips, head or hands travel by more than :data:`MOVING_M` about where they
-            mostly are (bystanders who sit or stand are left out); ``"nearest"``, the one with the least mean range; or
-            the number of a person, from ``"1"``.
-        fps: frames per second; who is there for less than a quarter of a second is not the nearest.
+        mode: ``"all"``; ``"moving"``, those whose hips, head or hands travel by more than :data:`MOVING_M` about where
+            they mostly are (bystanders that sit or stand are left out); ``"nearest"``, the one with the least mean
+            range; or the number of a person, from ``"1"``.
+        fps: frames per second; somebody there for less than a quarter of a second is not the nearest.
 
     Raises:
         TensorsimError: another mode, no such person, or several clips.

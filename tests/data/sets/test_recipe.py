@@ -59,7 +59,7 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ),
         ("sources: [{kind: films, path: a, people: 3}]", "SourceConfig.people: got one for the kind 'films'"),
         ("sources: [{people: 1, classes: [flying]}]", "activity: got 'flying'"),
-        ("radars: [{preset: nothing}]", "got 'nothing', which is no file"),
+        ("radars: [{preset: nothing}]", "got 'nothing', which is not a file"),
         ("radars: [{}, {}]", "got the names"),
         (
             f"{{radars: [{{name: {31 * 'a'}_1}}, {{name: {31 * 'a'}_2}}], storage: {{format: mat}}}}",
@@ -80,7 +80,7 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ("variations: {adc_bits: [4, 30]}", "VariationConfig.adc_bits: got"),
         ("variations: {real_receiver: -1}", "a probability"),
         ("variations: {denoisers: [perona]}", "weights of DnCNN: got 'perona'"),
-        ("variations: {denoisers: [a/b.safetensors]}", "got 'a/b.safetensors', which is no file"),
+        ("variations: {denoisers: [a/b.safetensors]}", "got 'a/b.safetensors', which is not a file"),
         ("processing: {denoiser: perona}", "weights of DnCNN: got 'perona'"),
         ("scene: {wall: {}}", "got a radar or a wall, expected them in radars"),
         ("scene: {sway: true}", "got sway, expected it in variations"),
