@@ -7,8 +7,8 @@ from torch import Tensor
 
 from tensorsim.geometry.boxes import center_to_xyxy, xyxy_to_center
 from tensorsim.types import Detections
-from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict
-from tensorsim.vision.tracking.tracker import GNNTracker, _Living
+from tensorsim.vision.smoothing.kalman import constant_velocity_predict
+from tensorsim.vision.tracking.tracker import GNNTracker, Living, joined
 
 
 class OnlineTracks(NamedTuple):
@@ -21,7 +21,7 @@ class OnlineTracks(NamedTuple):
         born: tracks that were ever started; ``living.rows`` are their numbers.
     """
 
-    living: _Living
+    living: Living
     confirmed: Tensor
     strong_hits: Tensor
     born: int
@@ -54,14 +54,13 @@ class OnlineTracker(GNNTracker):
         strong_hits = state.strong_hits + (hit & _taken(strong, column)).to(torch.int64)
         living = self._correct(living, xyxy_to_center(box), column)
         confirmed = state.confirmed | (living.history[:, : self.confirm_window].sum(-1) >= self.confirm_hits)
-        misses = living.age.clamp(max=self.delete_window) - living.history[:, : self.delete_window].sum(-1)
-        alive = torch.where(confirmed, misses < self.delete_misses, living.age < self.confirm_window)
+        alive = self._alive(living, confirmed)
 
         new = self._newcomers(box, strong, column[hit])
         numbers = torch.arange(new.shape[0]) + state.born
         start = self._start(numbers, xyxy_to_center(box[new]))
         return OnlineTracks(
-            _joined(living, alive, start),
+            joined(living, alive, start),
             torch.cat([confirmed[alive], torch.full((new.shape[0],), self.confirm_hits == 1)]),
             torch.cat([strong_hits[alive], torch.ones_like(numbers)]),
             state.born + new.shape[0],
@@ -92,14 +91,3 @@ class OnlineTracker(GNNTracker):
 def _taken(strong: Tensor, column: Tensor) -> Tensor:
     """Of each track, whether its detection (n,), -1 without, is a strong one."""
     return torch.cat([strong, strong.new_zeros(1)])[column]
-
-
-def _joined(living: _Living, alive: Tensor, start: _Living) -> _Living:
-    """The tracks that are still alive and those that begin."""
-    box = KalmanState(*(torch.cat([a[alive], b]) for a, b in zip(living.box, start.box, strict=True)))
-    return _Living(
-        torch.cat([living.rows[alive], start.rows]),
-        box,
-        torch.cat([living.history[alive], start.history]),
-        torch.cat([living.age[alive], start.age]),
-    )

@@ -33,13 +33,36 @@ from tensorsim.vision.tracking.assignment import assign
 from tensorsim.vision.tracking.joining import contained, join_tracks
 
 
-class _Living(NamedTuple):
-    """The n tracks that may still be matched."""
+class Living(NamedTuple):
+    """The n tracks that may still be matched.
 
-    rows: Tensor  # (n,) row of each in the table of all tracks
-    box: KalmanState  # (n, 4) centre and sides, and their velocities per frame; variances (n, 1)
-    history: Tensor  # (n, window) bool, hit or not in the observed frames, newest first
-    age: Tensor  # (n,) observed frames since the start
+    Attributes:
+        rows: (n,) number of each among all tracks.
+        box: (n, 4) centre and sides, and their velocities per frame; variances (n, 1).
+        history: (n, window) bool, hit or not in the observed frames, newest first.
+        age: (n,) observed frames since the start.
+    """
+
+    rows: Tensor
+    box: KalmanState
+    history: Tensor
+    age: Tensor
+
+
+def joined(living: Living, alive: Tensor, start: Living) -> Living:
+    """The tracks that are still ``alive`` (n,), bool, and those that begin."""
+    return Living(
+        torch.cat([living.rows[alive], start.rows]),
+        KalmanState(
+            torch.cat([living.box.position[alive], start.box.position]),
+            torch.cat([living.box.velocity[alive], start.box.velocity]),
+            torch.cat([living.box.p00[alive], start.box.p00]),
+            torch.cat([living.box.p01[alive], start.box.p01]),
+            torch.cat([living.box.p11[alive], start.box.p11]),
+        ),
+        torch.cat([living.history[alive], start.history]),
+        torch.cat([living.age[alive], start.age]),
+    )
 
 
 class GNNTracker(nn.Module):
@@ -211,7 +234,7 @@ class GNNTracker(nn.Module):
         living = self._start(torch.zeros(0, dtype=torch.int64), boxes.new_zeros(0, 4))
         for t in range(frames):
             predicted = constant_velocity_predict(living.box, self._process_noise(), 1.0)
-            living = _Living(living.rows, predicted, living.history, living.age)
+            living = Living(living.rows, predicted, living.history, living.age)
             if not bool(looked[t]):
                 continue
             best_first = scores[t].argsort(descending=True, stable=True)
@@ -225,9 +248,7 @@ class GNNTracker(nn.Module):
             recent_hits = living.history[:, : self.confirm_window].sum(-1)
             steady = confirmed[living.rows] | (recent_hits >= self.confirm_hits)
             confirmed[living.rows] = steady
-            hits = living.history[:, : self.delete_window].sum(-1)
-            misses = living.age.clamp(max=self.delete_window) - hits
-            alive = torch.where(steady, misses < self.delete_misses, living.age < self.confirm_window)
+            alive = self._alive(living, steady)
 
             new = self._newcomers(box, strong, column[hit])
             born = torch.arange(new.shape[0]) + table.shape[0]
@@ -236,19 +257,13 @@ class GNNTracker(nn.Module):
             at_once = torch.full((new.shape[0],), self.confirm_hits == 1, dtype=torch.bool)
             confirmed = torch.cat([confirmed, at_once])
             start = self._start(born, xyxy_to_center(box[new]))
-            living = _Living(
-                torch.cat([living.rows[alive], start.rows]),
-                KalmanState(
-                    torch.cat([living.box.position[alive], start.box.position]),
-                    torch.cat([living.box.velocity[alive], start.box.velocity]),
-                    torch.cat([living.box.p00[alive], start.box.p00]),
-                    torch.cat([living.box.p01[alive], start.box.p01]),
-                    torch.cat([living.box.p11[alive], start.box.p11]),
-                ),
-                torch.cat([living.history[alive], start.history]),
-                torch.cat([living.age[alive], start.age]),
-            )
+            living = joined(living, alive, start)
         return table[confirmed]
+
+    def _alive(self, living: Living, confirmed: Tensor) -> Tensor:
+        """(n,) bool, which tracks go on."""
+        misses = living.age.clamp(max=self.delete_window) - living.history[:, : self.delete_window].sum(-1)
+        return torch.where(confirmed, misses < self.delete_misses, living.age < self.confirm_window)
 
     def _process_noise(self) -> Tensor:
         return torch.full([1], self.process_noise, dtype=torch.float64)
@@ -256,28 +271,28 @@ class GNNTracker(nn.Module):
     def _measurement_noise(self) -> Tensor:
         return torch.full([1], self.measurement_noise, dtype=torch.float64)
 
-    def _start(self, rows: Tensor, z: Tensor) -> _Living:
+    def _start(self, rows: Tensor, z: Tensor) -> Living:
         """Tracks that begin with boxes ``z``."""
         p00 = torch.full_like(z[:, :1], self.measurement_noise)
         p11 = torch.full_like(z[:, :1], self.initial_speed**2)
         history = torch.zeros(z.shape[0], max(self.confirm_window, self.delete_window), dtype=torch.bool)
         history[:, 0] = True
         state = KalmanState(z, torch.zeros_like(z), p00, torch.zeros_like(p00), p11)
-        return _Living(rows, state, history, torch.ones_like(rows))
+        return Living(rows, state, history, torch.ones_like(rows))
 
-    def _correct(self, s: _Living, z: Tensor, column: Tensor) -> _Living:
+    def _correct(self, s: Living, z: Tensor, column: Tensor) -> Living:
         """The Kalman update of matched tracks, and one more hit or miss for all."""
         hit = column >= 0
         measured = torch.zeros_like(s.box.position)
         measured[hit] = z[column[hit]]
-        return _Living(
+        return Living(
             s.rows,
             kalman_update(s.box, measured, self._measurement_noise(), hit.unsqueeze(-1)),
             torch.cat([hit.unsqueeze(-1), s.history[:, :-1]], dim=-1),
             s.age + 1,
         )
 
-    def _assign(self, s: _Living, box: Tensor, score: Tensor, confirmed: Tensor) -> Tensor:
+    def _assign(self, s: Living, box: Tensor, score: Tensor, confirmed: Tensor) -> Tensor:
         """Detection of each living track among the boxes of a frame (n,), -1 for none."""
         x = s.box.position
         size = x[:, 2:].amax(-1).clamp(min=self.min_box_px)
