@@ -101,6 +101,14 @@ def still_beside_others(ends: Tensor, valid: Tensor, least: float = 0.04) -> Ten
     return (far <= least) & valid.any(dim=-1) & (far > least).any()
 
 
+def ankles_apart(keypoints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Neck (..., 2) and size (...) of bodies in pixels, and the way (..., 2) from right to left ankle in such sizes."""
+    neck = (keypoints[..., 5, :] + keypoints[..., 6, :]) / 2
+    ankles = (keypoints[..., 15, :] + keypoints[..., 16, :]) / 2
+    size = torch.linalg.vector_norm(neck - ankles, dim=-1).clamp(min=1.0)
+    return neck, size, (keypoints[..., 15, :] - keypoints[..., 16, :]) / size.unsqueeze(-1)
+
+
 def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
     """How much people walk: 0 standing to 1 walking, from how the ankles move against each other within a second.
 
@@ -116,10 +124,7 @@ def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
     Returns:
         (..., T) in [0, 1].
     """
-    neck = (keypoints[..., 5, :] + keypoints[..., 6, :]) / 2
-    ankles = (keypoints[..., 15, :] + keypoints[..., 16, :]) / 2
-    size = torch.linalg.vector_norm(neck - ankles, dim=-1).clamp(min=1.0)
-    apart = (keypoints[..., 15, :] - keypoints[..., 16, :]) / size.unsqueeze(-1)
+    neck, size, apart = ankles_apart(keypoints)
     weights = upright.to(apart.dtype)
     spread = torch.zeros_like(size)
     for axis in range(2):
@@ -162,10 +167,7 @@ def cadence(
         Hertz (...), and the share (...) of the power in [0, 1] that a sinusoid of this frequency takes: 0 where nobody
         walks for a second, or the peak is at an end of the band.
     """
-    neck = (keypoints[..., 5, :] + keypoints[..., 6, :]) / 2
-    ankles = (keypoints[..., 15, :] + keypoints[..., 16, :]) / 2
-    size = torch.linalg.vector_norm(neck - ankles, dim=-1).clamp(min=1.0)
-    apart = (keypoints[..., 15, :] - keypoints[..., 16, :]) / size.unsqueeze(-1)
+    _, _, apart = ankles_apart(keypoints)
     # What changes in a second and more, such as the heading, is not of the steps.
     slow = torch.stack([local_linear(apart[..., axis], walking, 0.5 * fps) for axis in range(2)], dim=-1)
     squared = (apart - slow).square().sum(dim=-1)
