@@ -141,6 +141,12 @@ def check_key_points(keypoints: Tensor, scores: Tensor, valid: Tensor, rank: int
     check_finite(scores, "scores")
 
 
+def check_image_size(height: int, width: int) -> None:
+    """Refuse a picture without pixels."""
+    if height < 1 or width < 1:
+        raise TensorsimError(f"image: got {height} x {width} pixels, expected at least 1 x 1")
+
+
 def check_not_empty(x: Tensor, name: str) -> None:
     """Refuse a tensor without elements."""
     if x.numel() == 0:

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from tensorsim.config import CameraConfig
 from tensorsim.errors import (
-    TensorsimError,
     check_count,
+    check_image_size,
     check_key_points,
     check_per_person,
     check_positive,
@@ -209,8 +209,7 @@ class CameraCalibrator(nn.Module):
     ) -> CameraEstimate:
         """Key points, scores, valid, image size, frame rate -> the cameras of the clips."""
         check_key_points(keypoints, scores, valid, 4, "(..., P, T, 17, 2) key points in pixels")
-        if image_height < 1 or image_width < 1:
-            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        check_image_size(image_height, image_width)
         check_positive(fps, "fps")
         shape = keypoints.shape[:-4]
         people, frames = keypoints.shape[-4], keypoints.shape[-3]

@@ -10,6 +10,7 @@ from tensorsim.config.people import PANEL_DISTANCES_M
 from tensorsim.errors import (
     TensorsimError,
     check_finite,
+    check_image_size,
     check_mask,
     check_per_person,
     check_points,
@@ -367,6 +368,5 @@ def _check(
         raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
     check_finite(keypoints, "keypoints")
     check_finite(scores, "scores")
-    if image_height < 1 or image_width < 1:
-        raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+    check_image_size(image_height, image_width)
     check_positive(fps, "fps")

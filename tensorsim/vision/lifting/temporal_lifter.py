@@ -18,6 +18,7 @@ from tensorsim.errors import (
     check_count,
     check_finite,
     check_floating,
+    check_image_size,
     check_mask,
     check_per_person,
     check_points,
@@ -151,8 +152,7 @@ class TemporalLifter(nn.Module):
     ) -> TemporalPose:
         """Key points, scores, boxes, valid, image size and fps -> TemporalPose."""
         _check(keypoints, scores, boxes, valid)
-        if image_height < 1 or image_width < 1:
-            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        check_image_size(image_height, image_width)
         check_positive(fps, "fps")
         lead, frames = keypoints.shape[:-3], keypoints.shape[-3]
         tracks = keypoints[..., 0, 0, 0].numel()

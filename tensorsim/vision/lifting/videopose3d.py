@@ -17,6 +17,7 @@ from tensorsim.errors import (
     TensorsimError,
     check_finite,
     check_floating,
+    check_image_size,
     check_min_rank,
     check_not_empty,
     check_size,
@@ -217,8 +218,7 @@ class VideoPoseLifter(nn.Module):
 
     def __init__(self, network: VideoPose3D, image_height: int, image_width: int) -> None:
         super().__init__()
-        if image_height < 1 or image_width < 1:
-            raise TensorsimError(f"image: got {image_height} x {image_width} pixels, expected at least 1 x 1")
+        check_image_size(image_height, image_width)
         self.network = network
         self.image_height, self.image_width = image_height, image_width
 
