@@ -9,6 +9,7 @@ from torch.nn import functional as F
 
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_floating,
     check_like_weights,
@@ -143,10 +144,8 @@ class ImageClassifier(nn.Module):
     def __init__(self, num_classes: int, in_channels: int) -> None:
         super().__init__()
         self.name = type(self).__name__
-        if num_classes < 1 or in_channels < 1:
-            raise TensorsimError(
-                f"{self.name}: got {num_classes} classes and {in_channels} channels, expected at least one of each"
-            )
+        check_count(num_classes, f"{self.name}.num_classes")
+        check_count(in_channels, f"{self.name}.in_channels")
         self.num_classes, self.in_channels = num_classes, in_channels
         self.register_buffer("mean", torch.zeros(in_channels))
 

@@ -9,7 +9,7 @@ import os
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.recognition.blocks import as_pictures, centred, conv_norm
 
 #: Groups of each version; the widths of the stages are 16, 32 and 64 times this number.
@@ -74,10 +74,8 @@ class SPGNet(nn.Module):
 
     def __init__(self, num_classes: int = 12, in_channels: int = 1, version: str = "s2p6") -> None:
         super().__init__()
-        if num_classes < 1 or in_channels < 1:
-            raise TensorsimError(
-                f"SPGNet: got {num_classes} classes and {in_channels} channels, expected at least one of each"
-            )
+        check_count(num_classes, "SPGNet.num_classes")
+        check_count(in_channels, "SPGNet.in_channels")
         if version not in VERSIONS:
             raise TensorsimError(f"SPGNet.version: got {version!r}, expected one of {', '.join(VERSIONS)}")
         self.num_classes, self.in_channels = num_classes, in_channels

@@ -10,7 +10,7 @@ import os
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_count
 from tensorsim.recognition.blocks import SameConv, as_pictures, centred, glorot
 
 
@@ -74,10 +74,8 @@ class SPNet(nn.Module):
         self, num_classes: int = 12, in_channels: int = 1, activation: str = "relu", padding: str = "matlab"
     ) -> None:
         super().__init__()
-        if num_classes < 1 or in_channels < 1:
-            raise TensorsimError(
-                f"SPNet: got {num_classes} classes and {in_channels} channels, expected at least one of each"
-            )
+        check_count(num_classes, "SPNet.num_classes")
+        check_count(in_channels, "SPNet.in_channels")
         if activation not in ("relu", "none"):
             raise TensorsimError(f"SPNet.activation: got {activation!r}, expected 'relu' or 'none'")
         if padding not in ("matlab", "torch"):

@@ -285,8 +285,8 @@ def test_weights_survive_a_file(kind: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: CCLN(0), "CCLN: got 0 classes"),
-        (lambda: MRWCN(3, 0), "0 channels"),
+        (lambda: CCLN(0), "CCLN.num_classes: got 0"),
+        (lambda: MRWCN(3, 0), "in_channels: got 0"),
         (lambda: FourierNet(size=40), "got 40, expected a multiple of 16"),
         (lambda: GlobalFilterNet(version="l"), "got 'l', expected one of tiny, xs, s, b"),
         (lambda: GlobalFilterNet(size=8), "got 8, expected a multiple of 16"),

@@ -173,11 +173,11 @@ def test_weights_survive_a_file(kind: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("network", "message"),
     [
-        (lambda: SPNet(0), "got 0 classes"),
-        (lambda: SPNet(in_channels=0), "0 channels"),
+        (lambda: SPNet(0), "num_classes: got 0"),
+        (lambda: SPNet(in_channels=0), "in_channels: got 0"),
         (lambda: SPNet(activation="gelu"), "got 'gelu', expected 'relu' or 'none'"),
         (lambda: SPNet(padding="same"), "got 'same', expected 'matlab' or 'torch'"),
-        (lambda: SPGNet(0), "got 0 classes"),
+        (lambda: SPGNet(0), "num_classes: got 0"),
         (lambda: SPGNet(version="s3"), "got 's3', expected one of s2p6"),
     ],
 )
