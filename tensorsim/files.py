@@ -22,6 +22,12 @@ SUMMARY = "summary.json"
 MAX_MEMO = 1_000_000
 
 
+def check_folder(path: Path, option: str = "--out") -> None:
+    """Refuse a file where a folder is wanted, which need not be there yet."""
+    if path.exists() and not path.is_dir():
+        raise TensorsimError(f"{option}: {path} is a file, expected a folder")
+
+
 @contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
     """Turn any error that a reader raises on a damaged or wrong file into one that names the file."""

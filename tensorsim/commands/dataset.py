@@ -8,6 +8,7 @@ import tyro
 
 from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
+from tensorsim.files import check_folder
 
 if TYPE_CHECKING:
     from tensorsim.data.sets.engines import Engine
@@ -44,8 +45,7 @@ class DatasetBuild:
         check_count(self.workers, "--workers")
         if self.address is not None and self.engine != "ray":
             raise TensorsimError("--address: got one without --engine ray, expected both")
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        check_folder(self.out)
         from tensorsim.data.sets.build import build_dataset
         from tensorsim.data.sets.recipe import DatasetRecipe
 

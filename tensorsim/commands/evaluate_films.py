@@ -11,6 +11,7 @@ from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
 from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
+from tensorsim.files import check_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +56,7 @@ class EvaluateFilms(NetworkOptions):
     def run(self) -> None:
         """Do it."""
         check_seed(self.seed)
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        check_folder(self.out)
         check_count(self.stride, "--stride")
         if len(self.scenes) == 0:
             raise TensorsimError("--scenes: got none, expected at least one")

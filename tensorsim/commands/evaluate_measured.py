@@ -7,7 +7,7 @@ from typing import Literal
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, check_count
-from tensorsim.files import complete_file, write_json
+from tensorsim.files import check_folder, complete_file, write_json
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,7 @@ class EvaluateMeasured:
         check_seed(self.seed)
         for name, count in (("--clips", self.clips), ("--steps", self.steps), ("--repeats", self.repeats)):
             check_count(count, name)
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        check_folder(self.out)
         folders = [self.train] if self.test is None else [self.train, self.test]
         for folder in folders:
             if not folder.is_dir():

@@ -8,6 +8,7 @@ from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import default_networks
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.files import check_folder
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,7 @@ class EvaluateTruth:
 
     def run(self) -> None:
         """Do it."""
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        check_folder(self.out)
         check_seed(self.seed)
         if self.motion_fps is not None and not self.motion:
             raise TensorsimError("--motion-fps: got it without --motion, which it is of")

@@ -8,6 +8,7 @@ import tyro
 
 from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError, check_count
+from tensorsim.files import check_folder
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,9 @@ class RunExperiment:
         find_experiment(self.name)
         if self.out is None:
             raise TensorsimError("--out: got nothing, expected a folder for the results")
-        for option, folder in (("--out", self.out), ("--cache", self.cache)):
-            if folder is not None and folder.exists() and not folder.is_dir():
-                raise TensorsimError(f"{option}: {folder} is a file, expected a folder")
+        check_folder(self.out)
+        if self.cache is not None:
+            check_folder(self.cache, "--cache")
         check_count(self.jobs, "--jobs")
         config = configuration(self.name, self.quick, self.config, self._settings())
         work = Work(self.out / "work" if self.cache is None else self.cache, self.jobs, self.quiet)

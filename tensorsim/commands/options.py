@@ -15,7 +15,8 @@ from tensorsim.array_files import array_formats
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
-from tensorsim.exceptions import TensorsimError, TensorsimWarning
+from tensorsim.exceptions import TensorsimError, TensorsimWarning, check_count
+from tensorsim.files import check_folder
 
 if TYPE_CHECKING:
     import torch
@@ -47,8 +48,7 @@ FIELDS |= PANEL_FIELDS | RECEIVER_FIELDS
 
 def check_seed(seed: int, option: str = "--seed") -> None:
     """Refuse a seed that some generator would not take."""
-    if not 0 <= seed < 2**32:
-        raise TensorsimError(f"{option}: got {seed}, expected an integer from 0 to 2^32 - 1")
+    check_count(seed, option, 0, 2**32 - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,8 +136,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
                 f"--least-probability: got {self.least_probability}, expected a number from 0 to 1"
             )
         array_formats(self.save)
-        if out.exists() and not out.is_dir():
-            raise TensorsimError(f"--out: {out} is a file, expected a folder")
+        check_folder(out)
 
     def described(self) -> dict[str, Any]:
         """The options that were given, as ``summary.json`` has them."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.files import check_folder
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,7 @@ class TrainAcf:
         from tensorsim.weights import save_weights
 
         check_seed(self.seed)
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"--out: {self.out} is a file, expected a folder")
+        check_folder(self.out)
         settings = AcfSettings(self.rounds, self.positives, self.negatives, seed=self.seed)
         trainer = AcfTrainer(self.data, settings, self.quiet)
         detector = trainer.train()
