@@ -28,7 +28,7 @@ from tensorsim.process import end_with_parent
 from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.training.classifier import held_out
-from tensorsim.training.loop import Batch, LoopConfig, Recipe, fit
+from tensorsim.training.loop import Batch, LoopConfig, Recipe, decay_groups, fit
 from tensorsim.weights import load_state_dict, load_strict
 
 LEARNING_RATE = 1.47e-3
@@ -122,10 +122,7 @@ class PaperRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """Adam; no L2 on biases and normalisation."""
-        weights = [p for p in self.net.parameters() if p.dim() > 1]
-        rest = [p for p in self.net.parameters() if p.dim() <= 1]
-        groups = [{"params": weights, "weight_decay": L2}, {"params": rest, "weight_decay": 0.0}]
-        return torch.optim.Adam(groups, lr=LEARNING_RATE)
+        return torch.optim.Adam(decay_groups(self.net, L2), lr=LEARNING_RATE)
 
     def rate(self, step: int, steps: int) -> float:
         """1, and 0.1 in the second half."""

@@ -13,7 +13,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.recognition.map_image import scaled
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
-from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.maps import MapStore
 from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict, read_metadata
@@ -197,12 +197,7 @@ class ClassifierRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """Adam; no L2 on biases and normalisation."""
-        weights = [p for p in self.net.parameters() if p.dim() > 1]
-        rest = [p for p in self.net.parameters() if p.dim() <= 1]
-        return torch.optim.Adam(
-            [{"params": weights, "weight_decay": 1e-4}, {"params": rest, "weight_decay": 0.0}],
-            lr=self.settings["learning_rate"],
-        )
+        return torch.optim.Adam(decay_groups(self.net, 1e-4), lr=self.settings["learning_rate"])
 
     def rate(self, step: int, steps: int) -> float:
         """1, and 0.1 in the second half."""

@@ -13,7 +13,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.geometry.boxes import distances_to_boxes
 from tensorsim.training.assign import detection_losses, distillation_loss
 from tensorsim.training.detector_data import PictureMaker, Sources
-from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.pose_data import lean_deg
 from tensorsim.training.shards import Sample, Shards, find_shards, read_coco_shards
 from tensorsim.vision.detection.rtmdet import RTMDet
@@ -168,10 +168,7 @@ class DetectorRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; norms and biases do not decay."""
-        heavy = [p for p in self.net.parameters() if p.ndim > 1]
-        light = [p for p in self.net.parameters() if p.ndim <= 1]
-        groups = [{"params": heavy, "weight_decay": 0.05}, {"params": light, "weight_decay": 0.0}]
-        return torch.optim.AdamW(groups, lr=self.learning_rate)
+        return torch.optim.AdamW(decay_groups(self.net, 0.05), lr=self.learning_rate)
 
     def rate(self, step: int, steps: int) -> float:
         """Linear warm-up, flat to the half, then a cosine to one in twenty."""

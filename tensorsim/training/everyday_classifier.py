@@ -17,7 +17,7 @@ from tensorsim.recognition.networks import find_classifier
 from tensorsim.training.classifier import RANGE_DB, held_out
 from tensorsim.training.everyday_maps import EverydayStore
 from tensorsim.training.expected_map import noise_rows
-from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.maps import SCENES
 from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict, save_weights
@@ -193,12 +193,7 @@ class EverydayRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; no decay of biases and normalisation."""
-        weights = [p for p in self.net.parameters() if p.dim() > 1]
-        rest = [p for p in self.net.parameters() if p.dim() <= 1]
-        return torch.optim.AdamW(
-            [{"params": weights, "weight_decay": 0.02}, {"params": rest, "weight_decay": 0.0}],
-            lr=self.settings["learning_rate"],
-        )
+        return torch.optim.AdamW(decay_groups(self.net, 0.02), lr=self.settings["learning_rate"])
 
     def rate(self, step: int, steps: int) -> float:
         """A short rise, then half a cosine down to a hundredth."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import BONES, bone_lengths, coco_to_body, mid_hips
 from tensorsim.training.lifter_motion import MotionPool
 from tensorsim.training.lifter_views import THRESHOLD, Windows, film
-from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.vision.lifting.sight import Sight
 from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
 from tensorsim.vision.lifting.videopose3d import body_to_h36m, h36m_to_body
@@ -139,13 +139,8 @@ class LifterRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; no decay of offsets and norms."""
-        decayed = [p for p in self.net.parameters() if p.dim() > 1]
-        others = [p for p in self.net.parameters() if p.dim() <= 1]
-        return torch.optim.AdamW(
-            [{"params": decayed, "weight_decay": 0.02}, {"params": others, "weight_decay": 0.0}],
-            lr=self.learning_rate,
-            betas=(0.9, 0.98),
-        )
+        groups = decay_groups(self.net, 0.02)
+        return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(0.9, 0.98))
 
     def rate(self, step: int, steps: int) -> float:
         """Rises over 300 steps, then falls along a cosine."""

@@ -24,10 +24,19 @@ from tqdm import tqdm
 
 from tensorsim.device import rank_and_processes, usable_device
 from tensorsim.errors import TensorsimError, check_count
-from tensorsim.files import complete_file
+from tensorsim.files import check_folder, complete_file
 from tensorsim.weights import save_weights
 
 Batch = dict[str, Any]
+
+
+def decay_groups(net: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
+    """Parameters for an optimiser: those of products and convolutions decay, biases and normalisation do not."""
+    parameters = list(net.parameters())
+    return [
+        {"params": [p for p in parameters if p.dim() > 1], "weight_decay": weight_decay},
+        {"params": [p for p in parameters if p.dim() <= 1], "weight_decay": 0.0},
+    ]
 
 
 class Recipe:
@@ -121,8 +130,7 @@ class LoopConfig:
             raise TensorsimError(
                 f"LoopConfig: got precision {self.precision!r}, expected 'bfloat16' or 'float32'"
             )
-        if self.out.exists() and not self.out.is_dir():
-            raise TensorsimError(f"LoopConfig: {self.out} is a file, expected a folder")
+        check_folder(self.out, "LoopConfig.out")
 
     def fingerprint(self) -> dict[str, Any]:
         """Settings that must not change when a run is resumed. The number of steps may."""

@@ -15,7 +15,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.training.classifier import LEARNING_RATE, NETWORKS
-from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict
 
@@ -148,10 +148,7 @@ class MapRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """Adam; no L2 on biases and normalisation."""
-        weights = [p for p in self.net.parameters() if p.dim() > 1]
-        rest = [p for p in self.net.parameters() if p.dim() <= 1]
-        groups = [{"params": weights, "weight_decay": 1e-4}, {"params": rest, "weight_decay": 0.0}]
-        return torch.optim.Adam(groups, lr=self.learning_rate)
+        return torch.optim.Adam(decay_groups(self.net, 1e-4), lr=self.learning_rate)
 
     def rate(self, step: int, steps: int) -> float:
         """1, and 0.1 in the second half."""

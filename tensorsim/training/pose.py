@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
 from tensorsim.training.colours import Picture, recoloured
-from tensorsim.training.loop import Batch, Recipe
+from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.pose_data import (
     Augmentation,
     Person,
@@ -298,14 +298,7 @@ class PoseRecipe(Recipe):
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; no decay of biases and normalisation."""
-        parameters = list(self.net.parameters())
-        return torch.optim.AdamW(
-            [
-                {"params": [p for p in parameters if p.ndim > 1], "weight_decay": 0.02},
-                {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
-            ],
-            lr=self.learning_rate,
-        )
+        return torch.optim.AdamW(decay_groups(self.net, 0.02), lr=self.learning_rate)
 
     def rate(self, step: int, steps: int) -> float:
         """Linear warm-up over a fiftieth, then a cosine down to a hundredth."""
