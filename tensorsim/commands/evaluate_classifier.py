@@ -67,11 +67,13 @@ class EvaluateClassifier:
         from tensorsim import plot
         from tensorsim.config import ACTIVITIES
         from tensorsim.recognition.confusion import confusion
-        from tensorsim.training.classifier import clips_of, load_classifier, logits_of
+        from tensorsim.recognition.recognizer import stored_classifier
+        from tensorsim.training.classifier import clips_of, logits_of
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         assert self.maps is not None
-        network, size = load_classifier(self.weights)
+        network, stated = stored_classifier(self.weights)
+        size = int(stated["size"])
         settings = MapSettings(seed=self.maps_seed)
         build_maps(self.maps, self.people, self.scenes, settings, quiet=self.quiet)
         store = MapStore(self.maps)

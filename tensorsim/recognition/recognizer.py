@@ -22,6 +22,23 @@ INPUTS = {"doppler": 1, "ridges": 1, "merged": 2}
 NETWORKS: dict[str, type[SPNet] | type[SPGNet]] = {"SPNet": SPNet, "SPGNet": SPGNet}
 
 
+def stored_classifier(path: Path) -> tuple[SPNet | SPGNet, dict[str, str]]:
+    """The network of a weight file, and what the header of the file states.
+
+    Raises:
+        TensorsimError: no such file, or weights of neither network.
+    """
+    if not path.is_file():
+        raise TensorsimError(f"{path}: no such file, expected the weights of a classifier")
+    stated = read_metadata(path)
+    if stated.get("network") not in NETWORKS or "size" not in stated:
+        raise TensorsimError(
+            f"{path}: got the metadata {stated or 'none'}, expected network (one of {', '.join(NETWORKS)}), "
+            "size, speed_m_s and range_db"
+        )
+    return NETWORKS[stated["network"]].from_pretrained(path), stated
+
+
 class ActivityRecognizer(nn.Module):
     """Maps of one radar to the logits of activities, or of classes of your own.
 
@@ -171,18 +188,11 @@ class ActivityRecognizer(nn.Module):
         from tensorsim.registry import locate
 
         path = locate(source, "SPGNet", "SPNet")
-        if not path.is_file():
-            raise TensorsimError(f"{path}: no such file, expected the weights of a classifier")
-        stated = read_metadata(path)
-        if stated.get("network") not in NETWORKS or "size" not in stated:
-            raise TensorsimError(
-                f"{path}: got the metadata {stated or 'none'}, expected network (one of {', '.join(NETWORKS)}), "
-                "size, speed_m_s and range_db"
-            )
+        network, stated = stored_classifier(path)
         names = stated.get("class_names")
         return cls(
             radar,
-            NETWORKS[stated["network"]].from_pretrained(path),
+            network,
             stated.get("inputs", "doppler"),
             int(stated["size"]),
             float(stated.get("speed_m_s", 3.8)),

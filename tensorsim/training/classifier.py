@@ -16,7 +16,7 @@ from tensorsim.recognition.spnet import SPNet
 from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.maps import MapStore
 from tensorsim.training.order import shuffled
-from tensorsim.weights import load_state_dict, load_strict, read_metadata
+from tensorsim.weights import load_state_dict, load_strict
 
 #: Networks by name, each with the size of the pictures that its authors give it.
 NETWORKS: dict[str, tuple[type[nn.Module], int]] = {"spnet": (SPNet, 224), "spgnet": (SPGNet, 32)}
@@ -238,26 +238,3 @@ def logits_of(
         x = torch.stack(pictures).to(parameter, memory_format=torch.channels_last)
         found.append(net(x).float().cpu())
     return torch.cat(found)
-
-
-class Classifier(NamedTuple):
-    """A network and the height and width of the pictures that it was trained on."""
-
-    network: nn.Module
-    size: int
-
-
-def load_classifier(path: Path) -> Classifier:
-    """The network of a weight file, SPNet or SPGNet, and the size of its pictures.
-
-    Raises:
-        TensorsimError: no such file, or weights of neither.
-    """
-    kinds = {kind.__name__: kind for kind, _ in NETWORKS.values()}
-    stated = read_metadata(path)
-    if stated.get("network") not in kinds or "size" not in stated:
-        raise TensorsimError(
-            f"{path}: its header says {stated or 'nothing'}, expected size and network ({', '.join(kinds)})"
-        )
-    network = kinds[stated["network"]].from_pretrained(path)  # type: ignore[attr-defined]
-    return Classifier(network, int(stated["size"]))

@@ -16,7 +16,6 @@ from tensorsim.training.classifier import (
     clips_of,
     drawn_snr,
     held_out,
-    load_classifier,
     logits_of,
     masked,
     picture,
@@ -24,7 +23,6 @@ from tensorsim.training.classifier import (
 from tensorsim.training.loop import LoopConfig, fit
 from tensorsim.training.maps import MapSettings, MapStore, to_bytes
 from tensorsim.training.order import shuffled
-from tensorsim.weights import save_weights
 
 pytest.importorskip("tensorboard")
 SIZE = 32
@@ -86,19 +84,6 @@ def test_learns_patterns_of_people_it_has_not_seen(
     counts = confusion(logits_of(mine.net, store, clips, (50.0, 50.0), SIZE), torch.arange(12).repeat(2))
     assert counts.sum(1).tolist() == [2] * 12
     assert int(counts.diagonal().sum()) >= 22
-
-
-@pytest.mark.parametrize(("network", "size"), [("spgnet", 32), ("spnet", 112)])
-def test_a_weight_file_says_which_network_it_is(network: str, size: int, tmp_path: Path) -> None:
-    kind = NETWORKS[network][0]
-    path = tmp_path / "w.safetensors"
-    save_weights(kind(12), path, {"network": kind.__name__, "size": str(size)})
-    loaded, found = load_classifier(path)
-    assert isinstance(loaded, kind)
-    assert found == size
-    save_weights(kind(12), path, {"size": str(size)})
-    with pytest.raises(TensorsimError, match=r"its header says .* expected size and network"):
-        load_classifier(path)
 
 
 def test_no_body_is_in_both_parts(store: MapStore) -> None:
