@@ -8,6 +8,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from tensorsim.config.documents import suggestion
 from tensorsim.errors import TensorsimError, first_line
 from tensorsim.files import complete_file, sha256_of
 from tensorsim.model_files import manifest, models_dir
@@ -215,16 +216,13 @@ def find(name: str, *networks: str) -> ModelEntry:
     Raises:
         TensorsimError: no such name; the message lists the known names and the most similar one.
     """
-    import difflib
-
     known = {entry.name: entry for entry in entries() if not networks or entry.network in networks}
     if name in known:
         return known[name]
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
     what = f"weights of {' or '.join(networks)}" if networks else "weights"
     raise TensorsimError(
-        f"{what}: got {name!r}, expected a path or one of: {', '.join(sorted(known)) or 'none'}{hint}"
+        f"{what}: got {name!r}, expected a path or one of: {', '.join(sorted(known)) or 'none'}"
+        f"{suggestion(name, list(known))}"
     )
 
 

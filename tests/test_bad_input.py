@@ -178,7 +178,7 @@ COMMAND_LINES: list[tuple[str, list[str], str]] = [
     ("paper position without distance", [*GOOD, "--position", "paper"], "initial-distance"),
     ("unknown device", [*GOOD, "--device", "abacus"], "device"),
     ("out is a file", [*GOOD, "--out", "a_file"], "a_file"),
-    ("unknown detector", ["good.avi", "--detector", "rtmdet-m-persn"], "did you mean rtmdet-m-person"),
+    ("unknown detector", ["good.avi", "--detector", "rtmdet-m-persn"], "perhaps 'rtmdet-m-person'"),
     ("unknown pose network", ["good.avi", "--pose", "hrnet-w32-coc"], "--pose"),
     ("unknown classifier", ["good.avi", "--classifier", "spgnet-activites"], "--classifier"),
     ("missing detector", ["good.avi", "--detector", "none.onnx", "--pose", "other.pth"], "none.onnx"),

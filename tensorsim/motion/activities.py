@@ -12,6 +12,7 @@ from tensorsim.body.kinematics import forward_kinematics, rotation
 from tensorsim.body.proportions import ANKLE_HEIGHT, FLESH, Proportions
 from tensorsim.body.skeleton import mirror
 from tensorsim.config import ACTIVITIES
+from tensorsim.config.documents import suggestion
 from tensorsim.errors import TensorsimError, check_count, check_positive
 from tensorsim.motion.act import Act
 from tensorsim.motion.feet import LEFT_LEG, RIGHT_LEG, place_ankles
@@ -58,12 +59,10 @@ def activity_index(name: str) -> int:
     for i, full in enumerate(ACTIVITIES):
         if wanted in (full.lower(), full.lower().split(" ", 1)[1], full.lower().split(" ", 1)[0]):
             return i
-    import difflib
-
     words = [full.lower().split(" ", 1)[1] for full in ACTIVITIES]
-    close = difflib.get_close_matches(wanted, words, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise TensorsimError(f"activity: got {name!r}{hint}, expected one of {', '.join(ACTIVITIES)}")
+    raise TensorsimError(
+        f"activity: got {name!r}, expected one of {', '.join(ACTIVITIES)}{suggestion(wanted, words)}"
+    )
 
 
 def _carried(act: Act, who: People) -> Tensor:

@@ -77,7 +77,7 @@ def test_nobody_is_filmed_for_empty(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"activity": "wlaking"}, "did you mean 'walking'"),
+        ({"activity": "wlaking"}, "perhaps 'walking'"),
         ({"duration": 0.0}, "--duration: got 0.0"),
         ({"duration": float("nan")}, "--duration: got nan"),
         ({"detector": "none.onnx"}, "--detector: none.onnx is not a file"),

@@ -57,7 +57,7 @@ def test_clips_of_a_row_and_of_rows_show_different_people() -> None:
     assert len(heights) == 36
     assert [clip.name for clip in rows["S8 Walking"]] == ["5", "6", "7"]
     assert not rows["S1 Empty"][0].present
-    with pytest.raises(TensorsimError, match="did you mean 'walking'"):
+    with pytest.raises(TensorsimError, match="perhaps 'walking'"):
         activity_clips(("wakling",), 1, 0)
 
 
