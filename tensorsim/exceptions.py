@@ -3,7 +3,7 @@
 import math
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from numbers import Integral
 from typing import Any
@@ -30,6 +30,12 @@ def check_count(value: object, name: str, least: int = 1, most: float = math.inf
         within = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
         raise TensorsimError(f"{name}: got {value!r}, expected an integer {within}")
     return count
+
+
+def check_choice(value: object, choices: Collection[str], name: str) -> None:
+    """Refuse anything but one of these names."""
+    if value not in choices:
+        raise TensorsimError(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
 
 
 def first_line(error: BaseException) -> str:

@@ -62,11 +62,9 @@ class ProcessingConfig:
 
     def __post_init__(self) -> None:
         make_plain(self)
-        require_choices(self, mti=Mti, integration=Integration)
+        require_choices(self, mti=Mti, integration=Integration, engine=Engine)
         if self.range_window is not None:
             require_choices(self, range_window=RangeWindow)
-        if self.engine not in ("time", "range-bins"):
-            raise TensorsimError(f"engine: got {self.engine!r}, expected 'time' or 'range-bins'")
         require_counts(self, "ridge_count", most=6)
         require_counts(self, "pulse_chunk", "energy_stride")
         require_positive("ProcessingConfig", window_s=self.window_s)

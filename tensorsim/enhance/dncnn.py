@@ -14,6 +14,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 from tensorsim.enhance.perona_malik import PeronaMalik
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_count,
     check_finite,
     check_floating,
@@ -184,8 +185,7 @@ class MapDenoiser(nn.Module):
     def __init__(self, network: DnCNN | PeronaMalik, tile: int = 1024, scale: str = "peak") -> None:
         super().__init__()
         check_count(tile, "MapDenoiser.tile")
-        if scale not in SCALES:
-            raise TensorsimError(f"MapDenoiser.scale: got {scale!r}, expected one of {SCALES}")
+        check_choice(scale, SCALES, "MapDenoiser.scale")
         self.network = network
         self.tile = tile
         self.scale = scale

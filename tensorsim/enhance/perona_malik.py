@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tensorsim.errors import (
-    TensorsimError,
+    check_choice,
     check_count,
     check_finite,
     check_floating,
@@ -60,10 +60,7 @@ class PeronaMalik(nn.Module):
         super().__init__()
         check_count(iterations, "PeronaMalik.iterations")
         check_positive(threshold, "PeronaMalik.threshold")
-        if conductance not in CONDUCTANCES:
-            raise TensorsimError(
-                f"PeronaMalik.conductance: got {conductance!r}, expected one of {CONDUCTANCES}"
-            )
+        check_choice(conductance, CONDUCTANCES, "PeronaMalik.conductance")
         self.reach = iterations
         self.threshold = threshold
         self.exponential = conductance == "exponential"

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES, SceneConfig, SimulationConfig
 from tensorsim.enhance.choice import DENOISERS, map_denoiser
-from tensorsim.errors import TensorsimError, TensorsimWarning, check_count
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_choice, check_count
 from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
@@ -189,8 +189,7 @@ class DenoiserConfig:
 
     def __post_init__(self) -> None:
         for scene in self.scenes:
-            if scene not in SCENES:
-                raise TensorsimError(f"scenes: got {scene!r}, expected one of {', '.join(SCENES)}")
+            check_choice(scene, SCENES, "scenes")
         counts = {
             "denoisers": len(self.denoisers),
             "scenes": len(self.scenes),

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.errors import TensorsimError, check_choice, check_count
 from tensorsim.experiments import figures
 from tensorsim.experiments.pictures import INPUTS
 from tensorsim.experiments.trials import Trial, run_trials
@@ -85,8 +85,7 @@ class InputsConfig:
         if not self.inputs:
             raise TensorsimError("inputs: got none, expected at least one")
         for name in self.inputs:
-            if name not in INPUTS:
-                raise TensorsimError(f"inputs: got {name!r}, expected one of {', '.join(INPUTS)}")
+            check_choice(name, INPUTS, "inputs")
 
     def trials(self) -> list[Trial]:
         """All trainings, seed after seed."""
@@ -104,8 +103,7 @@ def check_trainings(networks: Sequence[str], scenes: Sequence[str], seeds: int) 
     for name in networks:
         find_classifier(name)
     for scene in scenes:
-        if scene not in SCENES:
-            raise TensorsimError(f"scenes: got {scene!r}, expected one of {', '.join(SCENES)}")
+        check_choice(scene, SCENES, "scenes")
     for what, count in (("networks", len(networks)), ("scenes", len(scenes)), ("seeds", seeds)):
         check_count(count, what)
 

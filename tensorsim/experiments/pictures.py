@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimWarning, check_choice
 from tensorsim.experiments.work import Work, digest
 from tensorsim.files import complete_file
 from tensorsim.motion.resample import PoseResampler
@@ -57,8 +57,7 @@ class PictureSet:
         Raises:
             TensorsimError: unknown inputs.
         """
-        if inputs not in INPUTS:
-            raise TensorsimError(f"inputs: got {inputs!r}, expected one of {', '.join(INPUTS)}")
+        check_choice(inputs, INPUTS, "inputs")
         if inputs in ("doppler", "merged"):
             build_maps(self.folder("maps"), people, (self.scene,), self.settings, quiet=self.work.quiet)
         if inputs != "doppler":

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.experiments.pictures import INPUTS, SNR_DB, PictureSet
 from tensorsim.experiments.work import Work, digest, read_result, write_result
 from tensorsim.process import end_with_parent
@@ -66,8 +66,7 @@ class Trial:
     def check(self) -> None:
         """Raises TensorsimError: an unknown network or input, counts that cannot be."""
         find_classifier(self.network)
-        if self.inputs not in INPUTS:
-            raise TensorsimError(f"inputs: got {self.inputs!r}, expected one of {', '.join(INPUTS)}")
+        check_choice(self.inputs, INPUTS, "inputs")
         if self.clips < 5 or self.test_clips < 1:
             raise TensorsimError(
                 f"clips: got {self.clips} to train on and {self.test_clips} to test on, expected at least 5 and 1"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_choice
 from tensorsim.evaluation.clips import ActivityClip, activity_clips
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Observed
 from tensorsim.evaluation.scores import MAPS, Maps, compare
@@ -63,8 +63,7 @@ class VideoConfig:
         for name in self.activities:
             activity_index(name)
         for scene in self.scenes:
-            if scene not in SCENES:
-                raise TensorsimError(f"scenes: got {scene!r}, expected one of {', '.join(SCENES)}")
+            check_choice(scene, SCENES, "scenes")
         if not self.scenes:
             raise TensorsimError("scenes: got none, expected at least one")
         if self.clips < 1 or not 0.5 <= self.length_s <= 60:

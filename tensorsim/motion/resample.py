@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_finite,
     check_floating,
     check_min_rank,
@@ -110,8 +111,7 @@ class PoseResampler(nn.Module):
     def __init__(self, prf_hz: float, method: str = "spline") -> None:
         super().__init__()
         check_positive(prf_hz, "PoseResampler.prf_hz")
-        if method not in ("spline", "linear"):
-            raise TensorsimError(f'PoseResampler.method: got "{method}", expected "spline" or "linear"')
+        check_choice(method, ("spline", "linear"), "PoseResampler.method")
         self.prf_hz = float(prf_hz)
         self.method = method
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.recognition.blocks import ImageClassifier, SameConv, same_padding
 
 
@@ -154,10 +154,7 @@ class GlobalFilterNet(ImageClassifier):
         self, num_classes: int = 12, in_channels: int = 1, version: str = "tiny", size: int = 224
     ) -> None:
         super().__init__(num_classes, in_channels)
-        if version not in GLOBAL_FILTER_SIZES:
-            raise TensorsimError(
-                f"GlobalFilterNet.version: got {version!r}, expected one of {', '.join(GLOBAL_FILTER_SIZES)}"
-            )
+        check_choice(version, GLOBAL_FILTER_SIZES, "GlobalFilterNet.version")
         if size < 16 or size % 16:
             raise TensorsimError(f"GlobalFilterNet.size: got {size}, expected a multiple of 16")
         self.size = size

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_count,
     check_finite,
     check_floating,
@@ -102,8 +103,7 @@ class MapToImage(nn.Module):
                 f"MapToImage.span: got {span}, expected two finite numbers, the lower one first"
             )
         check_count(size, "MapToImage.size")
-        if scale not in SCALES:
-            raise TensorsimError(f"MapToImage.scale: got {scale!r}, expected one of {SCALES}")
+        check_choice(scale, SCALES, "MapToImage.scale")
         check_positive(range_db, "MapToImage.range_db")
         self.size, self.scale, self.range_db = size, scale, range_db
         self.low, self.high = float(low), float(high)

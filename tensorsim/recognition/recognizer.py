@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import TensorsimError, check_choice, check_positive
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.recognition.map_image import MapToImage, ridge_map
 from tensorsim.recognition.spgnet import SPGNet
@@ -80,10 +80,7 @@ class ActivityRecognizer(nn.Module):
         super().__init__()
         check_positive(temperature, "ActivityRecognizer.temperature")
         self.temperature = float(temperature)
-        if inputs not in INPUTS:
-            raise TensorsimError(
-                f"ActivityRecognizer.inputs: got {inputs!r}, expected one of {', '.join(INPUTS)}"
-            )
+        check_choice(inputs, INPUTS, "ActivityRecognizer.inputs")
         if either_way and inputs == "merged":
             raise TensorsimError(
                 "ActivityRecognizer.either_way: got True with 'merged', ranges have no other way"

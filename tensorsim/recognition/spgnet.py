@@ -9,7 +9,7 @@ import os
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.errors import TensorsimError, check_choice, check_count
 from tensorsim.recognition.blocks import as_pictures, centred, conv_norm
 
 #: Groups of each version; the widths of the stages are 16, 32 and 64 times this number.
@@ -76,8 +76,7 @@ class SPGNet(nn.Module):
         super().__init__()
         check_count(num_classes, "SPGNet.num_classes")
         check_count(in_channels, "SPGNet.in_channels")
-        if version not in VERSIONS:
-            raise TensorsimError(f"SPGNet.version: got {version!r}, expected one of {', '.join(VERSIONS)}")
+        check_choice(version, VERSIONS, "SPGNet.version")
         self.num_classes, self.in_channels = num_classes, in_channels
         groups = VERSIONS[version]
         self.register_buffer("mean", torch.zeros(in_channels))

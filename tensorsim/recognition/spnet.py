@@ -10,7 +10,7 @@ import os
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.errors import TensorsimError, check_choice, check_count
 from tensorsim.recognition.blocks import SameConv, as_pictures, centred, glorot
 
 
@@ -76,10 +76,8 @@ class SPNet(nn.Module):
         super().__init__()
         check_count(num_classes, "SPNet.num_classes")
         check_count(in_channels, "SPNet.in_channels")
-        if activation not in ("relu", "none"):
-            raise TensorsimError(f"SPNet.activation: got {activation!r}, expected 'relu' or 'none'")
-        if padding not in ("matlab", "torch"):
-            raise TensorsimError(f"SPNet.padding: got {padding!r}, expected 'matlab' or 'torch'")
+        check_choice(activation, ("relu", "none"), "SPNet.activation")
+        check_choice(padding, ("matlab", "torch"), "SPNet.padding")
         self.num_classes, self.in_channels = num_classes, in_channels
         self.metadata = {"activation": activation, "padding": padding}
         self.register_buffer("mean", torch.zeros(in_channels))

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.recognition.map_image import scaled
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
@@ -141,8 +141,7 @@ class ClassifierRecipe(Recipe):
         learning_rate: float = LEARNING_RATE,
         masks: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        if network not in NETWORKS:
-            raise TensorsimError(f"network: got {network!r}, expected one of {', '.join(NETWORKS)}")
+        check_choice(network, NETWORKS, "network")
         if not snr_db[0] <= snr_db[1]:
             raise TensorsimError(f"snr_db: got {snr_db}, expected the lower one first")
         if not all(0 <= part <= 1 for part in masks):

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from tensorsim.data.sets.reading import MapDataset, collate_maps
 from tensorsim.data.sets.transforms import RandomShift, SpecAugment
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.training.classifier import LEARNING_RATE, NETWORKS
@@ -91,8 +91,7 @@ class MapRecipe(Recipe):
         learning_rate: float = LEARNING_RATE,
         masks: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        if network not in NETWORKS:
-            raise TensorsimError(f"network: got {network!r}, expected one of {', '.join(NETWORKS)}")
+        check_choice(network, NETWORKS, "network")
         self.training = MapDataset(folder, "train", output, radars, labels)
         self.validation = MapDataset(folder, "validation", output, radars, self.training.labels)
         self.seed, self.labels = seed, LabelSet(self.training.labels)

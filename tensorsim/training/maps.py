@@ -23,7 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.evaluation.films import FPS
 from tensorsim.files import complete_file
 from tensorsim.motion.activities import ActivityGenerator
@@ -182,8 +182,7 @@ class MapMaker:
     """
 
     def __init__(self, scene: str, settings: MapSettings) -> None:
-        if scene not in SCENES:
-            raise TensorsimError(f"scene: got {scene!r}, expected one of {SCENES}")
+        check_choice(scene, SCENES, "scene")
         preset = PRESETS[scene]
         self.radar, self.settings = preset.radar, settings
         self.echo = EchoSynthesizer(preset.radar, preset.wall, multipath=preset.wall is not None)

@@ -182,7 +182,7 @@ def test_real_motion_between_frames(shared_data: Any) -> None:
     [
         ((0.0,), "prf_hz: got 0.0, expected a positive finite number"),
         ((float("inf"),), "prf_hz: got inf"),
-        ((100.0, "cubic"), 'method: got "cubic", expected "spline" or "linear"'),
+        ((100.0, "cubic"), "method: got 'cubic', expected one of spline, linear"),
     ],
 )
 def test_refuses_bad_settings(arguments: tuple[Any, ...], message: str) -> None:

@@ -175,8 +175,8 @@ def test_weights_survive_a_file(kind: Any, tmp_path: Path) -> None:
     [
         (lambda: SPNet(0), "num_classes: got 0"),
         (lambda: SPNet(in_channels=0), "in_channels: got 0"),
-        (lambda: SPNet(activation="gelu"), "got 'gelu', expected 'relu' or 'none'"),
-        (lambda: SPNet(padding="same"), "got 'same', expected 'matlab' or 'torch'"),
+        (lambda: SPNet(activation="gelu"), "got 'gelu', expected one of relu, none"),
+        (lambda: SPNet(padding="same"), "got 'same', expected one of matlab, torch"),
         (lambda: SPGNet(0), "num_classes: got 0"),
         (lambda: SPGNet(version="s3"), "got 's3', expected one of s2p6"),
     ],

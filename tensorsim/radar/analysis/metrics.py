@@ -12,7 +12,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_min_rank, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_choice,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_positive,
+)
 
 
 class Envelope(NamedTuple):
@@ -53,8 +60,7 @@ def normalise(maps: Tensor, scale: str = "db", range_db: float = 40.0) -> Tensor
         TensorsimError: unknown scale, a range that is not positive, negative or NaN magnitudes.
     """
     _check_map(maps, "map")
-    if scale not in ("linear", "db"):
-        raise TensorsimError(f"scale: got {scale!r}, expected 'linear' or 'db'")
+    check_choice(scale, ("linear", "db"), "scale")
     check_positive(range_db, "range_db")
     peak = maps.amax((-2, -1), keepdim=True)
     level = maps / torch.where(peak > 0, peak, 1.0)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_count,
     check_finite,
     check_floating,
@@ -112,8 +113,7 @@ class CfarDetector(nn.Module):
             raise TensorsimError(
                 f"CfarDetector: got false_alarm {false_alarm} and rank {rank}, expected both between 0 and 1"
             )
-        if method not in METHODS:
-            raise TensorsimError(f"CfarDetector.method: got {method!r}, expected one of {METHODS}")
+        check_choice(method, METHODS, "CfarDetector.method")
         if any(edge not in EDGES for edge in edges):
             raise TensorsimError(f"CfarDetector.edges: got {edges}, expected two of {EDGES}")
         check_count(looks, "looks")

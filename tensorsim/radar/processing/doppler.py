@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map, check_tensor, is_writing_onnx
+from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_tensor, is_writing_onnx
 from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.range_profile import gate_bins
 
@@ -187,10 +187,7 @@ class DopplerTimeMap(DopplerFrames):
         gate_m: tuple[float, float] | None = None,
     ) -> None:
         super().__init__(radar, window_s, overlap)
-        if integration not in ("noncoherent", "coherent", "paper"):
-            raise TensorsimError(
-                f"integration: got {integration!r}, expected 'noncoherent', 'coherent' or 'paper'"
-            )
+        check_choice(integration, ("noncoherent", "coherent", "paper"), "integration")
         self.integration = integration
         self.samples = radar.samples_per_chirp
         self.gated = gate_m is not None

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map
+from tensorsim.errors import TensorsimError, check_choice, check_complex_map
 from tensorsim.ops import flatten_batch, unflatten_batch
 from tensorsim.radar.processing.iir import BlockFilter
 
@@ -84,8 +84,7 @@ class MovingTargetIndicator(nn.Module):
         order: int = 4,
     ) -> None:
         super().__init__()
-        if method not in METHODS:
-            raise TensorsimError(f"method: got {method!r}, expected one of {METHODS}")
+        check_choice(method, METHODS, "method")
         if method == "n-pulse" and pulses < 2:
             raise TensorsimError(f"pulses: got {pulses}, expected at least 2")
         unused = [

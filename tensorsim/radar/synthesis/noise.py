@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_complex_map, check_positive
+from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_positive
 from tensorsim.limits import check_range
 
 BOLTZMANN_J_PER_K = 1.380649e-23
@@ -113,8 +113,7 @@ class ReceiverNoise(nn.Module):
         transmit_power_w: float = 0.01,
     ) -> None:
         super().__init__()
-        if reference not in ("echo", "total", "absolute"):
-            raise TensorsimError(f"reference: got {reference!r}, expected 'echo', 'total' or 'absolute'")
+        check_choice(reference, ("echo", "total", "absolute"), "reference")
         if snr_db is not None:
             check_range(snr_db, "ratio of powers", "snr_db")
         check_range(noise_figure_db, "ratio of powers", "noise_figure_db")

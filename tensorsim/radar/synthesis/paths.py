@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.errors import TensorsimError, check_choice, check_count
 from tensorsim.ops import safe_sqrt
 from tensorsim.radar.synthesis.legs import TracedLegs, flipped, leg_length, mirror_image, passes_face
 from tensorsim.radar.synthesis.wall import wall_tensors
@@ -196,13 +196,9 @@ class PropagationPaths(TracedLegs):
         wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
-        for option, value, known in (
-            ("wall_paths", wall_paths, ("series", "paper")),
-            ("incidence", incidence, ("normal", "oblique", "airy")),
-            ("polarization", polarization, ("te", "tm")),
-        ):
-            if value not in known:
-                raise TensorsimError(f"{option}: got {value!r}, expected one of {known}")
+        check_choice(wall_paths, ("series", "paper"), "wall_paths")
+        check_choice(incidence, ("normal", "oblique", "airy"), "incidence")
+        check_choice(polarization, ("te", "tm"), "polarization")
         if wall_paths == "paper" and incidence == "airy":
             raise TensorsimError(
                 "wall_paths: got 'paper' with incidence 'airy', which sums all bounces; expected 'normal' or 'oblique'"

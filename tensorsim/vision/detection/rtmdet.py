@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_count,
     check_not_empty,
     check_rank,
@@ -64,10 +65,7 @@ class RTMDet(nn.Module):
         input_size: int | None = None,
     ) -> None:
         super().__init__()
-        if variant not in RTMDET_SIZES:
-            raise TensorsimError(
-                f"RTMDet: got variant {variant!r}, expected one of {', '.join(RTMDET_SIZES)}"
-            )
+        check_choice(variant, RTMDET_SIZES, "RTMDet.variant")
         size = RTMDET_SIZES[variant]
         one_class = size.num_classes == 1
         self.variant = variant

@@ -9,6 +9,7 @@ from tensorsim.config import CameraConfig
 from tensorsim.config.people import PANEL_DISTANCES_M
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_finite,
     check_image_size,
     check_mask,
@@ -162,8 +163,7 @@ class MetricPose(nn.Module):
         calibrated: bool = False,
     ) -> None:
         super().__init__()
-        if mode not in ("camera", "paper"):
-            raise TensorsimError(f"MetricPose.mode: got {mode!r}, expected 'camera' or 'paper'")
+        check_choice(mode, ("camera", "paper"), "MetricPose.mode")
         self.mode = mode
         self.keypoint_threshold = keypoint_threshold
         self.range_smoothing_s = range_smoothing_s

@@ -8,7 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tensorsim.errors import TensorsimError, check_count, check_floating, check_min_rank, check_positive
+from tensorsim.errors import (
+    TensorsimError,
+    check_choice,
+    check_count,
+    check_floating,
+    check_min_rank,
+    check_positive,
+)
 
 METHODS = ("expected", "dark", "quarter")
 
@@ -223,8 +230,7 @@ class HeatmapDecoder(nn.Module):
         tolerance: float = 0.07,
     ) -> None:
         super().__init__()
-        if method not in METHODS:
-            raise TensorsimError(f"HeatmapDecoder: got method {method!r}, expected one of {METHODS}")
+        check_choice(method, METHODS, "HeatmapDecoder.method")
         check_positive(sharpness, "HeatmapDecoder.sharpness")
         check_positive(tolerance, "HeatmapDecoder.tolerance")
         if kernel_size < 1 or kernel_size % 2 == 0:

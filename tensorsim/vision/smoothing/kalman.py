@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from tensorsim.errors import (
     TensorsimError,
+    check_choice,
     check_finite,
     check_floating,
     check_mask,
@@ -227,8 +228,7 @@ class KalmanSmoother(nn.Module):
         initial_speed: float = 3.0,
     ) -> None:
         super().__init__()
-        if mode not in ("rts", "forward"):
-            raise TensorsimError(f"KalmanSmoother.mode: got {mode!r}, expected 'rts' or 'forward'")
+        check_choice(mode, ("rts", "forward"), "KalmanSmoother.mode")
         if mode == "forward":
             process_noise = PANEL_PROCESS_NOISE if process_noise is None else process_noise
             measurement_noise = PANEL_MEASUREMENT_NOISE if measurement_noise is None else measurement_noise

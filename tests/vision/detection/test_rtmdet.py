@@ -217,7 +217,7 @@ def test_distances_of_a_variant(fresh: dict[str, RTMDet], variant: str, exponent
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"variant": "nano"}, "got variant 'nano', expected one of nano-person, small-person, tiny"),
+        ({"variant": "nano"}, "variant: got 'nano', expected one of nano-person, small-person, tiny"),
         ({"score_threshold": -0.1}, "score_threshold: got -0.1"),
         ({"score_threshold": float("nan")}, "score_threshold: got nan"),
         ({"nms_iou": 1.5}, "nms_iou: got 1.5"),
@@ -362,7 +362,7 @@ def test_from_pretrained_refuses_other_networks(tmp_path: Path) -> None:
     torch.save(state, tmp_path / "nano.pth")
     with pytest.raises(TensorsimError, match="not the weights of this RTMDet"):
         RTMDet.from_pretrained(tmp_path / "nano.pth", variant="tiny")
-    with pytest.raises(TensorsimError, match="got variant 'huge'"):
+    with pytest.raises(TensorsimError, match="variant: got 'huge'"):
         RTMDet.from_pretrained(tmp_path / "nano.pth", variant="huge")
     torch.save({**state, "bbox_head.rtm_cls.0.weight": torch.zeros(7, 64, 1, 1)}, tmp_path / "seven.pth")
     with pytest.raises(TensorsimError, match="got 8 channels in the stem and 7 classes"):

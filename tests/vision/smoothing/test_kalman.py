@@ -224,7 +224,7 @@ def test_one_frame_and_no_people_pass() -> None:
         ({"process_noise": 0.0}, "process_noise"),
         ({"measurement_noise": -1.0}, "measurement_noise"),
         ({"initial_speed": math.inf}, "initial_speed"),
-        ({"mode": "backward"}, "'rts' or 'forward'"),
+        ({"mode": "backward"}, "expected one of rts, forward"),
     ],
 )
 def test_refuses_settings(settings: dict[str, Any], message: str) -> None:
