@@ -25,7 +25,7 @@ from tensorsim.vision.lifting.hidden_legs import HiddenLegs
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
-from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within, gaps_with
+from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within, gaps_with, where_any
 from tensorsim.vision.smoothing.even_time import even_count, to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 from tensorsim.vision.smoothing.noise import keypoint_noise, noise_with_depth
@@ -388,8 +388,7 @@ class VideoToPose(nn.Module):
         reliable = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
         body_scores = body_scores * reliable
         # A foot alone at the edge of the picture does not determine a pose: the smoother predicts such frames.
-        usable = tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints)
-        usable = torch.where(usable.any(dim=-1, keepdim=True), usable, tracks.valid)
+        usable = where_any(tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints), tracks.valid)
         usable = usable & self.is_person(scores, tracks.valid, fps).unsqueeze(-1)
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)

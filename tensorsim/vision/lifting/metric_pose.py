@@ -37,6 +37,7 @@ from tensorsim.vision.smoothing.along_time import (
     masked_median,
     nearest_valid,
     robust_smooth,
+    where_any,
 )
 
 
@@ -236,9 +237,7 @@ class MetricPose(nn.Module):
             if cut_off is not None:
                 beyond = beyond | cut_off
             whole = valid & many & (lifted.distance < self.poor_fit)
-            whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
-            whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid & many)
-            whole = torch.where(whole.any(dim=-1, keepdim=True), whole, valid)
+            whole = where_any(where_any(where_any(whole & ~beyond, whole), valid & many), valid)
             center = torch.tensor(self.pinhole.principal_point(image_height, image_width)).to(keypoints)
             hips_range = camera_range(focal, height, scale) - height * offset
             image = torch.where(seen[..., None], keypoints, lifted.keypoints)
@@ -248,7 +247,7 @@ class MetricPose(nn.Module):
             hips_range, whole, stands, precision = self._on_floor(
                 hips_range, image, depth, focal, center, pose, height, inside, whole, fps
             )
-            whole = torch.where((whole & ~beyond).any(dim=-1, keepdim=True), whole & ~beyond, whole)
+            whole = where_any(whole & ~beyond, whole)
             hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
             body_px = standing_px(focal, height, hips_range, offset)
             tells = whole.to(precision.dtype) * precision + 1e-4
@@ -312,8 +311,7 @@ class MetricPose(nn.Module):
         Also which frames tell it, in which of them the person stands, and how precise it is.
         """
         bent = looks_bent(image, seen)
-        straight = whole & ~bent
-        straight = torch.where(straight.any(dim=-1, keepdim=True), straight, whole)
+        straight = where_any(whole & ~bent, whole)
         smooth = robust_smooth(by_size, straight, self.range_smoothing_s * fps)
         smooth = torch.where(straight, smooth, by_size)
         joints = back_project(image, smooth[..., None] + depth, focal, center, pose)

@@ -31,6 +31,11 @@ def fill_gaps(x: Tensor, valid: Tensor) -> Tensor:
     return x.gather(-1, nearest_valid(valid))
 
 
+def where_any(preferred: Tensor, fallback: Tensor) -> Tensor:
+    """``preferred`` (..., T) bool of tracks that have such a frame, ``fallback`` (..., T) of the others."""
+    return torch.where(preferred.any(dim=-1, keepdim=True), preferred, fallback)
+
+
 def brief_gaps(seen: Tensor, longest: int) -> Tensor:
     """Gaps (..., T) in ``seen`` (..., T) bool of at most ``longest`` frames, with seen frames on both sides."""
     before, after = seen_beside(seen)
