@@ -43,6 +43,13 @@ def test_equals_the_radar_equation():
     np.testing.assert_allclose(echo.numpy(), [expected], rtol=1e-9)
 
 
+def test_the_gradient_by_a_cross_section_of_zero_is_zero():
+    p, rcs = tensors(swinging(5, 2, RADAR.prf_hz), np.zeros(2))
+    rcs.requires_grad_()
+    torch.view_as_real(make().double()(p, rcs)).sum().backward()
+    assert rcs.grad.tolist() == [0.0, 0.0]
+
+
 def test_the_phase_of_an_approaching_target_decreases():
     y = 3.0 - 1.5 * torch.arange(100, dtype=torch.float64) / RADAR.prf_hz
     p = torch.stack([0 * y, y, 1.5 + 0 * y], dim=-1)[:, None]
