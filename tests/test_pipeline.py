@@ -548,6 +548,7 @@ def test_scripted_pose_to_doppler_with_every_option(tmp_path: Path) -> None:
     assert_same(run_without_tensorsim(tmp_path / "maps.pt", arguments, tmp_path), expected, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:positions. some scatterer")  # an untrained network puts people anywhere
 def test_real_networks_script_whole(tmp_path: Path, shared_data: Path) -> None:
     from tensorsim.data.video import VideoReader

@@ -148,6 +148,7 @@ def test_few_joints_are_searched_exactly(seen: int) -> None:
     torch.testing.assert_close(found, every.topk(4, dim=-1)[0], atol=1e-12, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_blocks")
 def test_two_joints_of_different_weights_get_as_many_poses_as_all() -> None:
     library = standardise_poses(sample_poses(2000, seed=4)).float()

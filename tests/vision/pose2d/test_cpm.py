@@ -141,7 +141,7 @@ def test_one_map_pixel_is_eight_crop_pixels() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"stages": 0}, "0 stages"),
+        ({"stages": 0}, "CPM.stages: got 0"),
         ({"input_size": (100, 64)}, "multiples of 8"),
         ({"width": 6}, "multiple of 4"),
     ],
