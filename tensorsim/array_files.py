@@ -1,5 +1,6 @@
 """Named arrays in files: NumPy's .npz, MATLAB's .mat, HDF5."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tensorsim.exceptions import TensorsimError
+from tensorsim.files import complete_file, write_bytes
 
 ARRAY_FORMATS = ("npz", "mat", "h5")
 
@@ -37,20 +39,24 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray | float], formats: Sequ
         formats: of :data:`ARRAY_FORMATS`.
 
     Raises:
-        TensorsimError: h5py is not installed.
+        TensorsimError: h5py is not installed, or a file that cannot be written.
     """
     if "npz" in formats:
         named: dict[str, Any] = {name: np.asarray(x) for name, x in arrays.items()}
-        np.savez_compressed(path.with_suffix(".npz"), **named)
+        with complete_file(path.with_suffix(".npz")) as scratch, scratch.open("wb") as target:
+            np.savez_compressed(target, **named)
     if "mat" in formats:
         from scipy.io import savemat
 
-        savemat(path.with_suffix(".mat"), arrays, do_compression=True, oned_as="column")
+        with complete_file(path.with_suffix(".mat")) as scratch, scratch.open("wb") as target:
+            savemat(target, arrays, do_compression=True, oned_as="column")
     if "h5" in formats:
-        with _h5py().File(path.with_suffix(".h5"), "w") as file:
+        content = io.BytesIO()  # HDF5 can end the process where the disk is full
+        with _h5py().File(content, "w") as file:
             for name, x in arrays.items():
                 compression = {} if np.ndim(x) == 0 else {"compression": "gzip"}
                 file.create_dataset(name, data=np.asarray(x), **compression)
+        write_bytes(path.with_suffix(".h5"), content.getbuffer())
 
 
 def _h5py() -> Any:

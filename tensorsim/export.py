@@ -1,5 +1,6 @@
 """Export to TorchScript and ONNX files that run where tensorsim is not installed."""
 
+import io
 import logging
 import os
 import warnings
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError, first_line
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, write_bytes
 from tensorsim.onnx_operations import translations
 from tensorsim.protocols import check_instance
 
@@ -48,8 +49,10 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
         finally:
             for part in training:
                 part.training = True
-        with complete_file(path) as scratch:
-            torch.jit.save(scripted, str(scratch))
+        # Not into the file: torch ends the process where the disk is full.
+        content = io.BytesIO()
+        torch.jit.save(scripted, content)
+        write_bytes(path, content.getbuffer())
 
 
 def to_onnx(

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import pickletools
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +27,42 @@ def check_folder(path: Path, option: str = "--out") -> None:
     """Refuse a file where a folder is wanted, which need not be there yet."""
     if path.exists() and not path.is_dir():
         raise TensorsimError(f"{option}: {path} is a file, expected a folder")
+
+
+class NotWrittenError(TensorsimError):
+    """A file, or a folder of results, that could not be written: the disk is full, or the place is not ours.
+
+    Attributes:
+        path: the file.
+        reason: in the words of the system.
+    """
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(path, reason)
+        self.path, self.reason = path, reason
+
+    def __str__(self) -> str:
+        return f"{self.path}: could not be written ({self.reason})"
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the error of the system into one that names the file, or the folder that is no place for it.
+
+    Errors that name other files pass.
+    """
+    try:
+        yield
+    except TensorsimError:
+        raise
+    except Exception as error:
+        number, name = getattr(error, "errno", None), getattr(error, "filename", None)
+        in_rust = re.search(r"\(os error (\d+)\)", str(error))  # safetensors has an exception of its own
+        number = int(in_rust[1]) if in_rust else number
+        if number is None or not (name is None or path.is_relative_to(Path(name).parent)):
+            raise
+        culprit = Path(name) if name is not None and path.is_relative_to(name) else path
+        raise NotWrittenError(culprit, os.strerror(number)) from error
 
 
 @contextmanager
@@ -66,18 +103,22 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The folder is created if needed. The scratch path is in the same folder and ends in ``.tmp``. The file gets the
     permissions that new files usually have.
+
+    Raises:
+        NotWrittenError: the disk is full, or the place is not ours.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        scratch.touch()
-        rights = scratch.stat().st_mode
-        yield scratch
-        os.chmod(scratch, rights)  # safetensors makes files readable by their owner only
-        os.replace(scratch, path)
-    finally:
-        scratch.unlink(missing_ok=True)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            scratch.touch()
+            rights = scratch.stat().st_mode
+            yield scratch
+            os.chmod(scratch, rights)  # safetensors makes files readable by their owner only
+            os.replace(scratch, path)
+        finally:
+            scratch.unlink(missing_ok=True)
 
 
 def sha256_of_arrays(*arrays: "npt.NDArray[Any]") -> str:
@@ -98,8 +139,7 @@ def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
         if there != settings:
             raise TensorsimError(f"{folder}: got maps of {there}, expected {settings}")
     else:
-        with complete_file(path) as scratch:
-            scratch.write_text(json.dumps(settings, indent=2), encoding="utf-8")
+        write_text(path, json.dumps(settings, indent=2))
 
 
 @contextmanager
@@ -117,19 +157,24 @@ def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]
     Raises:
         TensorsimError: another process is writing into ``out``, there is a folder where a file should be, or
             ``source`` would be replaced or removed.
+        NotWrittenError: the disk is full, or the place is not ours.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
         _keep(source, out, _listed(out))
         scratch = out.parent / f".{out.name}.scratch"
         shutil.rmtree(scratch, ignore_errors=True)  # of a run that was killed; the lock is ours
         try:
             new, old = scratch / "new", scratch / "old"
-            new.mkdir(parents=True)
-            old.mkdir()
+            with writing(out):
+                new.mkdir(parents=True)
+                old.mkdir()
             yield new
             _keep(source, out, [file.name for file in new.iterdir()])
             _exchange(out, new, old)
+        except NotWrittenError as error:
+            if not error.path.is_relative_to(new):
+                raise
+            raise NotWrittenError(out / error.path.relative_to(new), error.reason) from error
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
 
@@ -181,14 +226,17 @@ def _listed(out: Path) -> list[str]:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Lock a folder for this process; the lock is released when the process ends, also by a crash."""
+    """Lock a folder for this process, made or not; the lock is released when the process ends, also by a crash."""
+    with writing(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
     try:
         import fcntl
     except ImportError:  # not on Windows
         yield
         return
     path = out.parent / f".{out.name}.lock"
-    file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+    with writing(out):
+        file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
     try:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -206,11 +254,20 @@ def locked(out: Path) -> Iterator[None]:
         os.close(file)
 
 
+def write_bytes(path: str | os.PathLike[str], content: bytes | memoryview) -> None:
+    """Write bytes; the file appears complete."""
+    with complete_file(path) as scratch:
+        scratch.write_bytes(content)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text in UTF-8; the file appears complete."""
+    write_bytes(path, text.encode())
+
+
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write strict JSON: NaN and infinity, which JSON cannot express, become ``null``. The file appears complete."""
-    with complete_file(path) as scratch:
-        text = json.dumps(_finite(content), indent=2, allow_nan=False)
-        scratch.write_text(text + "\n", encoding="utf-8")
+    write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
 def _finite(content: Any) -> Any:

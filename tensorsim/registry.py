@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tensorsim.config.documents import suggestion
 from tensorsim.errors import TensorsimError, first_line
-from tensorsim.files import complete_file, sha256_of
+from tensorsim.files import sha256_of, write_text
 from tensorsim.model_files import manifest, models_dir
 
 
@@ -293,8 +293,7 @@ def fetch(entry: ModelEntry, quiet: bool = False, unverified: bool = False) -> P
             f"with a connection elsewhere, save it as {path}, or give the path of a copy"
         ) from error
     digest = verify(entry)
-    with complete_file(_kept_digest(entry)) as scratch:
-        scratch.write_text(digest + "\n", encoding="ascii")
+    write_text(_kept_digest(entry), digest + "\n")
     return path
 
 

@@ -390,7 +390,7 @@ def test_a_reader_who_has_seen_enough_ends_the_program_quietly() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--out", "a_file/out"], r"a_file\S*: (File exists|Not a directory)$"),
+        (["--out", "a_file/out"], r"a_file\S*: could not be written \((File exists|Not a directory)\)$"),
         (["--out", "out", "--radar", "broken.yaml"], r"--radar: broken\.yaml: .* line 2"),
         (["--out", "out", "--seed", "-1"], r"--seed: got -1, expected an integer from 0"),
         (["--out", "out", "--seed", str(2**80)], r"--seed: got \d+, expected an integer from 0"),

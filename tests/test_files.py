@@ -3,17 +3,23 @@
 import json
 import math
 import os
+import pickle
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 import tensorsim as ts
+from tensorsim.array_files import save_arrays
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file, complete_or_nothing, write_json
+from tensorsim.files import NotWrittenError, complete_file, complete_or_nothing, write_json, write_text
+from tensorsim.plot.figure import new_figure, save_figure
 from tensorsim.weights import save_weights
 
 
@@ -152,3 +158,58 @@ def test_json_is_strict(tmp_path: Path) -> None:
     text = (tmp_path / "a.json").read_text()
     content = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert content == {"a": [None, 1.5, {"b": None}], "c": [True, None, "NaN"]}
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """A limit on the size of files stands for the end of the disk."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+NOISE = np.random.default_rng(0).random(10_000)
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "a.txt": lambda path: write_text(path, "a" * 10_000),
+    "a.npz": lambda path: save_arrays(path.with_suffix(""), {"a": NOISE}),
+    "a.mat": lambda path: save_arrays(path.with_suffix(""), {"a": NOISE}, ("mat",)),
+    "a.h5": lambda path: save_arrays(path.with_suffix(""), {"a": NOISE}, ("h5",)),
+    "a.png": lambda path: save_figure(new_figure(), path),
+    "a.safetensors": lambda path: save_weights(nn.Linear(100, 100), path, {}),
+    "a.pt": lambda path: ts.export.to_torchscript(nn.Linear(100, 100), path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_reported_with_the_name_of_the_file(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    with full_disk(), pytest.raises(NotWrittenError) as failure:
+        WRITERS[name](path)
+    assert str(failure.value) == f"{path}: could not be written (File too large)"
+    assert list(tmp_path.iterdir()) == []
+    # In a folder of results the file has the name that it would have had.
+    with full_disk(), pytest.raises(NotWrittenError) as failure, complete_or_nothing(tmp_path / "out") as new:
+        WRITERS[name](new / name)
+    assert str(failure.value) == f"{tmp_path / 'out' / name}: could not be written (File too large)"
+    assert str(pickle.loads(pickle.dumps(failure.value))) == str(failure.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_where_nothing_can_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file" / "a.json", tmp_path / "file" / "deeper" / "a.json"):
+        with pytest.raises(NotWrittenError, match=r"could not be written \((File exists|Not a directory)\)"):
+            write_json(path, {})
+        with pytest.raises(NotWrittenError, match=r"could not be written \("), complete_or_nothing(path):
+            pytest.fail("the work has begun")
+
+
+def test_errors_that_are_not_of_the_file_pass(tmp_path: Path) -> None:
+    for error in (FileNotFoundError(2, "No such file", "/elsewhere/film.mp4"), OSError("no number")):
+        with pytest.raises(OSError, match=r"No such file|no number"), complete_file(tmp_path / "a"):
+            raise error

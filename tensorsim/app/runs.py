@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 from tensorsim.progress import watched
 
 #: Runs that are kept; the oldest is removed for a new one.
@@ -129,6 +130,9 @@ def _add_configuration(folder: Path) -> None:
 def _add_archive(folder: Path) -> None:
     """Put all files into one."""
     files = sorted(path for path in folder.iterdir() if path.is_file())
-    with zipfile.ZipFile(folder / ARCHIVE, "w", zipfile.ZIP_STORED) as archive:
+    with (
+        complete_file(folder / ARCHIVE) as scratch,
+        zipfile.ZipFile(scratch, "w", zipfile.ZIP_STORED) as archive,
+    ):
         for path in files:
             archive.write(path, path.name)

@@ -96,11 +96,10 @@ class DatasetSample:
         """Do it."""
         from tensorsim.data.sets.again import sample_again
         from tensorsim.data.sets.shards import npy_bytes
-        from tensorsim.files import complete_file
+        from tensorsim.files import write_bytes
 
         sample = sample_again(self.folder, self.id)
         if self.out is not None:
             for name, array in sample.arrays.items():
-                with complete_file(self.out / f"{self.id}.{name}.npy") as scratch:
-                    scratch.write_bytes(npy_bytes(array))
+                write_bytes(self.out / f"{self.id}.{name}.npy", npy_bytes(array))
         print(f"{self.id}: {sample.row['label']}, the same to the bit ({sample.row['sha256']})")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from tensorsim.array_files import save_arrays
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import (
     RadarOptions,
@@ -172,17 +173,15 @@ def film_person(activity: int, frames: int, seed: int) -> Filmed:
 
 def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor") -> None:
     """Write ``pose_truth.npz``: what is true in each frame; ``valid`` (P, T) at the rate of the motion."""
-    import numpy as np
-
-    np.savez(
-        folder / "pose_truth.npz",
-        joints_m=film.joints.numpy(),
-        keypoints_px=film.keypoints.numpy(),
-        visibility=film.visibility.numpy(),
-        boxes_px=film.boxes.numpy(),
-        valid=valid[:, ::MOMENTS_PER_FRAME].numpy(),
-        fps=FILM_FPS,
-    )
+    arrays: dict[str, Any] = {
+        "joints_m": film.joints.numpy(),
+        "keypoints_px": film.keypoints.numpy(),
+        "visibility": film.visibility.numpy(),
+        "boxes_px": film.boxes.numpy(),
+        "valid": valid[:, ::MOMENTS_PER_FRAME].numpy(),
+        "fps": FILM_FPS,
+    }
+    save_arrays(folder / "pose_truth", arrays)
 
 
 def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":

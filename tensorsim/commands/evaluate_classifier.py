@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
+from tensorsim.files import write_text
 
 if TYPE_CHECKING:
     from tensorsim.training.film_maps import LabelledPose
@@ -95,13 +96,12 @@ class EvaluateClassifier:
                 for name, numbers in zip(names, matrix, strict=True):
                     print(f"{name:5s}" + "".join(f"{n:5d}" for n in numbers))
             if self.out is not None:
-                self.out.mkdir(parents=True, exist_ok=True)
                 stem = self.out / f"confusion_{scene}_{ratio:.0f}dB"
                 lines = [",".join(["", *names])]
                 lines += [
                     ",".join([name, *map(str, numbers)]) for name, numbers in zip(names, matrix, strict=True)
                 ]
-                stem.with_suffix(".csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+                write_text(stem.with_suffix(".csv"), "\n".join(lines) + "\n")
                 figure = plot.confusion_figure(matrix, names, f"{scene}, {ratio:.0f} dB")
                 plot.save_figure(figure, stem.with_suffix(".png"))
 

@@ -7,6 +7,7 @@ from typing import Literal
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, check_count
+from tensorsim.files import write_text
 
 
 @dataclass(frozen=True)
@@ -67,4 +68,4 @@ class EvaluateDenoiser:
             lines += [
                 ",".join([*map(str, key), *(f"{x:.4f}" for x in figures)]) for key, figures in rows.items()
             ]
-            self.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            write_text(self.out, "\n".join(lines) + "\n")

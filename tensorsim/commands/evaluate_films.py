@@ -11,7 +11,7 @@ from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
 from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
-from tensorsim.files import check_folder
+from tensorsim.files import check_folder, complete_file, write_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,8 +104,8 @@ class EvaluateFilms(NetworkOptions):
                     rows.append(row | {"warnings": messages})
                 print_warnings(f"{film.file}: {message}" for message in messages)
         text = markdown(rows)
-        (self.out / "films.md").write_text(text, encoding="utf-8")
-        (self.out / "films.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        write_text(self.out / "films.md", text)
+        write_text(self.out / "films.json", json.dumps(rows, indent=2) + "\n")
         write_csv(self.out / "films.csv", rows)
         print(text, end="")
 
@@ -152,7 +152,7 @@ def _sheet_name(file: str) -> str:
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
     """One line per film and scene."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(
             [

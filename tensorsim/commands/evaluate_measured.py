@@ -7,7 +7,7 @@ from typing import Literal
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, check_count
-from tensorsim.files import check_folder, complete_file, write_json
+from tensorsim.files import check_folder, write_json, write_text
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,7 @@ class EvaluateMeasured:
             )
             if self.ablation:
                 rows = ablation_table(experiment, ablation(experiment, self.repeats))
-                with complete_file(self.out / f"ablation_{measured.name}.md") as path:
-                    path.write_text(rows + "\n", encoding="utf-8")
+                write_text(self.out / f"ablation_{measured.name}.md", rows + "\n")
                 print(rows, flush=True)
                 continue
             logits = experiment.quick() if self.quick else experiment.full()

@@ -8,7 +8,7 @@ from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import default_networks
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
-from tensorsim.files import check_folder
+from tensorsim.files import check_folder, write_text
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,7 @@ class EvaluateTruth:
             cells = loop.run(self.quiet)
         print_warnings(messages)
         text = markdown(cells)
-        self.out.mkdir(parents=True, exist_ok=True)
-        (self.out / "truth.md").write_text(text, encoding="utf-8")
+        write_text(self.out / "truth.md", text)
         write_csv(self.out / "truth.csv", cells)
         pipelines = loop.pipelines()
         for scene in self.scenes:

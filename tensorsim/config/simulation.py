@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from tensorsim.config.checks import require_counts
@@ -15,7 +14,7 @@ from tensorsim.config.receiver import ReceiverConfig
 from tensorsim.config.scene import SceneConfig
 from tensorsim.config.surroundings import WallConfig
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import write_text
 
 
 @dataclass(frozen=True)
@@ -155,8 +154,7 @@ class SimulationConfig:
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
         """Write a file from which :meth:`from_yaml` reads the same."""
-        with complete_file(Path(path)) as scratch:
-            scratch.write_text(dump_limited_yaml(self.to_document()), encoding="utf-8")
+        write_text(path, dump_limited_yaml(self.to_document()))
 
 
 def _replaced(config: Any, path: list[str], value: Any) -> Any:

@@ -362,21 +362,30 @@ def _first_from(capture: Any, clock: FilmClock, start_s: float) -> tuple[int, fl
 
 
 @contextmanager
-def opening() -> Iterator[None]:
-    """Open films without OpenCV's and FFmpeg's log on stderr, and without FFmpeg's protocols but files."""
-    # FFmpeg's level is read once, by the first film of the process.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+def silent_log() -> Iterator[None]:
+    """Let OpenCV log nothing."""
     from cv2.utils import logging
 
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
-    options = os.environ.get("OPENCV_FFMPEG_CAPTURE_OPTIONS")
-    # Whatever a file names, FFmpeg opens local files only.
-    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "protocol_whitelist;file"
     try:
         yield
     finally:
         logging.setLogLevel(level)
+
+
+@contextmanager
+def opening() -> Iterator[None]:
+    """Open films without OpenCV's and FFmpeg's log on stderr, and without FFmpeg's protocols but files."""
+    # FFmpeg's level is read once, by the first film of the process.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    options = os.environ.get("OPENCV_FFMPEG_CAPTURE_OPTIONS")
+    # Whatever a file names, FFmpeg opens local files only.
+    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "protocol_whitelist;file"
+    try:
+        with silent_log():
+            yield
+    finally:
         if options is None:
             del os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"]
         else:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from tensorsim.data.video import opening, properties
+from tensorsim.data.video import opening, properties, silent_log
 from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.files import NotWrittenError, writing
 
 
 class VideoWriter:
@@ -44,7 +45,8 @@ class VideoWriter:
     def __enter__(self) -> "VideoWriter":
         import cv2
 
-        self._folder = tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".writing-")
+        with writing(self.path):
+            self._folder = tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".writing-")
         self._partial = Path(self._folder.name) / self.path.name
         self._writer = cv2.VideoWriter()
         return self
@@ -66,7 +68,8 @@ class VideoWriter:
         bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
         bgr = cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         self.count += 1  # an interrupt, which comes after the write, must not leave the frame uncounted
-        self._writer.write(bgr)
+        with silent_log():  # a full disk shows at the end
+            self._writer.write(bgr)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._folder:
@@ -77,8 +80,9 @@ class VideoWriter:
                 raise TensorsimError(f"{self.path}: got no frames, expected at least one")
             # OpenCV says nothing of writes that fail, as on a full disk; what is missing shows when it is read.
             if _frames_in(self._partial) != self.count:
-                raise TensorsimError(f"{self.path}: the film could not be written whole; is the disk full?")
-            os.replace(self._partial, self.path)
+                raise NotWrittenError(self.path, "the film is not whole; is the disk full?")
+            with writing(self.path):
+                os.replace(self._partial, self.path)
 
 
 def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> None:

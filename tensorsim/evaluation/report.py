@@ -10,6 +10,7 @@ import numpy as np
 
 from tensorsim.evaluation.scores import FIGURES, MAPS
 from tensorsim.evaluation.settings import SOURCES
+from tensorsim.files import complete_file
 
 #: Headings of the figures in the tables.
 HEADINGS = {
@@ -39,7 +40,7 @@ def figure_of(cells: Cells, scene: str, name: str, figure: str) -> float:
 
 def write_csv(path: Path, cells: Cells) -> None:
     """One line per clip, setting, scene and map."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["row", "clip", "setting", "scene", "map", *FIGURES])
         for cell in cells:

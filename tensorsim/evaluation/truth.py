@@ -23,7 +23,7 @@ from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captu
 from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
-from tensorsim.files import complete_file
+from tensorsim.files import write_text
 from tensorsim.process import end_with_parent
 from tensorsim.radar.presets import PRESETS
 from tensorsim.registry import shipped_weights
@@ -186,8 +186,7 @@ def _plain(name: str) -> str:
 
 
 def _write(path: Path, cell: dict[str, Any]) -> None:
-    with complete_file(path) as scratch:
-        scratch.write_text(json.dumps(cell), encoding="utf-8")
+    write_text(path, json.dumps(cell))
 
 
 def _one_thread_row(loop: TruthLoop, row: str) -> None:

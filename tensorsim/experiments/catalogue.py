@@ -11,7 +11,7 @@ from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
 from tensorsim.experiments import ablations, networks, paper, real, video
 from tensorsim.experiments.work import Report, Work
-from tensorsim.files import complete_or_nothing
+from tensorsim.files import complete_or_nothing, write_text
 
 
 @dataclass(frozen=True)
@@ -129,12 +129,12 @@ def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
     experiment = find_experiment(name)
     report = experiment.run(config, work)
     with complete_or_nothing(out) as new:
-        (new / f"{name}.md").write_text(report.markdown(experiment.title), encoding="utf-8")
+        write_text(new / f"{name}.md", report.markdown(experiment.title))
         settings = {"experiment": name} | to_document(config)
-        (new / f"{name}.yaml").write_text(dump_limited_yaml(settings), encoding="utf-8")
+        write_text(new / f"{name}.yaml", dump_limited_yaml(settings))
         for table in report.tables:
             stem = f"{name}-{table.file}" if table.file else name
-            (new / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
+            write_text(new / f"{stem}.csv", table.csv())
         for figure_name, figure in report.figures.items():
             for suffix in ("png", "svg"):
                 save_figure(figure, new / f"{name}-{figure_name}.{suffix}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tensorsim.config.documents import to_document
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,8 +57,7 @@ def counted(count: int, noun: str) -> str:
 
 def write_result(path: Path, content: dict[str, Any]) -> None:
     """Write a result as JSON, whole or not at all. NaN and infinity stay what they are."""
-    with complete_file(path) as scratch:
-        scratch.write_text(json.dumps(content), encoding="utf-8")
+    write_text(path, json.dumps(content))
 
 
 def read_result(path: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tensorsim.errors import TensorsimError
+from tensorsim.files import complete_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +30,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a picture in the format of its suffix: PNG, or PDF and SVG with lines and letters as vectors.
 
     Raises:
-        TensorsimError: another suffix.
+        TensorsimError: another suffix, or a file that cannot be written.
     """
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in FIGURE_FORMATS:
@@ -37,7 +38,7 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise TensorsimError(f"{path}: got the suffix {path.suffix!r}, expected one of {expected}")
     # Without the date the same run writes the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), complete_file(path) as scratch:
         # Names of films may have letters that the font lacks: a box is drawn in their place.
         warnings.filterwarnings("ignore", "Glyph .* missing from")
-        figure.savefig(path, dpi=120, metadata=dated.get(suffix))
+        figure.savefig(scratch, format=suffix, dpi=120, metadata=dated.get(suffix))

@@ -23,6 +23,7 @@ from tensorsim.config.documents import from_document, suggestion, to_document
 from tensorsim.config.limited_yaml import dump_limited_yaml
 from tensorsim.config.yaml_files import read_yaml
 from tensorsim.errors import TensorsimError
+from tensorsim.files import write_text
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 
 #: The parts of a scene that a file describes beside the radar.
@@ -198,4 +199,4 @@ def save_radar_yaml(
     for name, part in (("wall", wall), ("floor", floor)):
         if part is not None:
             document[name] = to_document(part)
-    Path(path).write_text(dump_limited_yaml(document), encoding="utf-8")
+    write_text(path, dump_limited_yaml(document))

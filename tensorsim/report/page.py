@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tensorsim import plot
-from tensorsim.files import complete_file
+from tensorsim.files import write_text
 from tensorsim.report.film import FilmStrip
 from tensorsim.types import Pose, RadarMaps
 
@@ -70,8 +70,7 @@ def write_report(
         "timeline": timeline_content(summary.get("timeline") or [], frames / fps),
         "summary": {key: value for key, value in summary.items() if key not in ("files", "run")},
     }
-    with complete_file(folder / "report.html") as scratch:
-        scratch.write_text(page(content), encoding="utf-8")
+    write_text(folder / "report.html", page(content))
 
 
 def page(content: dict[str, Any]) -> str:

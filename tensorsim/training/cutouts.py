@@ -22,7 +22,7 @@ from tensorsim.body.kinematics import rest_on_floor, rotation
 from tensorsim.config import CameraConfig
 from tensorsim.device import rank_and_processes
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, write_text
 from tensorsim.geometry.camera import camera_to_world
 from tensorsim.motion.pose_sampler import FAMILIES, sample_poses
 from tensorsim.render.renderer import PersonRenderer
@@ -168,8 +168,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
         if there != settings:
             raise TensorsimError(f"{folder}: it holds rendered people of {there}, expected {settings}")
     elif not any(folder.glob("cutouts-*.tar")):
-        with complete_file(described) as scratch:
-            scratch.write_text(json.dumps(settings), encoding="utf-8")
+        write_text(described, json.dumps(settings))
     shards = [folder / f"cutouts-{k:03d}.tar" for k in range(math.ceil(count / PER_SHARD))]
     rank, processes = rank_and_processes()
     with tqdm(total=count, desc="people", disable=quiet or rank > 0) as progress:

@@ -4,6 +4,7 @@ Everything is kept as joints at 60 frames a second, about 4 s each, on the floor
 every time it is used.
 """
 
+import io
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from tensorsim.body.proportions import Proportions
 from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.data.motion_files import load_motion, motion_keys
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import write_bytes
 from tensorsim.motion import everyday, martial_arts
 from tensorsim.motion.act import Act
 from tensorsim.motion.activities import perform
@@ -259,7 +260,7 @@ def build_pool(
                 bar.update(len(made))
     pool = MotionPool(torch.cat(joints), torch.cat(heights), torch.cat(kinds))
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with complete_file(path) as scratch:
-            torch.save(pool._asdict() | {"settings": settings}, scratch)
+        content = io.BytesIO()
+        torch.save(pool._asdict() | {"settings": settings}, content)
+        write_bytes(path, content.getbuffer())
     return pool

@@ -7,6 +7,7 @@ that was interrupted goes on to the same result. Several GPUs: ``torchrun --npro
 """
 
 import csv
+import io
 import math
 import os
 import pickle
@@ -24,7 +25,7 @@ from tqdm import tqdm
 
 from tensorsim.device import rank_and_processes, usable_device
 from tensorsim.errors import TensorsimError, check_count
-from tensorsim.files import check_folder, complete_file
+from tensorsim.files import check_folder, complete_file, write_bytes
 from tensorsim.weights import save_weights
 
 Batch = dict[str, Any]
@@ -369,8 +370,10 @@ def _save(
         "averaged": averaged.state_dict(),
         "optimiser": optimiser.state_dict(),
     }
-    with complete_file(path) as scratch:
-        torch.save(state, scratch)
+    # Not into the file: what torch says of a full disk is an assertion of its own.
+    content = io.BytesIO()
+    torch.save(state, content)
+    write_bytes(path, content.getbuffer())
 
 
 def _read(path: Path) -> dict[str, Any]:

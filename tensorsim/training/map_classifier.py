@@ -184,7 +184,7 @@ def write_outcome(recipe: MapRecipe, best: Path) -> None:
     :class:`~tensorsim.recognition.ActivityRecognizer` and ``tensorsim simulate --classifier``.
     """
     from tensorsim.export import to_onnx, to_torchscript
-    from tensorsim.files import complete_file
+    from tensorsim.files import write_text
     from tensorsim.weights import load_strict, save_weights
 
     folder, net = best.parent, recipe.net
@@ -193,8 +193,7 @@ def write_outcome(recipe: MapRecipe, best: Path) -> None:
     net = net.cpu().eval()
     maps = recipe.validation
     table = confusion_markdown(confusion(logits_of(net, maps), maps.targets), list(recipe.labels))
-    with complete_file(folder / "confusion.md") as scratch:
-        scratch.write_text(f"Part validation, {len(maps)} samples.\n\n{table}", encoding="utf-8")
+    write_text(folder / "confusion.md", f"Part validation, {len(maps)} samples.\n\n{table}")
     print(table, end="")
     to_torchscript(net, folder / "picture_to_label.pt")
     example = torch.stack([maps[0]["map"]] * 2)

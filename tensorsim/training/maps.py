@@ -25,7 +25,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.evaluation.films import FPS
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, write_text
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import PoseResampler
@@ -309,8 +309,7 @@ def build_maps(
         if there != settings:
             raise TensorsimError(f"{folder}: got maps of {asdict(there)}, expected {asdict(settings)}")
     else:
-        with complete_file(described) as scratch:
-            scratch.write_text(json.dumps(asdict(settings), indent=2), encoding="utf-8")
+        write_text(described, json.dumps(asdict(settings), indent=2))
     motion = MotionMaker(settings, errors)
     makers = {scene: MapMaker(scene, settings) for scene in scenes}
     for index in tqdm(range(first, first + people), desc=folder.name, unit="person", disable=quiet):

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import NotWrittenError, write_bytes
 from tensorsim.geometry.boxes import LETTERBOX_GREY, letterbox_size
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
@@ -176,8 +176,8 @@ def _opened(network: nn.Module, size: tuple[int, int], runtime: Runtime, threads
 
         model = quantised(model, rendered_crops(size))
     # A cache that cannot be written costs an export in every run.
-    with suppress(OSError), complete_file(path) as scratch:
-        scratch.write_bytes(model)
+    with suppress(NotWrittenError):
+        write_bytes(path, model)
     return run(model)
 
 

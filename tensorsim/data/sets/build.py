@@ -18,7 +18,7 @@ from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.files import locked, reading, write_json
+from tensorsim.files import NotWrittenError, locked, reading, write_json
 
 #: The folder of finished shards' rows, in it the file that is written first: the recipe and the listing of the clips.
 ROWS, BEGUN = ".rows", "begun.json"
@@ -70,8 +70,8 @@ def prepare_clip(job: Job) -> int:
     source, clip = plan.clip(job.number)
     try:
         source.prepare(clip)
-    except (TensorsimError, OSError):
-        if job.strict:
+    except (TensorsimError, OSError) as error:
+        if job.strict or isinstance(error, NotWrittenError):
             raise
     return 1
 
@@ -84,6 +84,8 @@ def build_shard(job: Job) -> int:
     for number in range(shard.first, shard.stop):
         try:
             samples.append(make_sample(plan, number, shard.name))
+        except NotWrittenError:
+            raise
         except (TensorsimError, OSError) as error:
             if job.strict:
                 raise TensorsimError(str(error)) from error
@@ -140,7 +142,6 @@ def build_dataset(
             stacklevel=2,
         )
     out = Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
     with locked(out):
         begun = _begun(out, recipe)
         engine = Serial() if engine is None else engine

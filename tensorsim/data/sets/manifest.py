@@ -16,7 +16,7 @@ from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import columns
 from tensorsim.data.sets.sheet import draw_sheet
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file, reading, write_json
+from tensorsim.files import complete_file, reading, write_json, write_text
 
 Row = dict[str, Any]
 
@@ -52,8 +52,7 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
     _write_manifest(out, plan.recipe, finished)
     draw_sheet(out, plan.recipe)
     sizes = {name: (out / name).stat().st_size for name in files}
-    with complete_file(out / "README.md") as scratch:
-        scratch.write_text(card(plan, counts, len(failures), sum(sizes.values())), encoding="utf-8")
+    write_text(out / "README.md", card(plan, counts, len(failures), sum(sizes.values())))
     summary = {
         "name": plan.recipe.name,
         "recipe": plan.recipe.digest,

@@ -5,7 +5,6 @@ import json
 import os
 import re
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 from tensorsim.config import ACTIVITIES, ProcessingConfig, SceneConfig, SimulationConfig
@@ -17,7 +16,7 @@ from tensorsim.data.sets.outputs import OutputConfig
 from tensorsim.data.sets.variations import VariationConfig
 from tensorsim.enhance.choice import check_denoiser
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file
+from tensorsim.files import write_text
 from tensorsim.motion.activities import activity_index
 from tensorsim.radar.presets import radar_scene
 
@@ -343,5 +342,4 @@ class DatasetRecipe:
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
         """Write a file from which :meth:`from_yaml` reads the same."""
-        with complete_file(Path(path)) as scratch:
-            scratch.write_text(dump_limited_yaml(self.to_document()), encoding="utf-8")
+        write_text(path, dump_limited_yaml(self.to_document()))

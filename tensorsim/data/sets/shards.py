@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from tensorsim.data.sets.recipe import StorageConfig, folder_name, matlab_name
 from tensorsim.data.sets.samples import Sample
-from tensorsim.files import complete_file
+from tensorsim.files import write_bytes
 
 #: Suffix of the shards of each format; pictures have none.
 SUFFIXES = {"webdataset": ".tar", "hdf5": ".h5", "mat": ".mat"}
@@ -44,8 +44,7 @@ def write_shard(folder: Path, storage: StorageConfig, name: str, samples: Sequen
     else:
         files[shard_path(folder, storage, name)] = _BYTES[storage.format](samples)
     for path, content in files.items():
-        with complete_file(path) as scratch:
-            scratch.write_bytes(content)
+        write_bytes(path, content)
     return {str(path.relative_to(folder)): hashlib.sha256(files[path]).hexdigest() for path in sorted(files)}
 
 
