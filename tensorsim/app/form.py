@@ -26,9 +26,26 @@ _MORE = {
         "people",
         "seed",
     ],
-    "CAMERA": ["camera_fov", "calibrate", "position", "fps", "start", "end", "stride", "flip_test"],
+    "CAMERA": [
+        "camera_fov",
+        "calibrate",
+        "position",
+        "fps",
+        "start",
+        "end",
+        "stride",
+        "flip_test",
+        "image_size",
+    ],
     "MOTION CAPTURE": ["clip", "heading"],
     "PICTURES": ["colormap", "dynamic_range", "hide_ridges", "figure_format", "full_rate", "sound"],
+}
+#: Kinds of controls that take numbers, and what they expect.
+_EXPECTED = {
+    "number": "numbers",
+    "integer": "a whole number",
+    "numbers": "numbers",
+    "integers": "whole numbers",
 }
 GROUPS = ("VISION", "RADAR", "WALL", "PROCESSING", *_MORE)
 
@@ -42,10 +59,11 @@ class Control:
         group: of :data:`GROUPS`.
         label: with its unit.
         help: what the option does and its default.
-        kind: ``"number"``, ``"integer"``, ``"numbers"`` (some, separated by spaces), ``"choice"``, ``"switch"`` or
-            ``"text"``.
+        kind: ``"number"``, ``"integer"``, ``"numbers"``, ``"integers"`` (several, separated by spaces), ``"choice"``,
+            ``"switch"`` or ``"text"``.
         choices: of a choice; the empty one leaves the default.
         default: what the control shows at first.
+        count: how many numbers it takes; None for any number of them.
     """
 
     option: str
@@ -55,6 +73,7 @@ class Control:
     kind: str
     choices: tuple[str, ...]
     default: Any
+    count: int | None = None
 
     def value_of(self, given: Any) -> Any:
         """The value of the option that was given; None where the control was left empty.
@@ -66,17 +85,21 @@ class Control:
             return bool(given)
         if given is None or (isinstance(given, str) and not given.strip()):
             return None
+        if self.kind not in _EXPECTED:
+            return str(given).strip()
         try:
-            if self.kind == "numbers":
-                return tuple(float(part) for part in str(given).replace(",", " ").split())
-            if self.kind == "integer":
-                if float(given) != int(float(given)):
-                    raise ValueError
-                return int(float(given))
-            return float(given) if self.kind == "number" else str(given).strip()
+            number = _whole if self.kind.startswith("integer") else float
+            if not self.kind.endswith("s"):
+                return number(given)
+            several = tuple(number(part) for part in str(given).replace(",", " ").split())
+            if self.count not in (None, len(several)):
+                raise ValueError
+            return several
         except (ValueError, OverflowError):
-            expected = "a whole number" if self.kind == "integer" else "numbers"
-            raise TensorsimError(f"{self.label}: got {given!r}, expected {expected}") from None
+            many = f"{self.count} " if self.count else ""
+            raise TensorsimError(
+                f"{self.label}: got {given!r}, expected {many}{_EXPECTED[self.kind]}"
+            ) from None
 
 
 def controls() -> list[Control]:
@@ -89,8 +112,9 @@ def controls() -> list[Control]:
     made = []
     for option, group, label in named:
         kind, choices = _kind(hints[option])
+        count = _count(hints[option])
         default = None if defaults[option] is MISSING else defaults[option]
-        made.append(Control(option, group, label, helps[option], kind, choices, default))
+        made.append(Control(option, group, label, helps[option], kind, choices, default, count))
     return sorted(made, key=lambda control: GROUPS.index(control.group))
 
 
@@ -130,11 +154,25 @@ def _kind(hint: Any) -> tuple[str, tuple[str, ...]]:
     if getattr(members[0], "__origin__", None) is Literal:
         return "choice", ("", *get_args(members[0]))
     if getattr(members[0], "__origin__", None) is tuple:
-        return "numbers", ()
+        return ("integers" if get_args(members[0])[0] is int else "numbers"), ()
     if members[0] is bool:
         # A switch that may also be left to the scene.
         return ("choice", ("", "on", "off")) if len(get_args(hint)) > 1 else ("switch", ())
     return {float: "number", int: "integer"}.get(members[0], "text"), ()
+
+
+def _count(hint: Any) -> int | None:
+    """How many numbers an option of this type takes, where it takes a fixed number of several."""
+    members = [get_args(member) for member in get_args(hint) if getattr(member, "__origin__", None) is tuple]
+    return len(members[0]) if members and ... not in members[0] else None
+
+
+def _whole(given: Any) -> int:
+    """A whole number, however it is written."""
+    number = float(given)
+    if number != int(number):
+        raise ValueError
+    return int(number)
 
 
 def _field_docstrings(cls: type) -> dict[str, str]:

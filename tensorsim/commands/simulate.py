@@ -100,7 +100,7 @@ class Simulate(NetworkOptions, RadarOptions):
     stride: int = 1
     """Keep every n-th frame."""
     image_size: Annotated[Option[tuple[int, int]], numbers("WIDTH HEIGHT", int)] = None
-    """Pixels of the pictures that keypoints were found in, where their file does not say."""
+    """Width and height in pixels of the pictures that keypoints were found in, where their file does not say."""
     clip: Option[str] = None
     """Which motion of a file with several: the name of an array, or subject and action as in "S1/Walking"."""
     heading: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0

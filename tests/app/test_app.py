@@ -54,6 +54,7 @@ def test_values_of_controls_become_options() -> None:
         "mti": "",
         "clip": "S1/Walking",
         "heading": "30",
+        "image_size": "640, 480",
     }
     options = options_of(values)
     assert options == {
@@ -66,6 +67,7 @@ def test_values_of_controls_become_options() -> None:
         "flip_test": False,
         "clip": "S1/Walking",
         "heading": 30.0,
+        "image_size": (640, 480),
     }
     command = Simulate(source=Path("film.mp4"), out=Path("out"), scene="through-wall", **options)
     config = command.configuration()
@@ -79,6 +81,10 @@ def test_values_of_controls_become_options() -> None:
         options_of({"ridges": 2.5})
     with pytest.raises(TensorsimError, match=r"Number of ridges: got '1e400', expected a whole number"):
         options_of({"ridges": "1e400"})
+    with pytest.raises(TensorsimError, match=r"Image size: got '640', expected 2 whole numbers"):
+        options_of({"image_size": "640"})
+    with pytest.raises(TensorsimError, match=r"Tx position \(m\): got '1 2', expected 3 numbers"):
+        options_of({"tx_position": "1 2"})
     with pytest.raises(TensorsimError, match="initial distance: got it for a generated person"):
         for_demo({"initial_distance": (4.0,)})
 
