@@ -174,8 +174,7 @@ def build_dataset(
         count = sum(plan.shards[k].stop - plan.shards[k].first for k in missing)
         _run(engine, "samples", "sample", count, engine.run(build_shard, map(job, missing)), quiet)
         samples, failures = finish(out, plan, [rows_path(out, shard) for shard in plan.shards])
-        made = sum(len(rows_of_shard(rows_path(out, plan.shards[k]))["rows"]) for k in missing)
-        return Built(samples, failures, made)
+        return Built(sum(samples), failures, sum(samples[k] for k in missing))
 
 
 def _run(engine: Engine, name: str, unit: str, total: int, done: Iterator[int], quiet: bool) -> None:

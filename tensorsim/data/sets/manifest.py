@@ -3,7 +3,8 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from tensorsim.files import complete_file, reading, write_json, write_text
 Row = dict[str, Any]
 
 
-def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
+def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[list[int], int]:
     """Write everything beside the shards of a complete data set; ``dataset.json`` is the last.
 
     Args:
@@ -30,26 +31,32 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
         finished: the rows of each shard, in order.
 
     Returns:
-        Numbers of samples, and of clips of which samples failed.
+        Numbers of samples in each shard, and of clips of which samples failed.
 
     Raises:
         TensorsimError: every sample failed.
     """
-    failures = _failures(finished)
+    samples: list[int] = []
     counts: Counter[tuple[str, str]] = Counter()
     files: dict[str, str] = {}
-    for path in finished:
-        content = rows_of_shard(path)
-        counts.update((row["part"], row["label"]) for row in content["rows"])
-        files |= content["files"]
-    _write_failures(out / "failures.csv", failures)
-    samples = sum(counts.values())
-    if samples == 0:
-        reason = failures[0]["reason"] if failures else "there are none"
+    failed: dict[tuple[str, str], dict[str, Any]] = {}
+    with _manifest(out, plan.recipe) as add_rows:
         for path in finished:
-            path.unlink()  # to be tried again
-        raise TensorsimError(f"{out}: got no sample at all ({reason}), expected some")
-    _write_manifest(out, plan.recipe, finished)
+            content = rows_of_shard(path)
+            add_rows(content["rows"])
+            samples.append(len(content["rows"]))
+            counts.update((row["part"], row["label"]) for row in content["rows"])
+            files |= content["files"]
+            for failure in content["failures"]:
+                clip = failed.setdefault((failure["clip"], failure["path"]), failure | {"samples": 0})
+                clip["samples"] += 1
+        failures = [failed[key] for key in sorted(failed)]
+        _write_failures(out / "failures.csv", failures)
+        if sum(samples) == 0:
+            reason = failures[0]["reason"] if failures else "there are none"
+            for path in finished:
+                path.unlink()  # to be tried again
+            raise TensorsimError(f"{out}: got no sample at all ({reason}), expected some")
     draw_sheet(out, plan.recipe)
     sizes = {name: (out / name).stat().st_size for name in files}
     write_text(out / "README.md", card(plan, counts, len(failures), sum(sizes.values())))
@@ -57,7 +64,7 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[int, int]:
         "name": plan.recipe.name,
         "recipe": plan.recipe.digest,
         "labels": list(plan.labels),
-        "samples": samples,
+        "samples": sum(samples),
         "failures": len(failures),
         "bytes": sum(sizes.values()),
         "sha256": files,
@@ -77,25 +84,17 @@ def rows_of_shard(path: Path) -> dict[str, Any]:
     return content
 
 
-def _failures(finished: Sequence[Path]) -> list[dict[str, Any]]:
-    """Every clip of which samples failed, with their number and the first reason."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
-    for path in finished:
-        for failure in rows_of_shard(path)["failures"]:
-            clip = found.setdefault((failure["clip"], failure["path"]), failure | {"samples": 0})
-            clip["samples"] += 1
-    return [found[key] for key in sorted(found)]
-
-
 def _write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
+    """Write every clip of which samples failed, with their number and the first reason."""
     with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, ["clip", "path", "samples", "reason"])
         writer.writeheader()
         writer.writerows(failures)
 
 
-def _write_manifest(out: Path, recipe: DatasetRecipe, finished: Sequence[Path]) -> None:
-    """``manifest.parquet``, which holds the recipe as well, and ``manifest.csv``; shard by shard."""
+@contextmanager
+def _manifest(out: Path, recipe: DatasetRecipe) -> Iterator[Callable[[list[Row]], None]]:
+    """``manifest.parquet``, which holds the recipe as well, and ``manifest.csv``: a function that adds rows to both."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -113,11 +112,13 @@ def _write_manifest(out: Path, recipe: DatasetRecipe, finished: Sequence[Path]) 
     ):
         lines = csv.DictWriter(file, list(names))
         lines.writeheader()
-        for path in finished:
-            rows = rows_of_shard(path)["rows"]
+
+        def add(rows: list[Row]) -> None:
             if rows:
                 writer.write_table(pa.Table.from_pylist(rows, schema))
                 lines.writerows(rows)
+
+        yield add
 
 
 def _finished(out: Path) -> Path:
