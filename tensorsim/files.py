@@ -30,7 +30,7 @@ def check_folder(path: Path, option: str = "--out") -> None:
 
 
 class NotWrittenError(TensorsimError):
-    """A file, or a folder of results, that could not be written: the disk is full, or the place is not ours.
+    """A file, or a folder of results, that could not be written: the disk is full, or the folder is not writable.
 
     Attributes:
         path: the file.
@@ -105,7 +105,7 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     permissions that new files usually have.
 
     Raises:
-        NotWrittenError: the disk is full, or the place is not ours.
+        NotWrittenError: the disk is full, or the folder is not writable.
     """
     path = Path(path)
     scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -157,7 +157,7 @@ def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]
     Raises:
         TensorsimError: another process is writing into ``out``, there is a folder where a file should be, or
             ``source`` would be replaced or removed.
-        NotWrittenError: the disk is full, or the place is not ours.
+        NotWrittenError: the disk is full, or the folder is not writable.
     """
     with locked(out):
         _keep(source, out, _listed(out))
