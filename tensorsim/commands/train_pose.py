@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tensorsim.commands.arguments import Option
-from tensorsim.commands.training import PeopleOptions
+from tensorsim.commands.training import PeopleOptions, digest
 from tensorsim.exceptions import TensorsimError, check_positive
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ class TrainPose(PeopleOptions):
             nearer to those of films.
         second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
             agree with the labels, they put them right and add the face.
+        teacher: a better network of COCO-17 heat maps for crops of the same size (.onnx), whose answers the HRNet
+            learns besides the labels.
         validate_every: steps between measurements on held-out people, which pick the best weights.
         presence: train nothing but the head of the HRNet in --init that tells which keypoints are in the picture, on
             crops of one size and without rendered people.
@@ -48,6 +50,7 @@ class TrainPose(PeopleOptions):
     learning_rate: float = 2e-3
     augmentation: Literal["full", "mild"] = "full"
     second_labels: Option[Path] = None
+    teacher: Option[Path] = None
     validate_every: int = 500
     presence: bool = False
 
@@ -67,11 +70,12 @@ class TrainPose(PeopleOptions):
         from tensorsim.training.presence import PresenceRecipe, with_presence_head
         from tensorsim.training.shards import Shards, find_shards
         from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
+        from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
 
         check_positive(self.learning_rate, "--learning-rate")
         if self.presence and (self.init is None or self.network != "hrnet"):
             raise TensorsimError("--presence: got no --init of an HRNet, whose keypoints it is about")
-        without = ("rendered", "cutouts", "augmentation", "first_size", "first_steps")
+        without = ("rendered", "cutouts", "augmentation", "first_size", "first_steps", "teacher")
         given = [name for name in without if getattr(self, name) != getattr(TrainPose, name)]
         if self.presence and given:
             raise TensorsimError(
@@ -86,6 +90,14 @@ class TrainPose(PeopleOptions):
             )
         if first_steps > 0 and (min(self.first_size) < 32 or any(side % 32 for side in self.first_size)):
             raise TensorsimError(f"--first-size: got {self.first_size}, expected (H, W), multiples of 32")
+        teacher = None if self.teacher is None else OnnxHeatmaps(self.teacher, threads=1)
+        if teacher is not None and (
+            self.network == "cpm" or first_steps > 0 or teacher.input_size != self.size
+        ):
+            raise TensorsimError(
+                f"--teacher: got a network of crops of {teacher.input_size}, expected it with --network hrnet, "
+                "--first-steps 0 and crops of the same --size"
+            )
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=self.validate_every)
         torch.manual_seed(self.seed)
         net: HRNet | TrainedCPM
@@ -130,7 +142,9 @@ class TrainPose(PeopleOptions):
             first_samples=first_steps * self.batch,
             shares=SHARES if self.second_labels is None else SHARES_CONFIRMED,
             augmentation=Augmentation() if self.augmentation == "full" else MILD_AUGMENTATION,
+            teacher=teacher,
         )
+        recipe.settings["teacher"] = digest(self.teacher)
         self.train(recipe, loop)
 
 

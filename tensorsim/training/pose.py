@@ -44,6 +44,10 @@ LSPET_HELD_OUT_PERCENT = 3
 SHARES = (0.5, 0.15, 0.3, 0.12)
 #: The same where most people of LSPE are confirmed by second labels, and so among the first.
 SHARES_CONFIRMED = (0.75, 0.12, 0.05, 0.1)
+#: Distance from a label up to which a teacher's peak agrees with it, in heights of the map.
+AGREED = 0.0625
+#: Share of the labels of a person that must agree with the teacher, for it to be believed about other keypoints.
+CONFIRMED = 0.6
 
 
 class PosePeople(NamedTuple):
@@ -184,6 +188,42 @@ def person_loss(
     return torch.where(~sided & (exchanged < 0.5 * straight), exchanged, straight)
 
 
+def sharpened(maps: Tensor, sigma: float, of_teacher: float = 2.0) -> Tensor:
+    """Heat maps (..., h, w) of Gaussians of one sigma, map pixels, with another, at the same heights.
+
+    ``h (m / h)^((s / sigma)^2)``, h the height of the map m and s the sigma it has, by default that of B. Xiao et al.,
+    "Simple baselines for human pose estimation and tracking", ECCV 2018.
+    """
+    maps = maps.clamp(0, 1)
+    heights = maps.amax((-2, -1), keepdim=True).clamp_min(1e-6)
+    return heights * (maps / heights) ** ((of_teacher / sigma) ** 2)
+
+
+def distillation_loss(maps: Tensor, taught: Tensor, points: Tensor, known: Tensor, gone: Tensor) -> Tensor:
+    """How far maps are from a teacher's, (N,): the mean of :func:`heatmap_loss` over what the teacher is right about.
+
+    That is a known keypoint whose label is within :data:`AGREED` of the peak of the teacher's map, which is as high as
+    the labels' then, and, of people of whom at least :data:`CONFIRMED` of the known keypoints are, those keypoints that
+    are neither known nor gone.
+
+    Args:
+        maps: (N, 17, h, w).
+        taught: (N, 17, h, w), the teacher's.
+        points: (N, 17, 2) map pixels.
+        known: (N, 17) bool.
+        gone: (N, 17) bool, none of them known.
+    """
+    height, width = maps.shape[-2:]
+    peaks = taught.flatten(-2).argmax(-1)
+    places = torch.stack([peaks % width, peaks // width], -1).to(points.dtype)
+    agreed = known & ((places - points).norm(dim=-1) <= AGREED * height)
+    confirmed = agreed.sum(-1) >= CONFIRMED * known.sum(-1).clamp_min(1)
+    told = agreed | (confirmed[:, None] & ~known & ~gone)
+    heights = torch.where(agreed, taught.amax((-2, -1)), 1.0).clamp_min(1e-3)
+    taught = taught / heights[..., None, None]
+    return (heatmap_loss(maps, taught) * told).sum(-1) / told.sum(-1).clamp_min(1)
+
+
 class TrainedCPM(CPM):
     """CPM that gives the maps of every stage in training, (S, N, 17, h, w), as each of them is supervised."""
 
@@ -208,6 +248,8 @@ class PoseRecipe(Recipe):
         first_samples: how many; 0 trains at the network's size from the start.
         shares: of ``sided``, ``films``, ``unsided`` and ``rendered`` in the stream, in relation to each other.
         augmentation: of the crops.
+        teacher: a better network, crops to heat maps of the same size, whose answers are learnt besides the labels;
+            None learns from labels alone.
 
     Raises:
         TensorsimError: a source without people.
@@ -226,6 +268,7 @@ class PoseRecipe(Recipe):
         first_samples: int = 0,
         shares: tuple[float, float, float, float] = SHARES,
         augmentation: Augmentation | None = None,
+        teacher: nn.Module | None = None,
     ) -> None:
         self.augmentation = Augmentation() if augmentation is None else augmentation
         height, width = net.input_size
@@ -244,6 +287,7 @@ class PoseRecipe(Recipe):
         }
         network = "CPM" if isinstance(net, CPM) else "HRNet"
         super().__init__(net, settings, {"network": network, "input_size": f"{height}x{width}"})
+        self.teacher = teacher
         self.stride = getattr(net, "stride", 4)
         self.input_size, self.first_size, self.first_samples = net.input_size, first_size, first_samples
         self.rendered, self.validation = rendered, validation
@@ -255,7 +299,10 @@ class PoseRecipe(Recipe):
         self.weights = [_weights(group) for group in self.groups]
 
     def sample(self, index: int) -> dict[str, Any]:
-        """A crop (3, h, w) uint8, its points and rivals, which are known and which gone, whether sides hold."""
+        """A crop (3, h, w) uint8, its points and rivals, which are known and which gone, whether sides hold.
+
+        With a teacher, its maps (17, h/4, w/4) as well: found here, by the processes that prepare samples.
+        """
         import cv2
 
         cv2.setNumThreads(0)  # the processes of the loader are the parallel ones
@@ -276,8 +323,14 @@ class PoseRecipe(Recipe):
                 image, person.box, keypoints, size, self.augmentation, generator, person.others
             )
         image = covered(recoloured(crop.image, generator), generator)
-        return {
-            "crops": np.ascontiguousarray(image.transpose(2, 0, 1)),
+        pixels = np.ascontiguousarray(image.transpose(2, 0, 1))
+        taught = {}
+        if self.teacher is not None:
+            with torch.inference_mode():
+                found = self.teacher(torch.from_numpy(pixels)[None].float() / 255)[0]
+            taught = {"taught": sharpened(found, self.sigma).half().numpy()}
+        return taught | {
+            "crops": pixels,
             "points": crop.points,
             "known": crop.known,
             "gone": crop.gone,
@@ -286,7 +339,7 @@ class PoseRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Mean over the batch, and over the stages of CPM, of :func:`person_loss`."""
+        """Mean over the batch, and over the stages of CPM, of :func:`person_loss` and :func:`distillation_loss`."""
         crops = batch["crops"].float() / 255
         maps = net(crops.contiguous(memory_format=torch.channels_last)).float()
         labels = {name: batch[name] for name in ("points", "known", "gone", "rivals", "sided")}
@@ -294,7 +347,12 @@ class PoseRecipe(Recipe):
         losses = [
             person_loss(of_stage, **labels, sigma=self.sigma, stride=self.stride) for of_stage in stages
         ]
-        return {"loss": torch.stack(losses).mean()}
+        loss = torch.stack(losses).mean()
+        if self.teacher is None:
+            return {"loss": loss}
+        told = (batch["taught"].float(), batch["points"] / self.stride, batch["known"], batch["gone"])
+        difference = torch.stack([distillation_loss(of_stage, *told) for of_stage in stages]).mean()
+        return {"loss": loss + difference, "distillation": difference.detach()}
 
     def optimiser(self) -> torch.optim.Optimizer:
         """AdamW; no decay of biases and normalisation."""

@@ -16,17 +16,21 @@ from tensorsim.training.pose import (
     PoseRecipe,
     TrainedCPM,
     covered,
+    distillation_loss,
     gaussian_maps,
     heatmap_loss,
     person_loss,
+    sharpened,
 )
 from tensorsim.training.pose_data import Augmentation, Person, RenderedPeople
 from tensorsim.training.pose_metrics import SIGMAS, evaluate_cut, evaluate_pose, oks, pck, pck_either_way
 from tensorsim.training.shards import Sample
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
+from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
 from tests.training.test_pose_data import BOX, drawn, sample, standing, write_cutouts
 from tests.training.test_shards import jpg
+from tests.vision.pose2d.test_onnx_heatmaps import write_network
 
 TINY = HRNetConfig(4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4)
 
@@ -223,6 +227,55 @@ def test_scores_of_cut_people_tell_what_is_out_of_sight(tmp_path: Path) -> None:
     assert evaluate_cut(Everything(), persons) == {"seen": 1.0, "ghosts": 1.0}
     keypoints[3:, 2] = 0  # too few labels to cut
     assert np.isnan(list(evaluate_cut(Everything(), persons).values())).all()
+
+
+def test_sharpened_maps_are_narrower_gaussians_of_the_same_height() -> None:
+    points = torch.tensor([[5.0, 6.0], [7.0, 3.0]])
+    heights = torch.tensor([0.7, 0.2])[:, None, None]
+    found = sharpened(heights * gaussian_maps(points, (16, 12), 2.0), 1.5)
+    torch.testing.assert_close(found, heights * gaussian_maps(points, (16, 12), 1.5))
+    assert (sharpened(-torch.ones(1, 4, 4), 1.5) == 0).all()
+
+
+def test_a_teacher_is_believed_where_the_labels_agree() -> None:
+    """Of three people: it is right about all of one but a shoulder, about few of another, and about all of the third,
+    of whom some are unknown."""
+    points = 4 + (torch.rand(3, 17, 2) * torch.tensor([4.0, 24.0])).round()  # on pixels, where peaks are
+    known, gone = torch.ones(3, 17, dtype=torch.bool), torch.zeros(3, 17, dtype=torch.bool)
+    known[1:, :4], gone[1:, 0] = False, True
+    places = points.clone()
+    places[0, 5] += torch.tensor([6.0, 0.0])
+    places[1, 9:] += torch.tensor([6.0, 0.0])
+    taught = 0.6 * gaussian_maps(places, (32, 16), 1.5)
+    maps = torch.rand(3, 17, 32, 16, requires_grad=True)
+    loss = distillation_loss(maps, taught, points, known, gone)
+    loss.sum().backward()
+    assert maps.grad is not None
+    told = torch.ones(3, 17, dtype=torch.bool)
+    told[0, 5], told[1, :4], told[1, 9:], told[2, 0] = False, False, False, False
+    torch.testing.assert_close(maps.grad.abs().amax((-2, -1)) > 0, told)
+    # A label is as high as any; what has none keeps the teacher's height.
+    best = taught / 0.6
+    best[2, 1:4] *= 0.6
+    torch.testing.assert_close(
+        distillation_loss(best, taught, points, known, gone), torch.zeros(3), atol=1e-6, rtol=0
+    )
+
+
+def test_a_teacher_is_asked_about_what_the_network_is_shown(tmp_path: Path) -> None:
+    teacher = OnnxHeatmaps(write_network(tmp_path / "teacher.onnx", size=(64, 64)), threads=1)
+    with_teacher, alone = recipe(tmp_path, teacher=teacher), recipe(tmp_path)
+    batch = with_teacher.collate([with_teacher.sample(n) for n in range(4)])
+    crops = batch["crops"].float() / 255
+    torch.testing.assert_close(batch["taught"].float(), sharpened(teacher(crops), 1.5), atol=1e-3, rtol=0)
+    losses = with_teacher.loss(with_teacher.net, batch)
+    expected = distillation_loss(
+        with_teacher.net(crops), batch["taught"].float(), batch["points"] / 4, batch["known"], batch["gone"]
+    ).mean()
+    torch.testing.assert_close(losses["distillation"], expected)
+    labels = alone.loss(with_teacher.net, batch)
+    assert labels.keys() == {"loss"}
+    torch.testing.assert_close(losses["loss"], labels["loss"] + expected)
 
 
 def recipe(folder: Path, **options: object) -> PoseRecipe:

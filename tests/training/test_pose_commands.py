@@ -15,6 +15,7 @@ from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 from tests.training.tars import write_tar
 from tests.training.test_pose_data import BOX, standing, write_cutouts
 from tests.training.test_shards import jpg, label
+from tests.vision.pose2d.test_onnx_heatmaps import WEIGHT, write_network
 
 
 @pytest.fixture
@@ -166,6 +167,38 @@ def test_most_steps_at_the_size_that_is_asked_for(
     monkeypatch.setattr(TrainPose, "train", lambda self, recipe, loop: recipes.append(recipe))
     TrainPose(data, out=data / "out", steps=steps, batch=2, **options).run()  # type: ignore[arg-type]
     assert recipes[0].first_samples == 2 * first
+
+
+@pytest.mark.parametrize(
+    "options", [{"network": "cpm"}, {"size": (64, 32), "first_steps": 1}, {"size": (128, 96)}]
+)
+def test_a_teacher_of_other_maps_is_refused(options: dict[str, object], data: Path) -> None:
+    teacher = write_network(data / "teacher.onnx")  # crops of 64x32
+    options = {"size": (64, 32), "first_steps": 0, "steps": 2, "teacher": teacher} | options
+    with pytest.raises(TensorsimError, match=r"--teacher: got a network of crops of \(64, 32\)"):
+        TrainPose(data, out=data / "out", **options).run()  # type: ignore[arg-type]
+    assert not (data / "out").exists()
+
+
+def test_training_with_a_teacher_goes_on_with_no_other(data: Path) -> None:
+    teacher = write_network(data / "teacher.onnx")
+    options = TrainPose(
+        data,
+        out=data / "out",
+        steps=1,
+        first_steps=0,
+        size=(64, 32),
+        width=4,
+        batch=2,
+        workers=0,
+        quiet=True,
+        teacher=teacher,
+    )
+    options.run()
+    assert "distillation" in (data / "out" / "metrics.csv").read_text()
+    write_network(teacher, weight=2 * WEIGHT)
+    with pytest.raises(TensorsimError, match=r"another run .*teacher"):
+        replace(options, steps=2).run()
 
 
 def test_nobody_to_measure_on_is_told_before_training(data: Path) -> None:

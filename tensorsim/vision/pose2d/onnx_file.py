@@ -21,6 +21,7 @@ class OnnxFile(nn.Module):
     Args:
         path: the ``.onnx`` file.
         expected: outputs that it should have, for messages.
+        threads: of ONNX Runtime for one crop; None takes all cores.
 
     Attributes:
         input_size: (H, W) of the crops it takes; (256, 192) where the file does not fix it.
@@ -33,9 +34,9 @@ class OnnxFile(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, path: str | os.PathLike[str], expected: str) -> None:
+    def __init__(self, path: str | os.PathLike[str], expected: str, threads: int | None = None) -> None:
         super().__init__()
-        self.path, self.expected = Path(path).absolute(), expected
+        self.path, self.expected, self.threads = Path(path).absolute(), expected, threads
         self._session: Any = None
         inputs = self.session.get_inputs()
         shape = inputs[0].shape
@@ -62,7 +63,7 @@ class OnnxFile(nn.Module):
     def session(self) -> Any:
         """The ``onnxruntime.InferenceSession``, opened on first use."""
         if self._session is None:
-            self._session = open_session(self.path)
+            self._session = open_session(self.path, self.threads)
         return self._session
 
     def run_on(self, crops: Tensor, outputs: list[str]) -> list[Tensor]:
@@ -98,8 +99,8 @@ def is_size(size: Any, expected: int) -> bool:
     return not isinstance(size, int) or size == expected
 
 
-def open_session(path: Path) -> Any:
-    """The ``onnxruntime.InferenceSession`` of a file on the CPU.
+def open_session(path: Path, threads: int | None = None) -> Any:
+    """The ``onnxruntime.InferenceSession`` of a file on the CPU, with this many threads or one for each core.
 
     Raises:
         TensorsimError: no ONNX Runtime, no such file, or one that it cannot read.
@@ -112,7 +113,9 @@ def open_session(path: Path) -> Any:
         ) from error
     if not path.is_file():
         raise TensorsimError(f"{path}: got no such file, expected an ONNX network")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 0 if threads is None else threads
     try:
-        return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime's own exceptions share no base class
         raise TensorsimError(f"{path}: got a file that ONNX Runtime cannot read ({error})") from error

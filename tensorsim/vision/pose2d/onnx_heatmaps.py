@@ -17,14 +17,15 @@ class OnnxHeatmaps(OnnxFile):
 
     Args:
         path: the ``.onnx`` file.
+        threads: of ONNX Runtime for one crop; None takes all cores.
 
     Raises:
         TensorsimError: no ONNX Runtime, a file that it cannot read, inputs or outputs of another layout,
             crops of another size; also when it is scripted.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__(path, "heat maps (N or 1, 17, H/4, W/4) first")
+    def __init__(self, path: str | os.PathLike[str], threads: int | None = None) -> None:
+        super().__init__(path, "heat maps (N or 1, 17, H/4, W/4) first", threads)
         maps = self.session.get_outputs()[0].shape
         if len(maps) != 4 or not is_size(maps[1], len(COCO_KEYPOINTS)):
             self.refuse()
