@@ -1,7 +1,6 @@
-"""What a simulation writes into its folder: maps, poses, pictures, the overlay film and the summary."""
+"""What a simulation writes into its folder: maps, poses, pictures and the overlay film."""
 
 import math
-import uuid
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future
@@ -21,16 +20,13 @@ from tensorsim.data.sound import doppler_sound, slow_time_signal, write_sound
 from tensorsim.data.video_writer import VideoWriter
 from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.files import write_json
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
 from tensorsim.progress import picture, progress_bar
-from tensorsim.recognition import ActivityRecognizer, label_windows
-from tensorsim.recognition.timeline import NOT_SURE, scene_probabilities
 from tensorsim.report.film import FilmStrip
 from tensorsim.streaming import Found, maps_of_pose, within_reach
 from tensorsim.threads import beside
 from tensorsim.types import Pose, RadarMaps
-from tensorsim.vision.calibration.calibrator import camera_config, camera_row
+from tensorsim.vision.calibration.calibrator import camera_config
 from tensorsim.vision.tracking.selection import select_people
 
 if TYPE_CHECKING:
@@ -45,11 +41,12 @@ class Axes:
 
     Attributes:
         range_m: (R,).
-        doppler_hz: (F,), positive = approaching.
+        doppler_hz: (F,), positive = approaching if ``signed``.
         time_s: (K,) centres of the Doppler-time columns.
         range_time_rate_hz: columns of the range-time maps per second.
         speed_per_hz: m/s per Hz of Doppler.
         block: pulses per column of the range-time maps.
+        signed: whether the Doppler-time map tells approaching from receding; the paper's does not.
     """
 
     range_m: np.ndarray
@@ -58,6 +55,12 @@ class Axes:
     range_time_rate_hz: float
     speed_per_hz: float
     block: int = 1
+    signed: bool = True
+
+    @property
+    def doppler_label(self) -> str:
+        """What is written beside the Doppler axis."""
+        return "Doppler in Hz, " + ("positive = approaching" if self.signed else "without its sign")
 
     def range_time_s(self, columns: int) -> np.ndarray:
         """Times (columns,) of the middles of the range-time columns."""
@@ -78,6 +81,7 @@ def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
         range_time_rate_hz=simulator.radar.prf_hz / simulator.range_time_block,
         speed_per_hz=simulator.radar.doppler_wavelength_m / 2,
         block=simulator.range_time_block,
+        signed=doppler.integration != "paper",
     )
 
 
@@ -155,7 +159,7 @@ def doppler_figure(
         axes.time_s,
         axes.doppler_hz,
         "Doppler-time map",
-        "Doppler in Hz, positive = approaching",
+        axes.doppler_label,
         ridges=strong_ridges(maps, axes),
         speed_per_axis=axes.speed_per_hz,
         half_span=max(plot.doppler_span(one.doppler_time.numpy(), axes.doppler_hz, range_db) for one in both),
@@ -362,89 +366,3 @@ def _figure_pixels(figure: Any) -> np.ndarray:
     """A figure as (H, W, 3) uint8 RGB."""
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
-
-
-def people_of(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]]:
-    """One row per person: when it is in the scene, how far its torso is from the radar, and how fast that shrinks."""
-    rows = []
-    antennas = torch.tensor(radar.middle_m, dtype=torch.float64)
-    for person in range(pose.joints.shape[1]):
-        frames = torch.nonzero(pose.valid[0, person]).flatten()
-        if frames.numel() == 0:
-            continue  # a track on which no joint was seen
-        torso = pose.joints[0, person, frames][:, [1, 8, 11]].double().mean(dim=1)
-        range_m = (torso - antennas).norm(dim=-1)
-        duration_s = max(float(frames[-1] - frames[0]) / fps, 1 / fps)
-        rows.append(
-            {
-                "id": person + 1,
-                "first_frame": int(frames[0]),
-                "last_frame": int(frames[-1]),
-                "mean_range_m": round(float(range_m.mean()), 3),
-                "mean_approach_m_s": round(float(range_m[0] - range_m[-1]) / duration_s, 3),
-            }
-        )
-    return rows
-
-
-def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: RadarMaps) -> dict[str, Any]:
-    """What ``summary.json`` says of every simulation; ``config`` is read by :meth:`SimulationConfig.from_yaml`."""
-    snr_db = float(maps.snr_db)
-    document = config.to_document()
-    return {
-        "source": {"kind": source.kind, **source.about},
-        "people": people_of(found.pose, source.fps, config.scene.radar),
-        "camera": camera_row(found.camera),
-        "radar_ahead_of_camera_m": round(found.radar_ahead_m, 3),
-        "background_px_s": None if found.background_px_s is None else round(found.background_px_s, 1),
-        "frames": found.pose.valid.shape[2],
-        "fps": source.fps,
-        "seed": config.seed,
-        "realised_snr_db": round(snr_db, 3) if math.isfinite(snr_db) else None,
-        **{part: document["scene"][part] for part in ("radar", "wall", "floor")},
-        "config": document,
-    }
-
-
-def label_of(
-    recognizer: ActivityRecognizer | None, maps: RadarMaps, duration_s: float, least_probability: float = 0.0
-) -> dict[str, Any]:
-    """What ``summary.json`` says of the activity.
-
-    ``timeline`` has the label of each window of four seconds; ``label`` and ``probabilities`` are of the whole scene,
-    see :func:`~tensorsim.recognition.timeline.scene_probabilities`. None where there is no recognizer, or one that
-    cannot see the speeds of this radar.
-
-    Args:
-        recognizer: of the radar of the maps.
-        maps: without batch dimensions.
-        duration_s: of the scene.
-        least_probability: below it the label is "not sure".
-    """
-    if recognizer is None:
-        return {"label": None, "probabilities": None, "timeline": None}
-    windows = label_windows(recognizer, maps, duration_s, least_probability=least_probability)
-    means = scene_probabilities(windows)
-    best = int(means.argmax())
-    sure = float(means[best]) >= least_probability
-    return {
-        "label": recognizer.class_names[best] if sure else NOT_SURE,
-        "probabilities": {
-            name: round(p, 4) for name, p in zip(recognizer.class_names, means.tolist(), strict=True)
-        },
-        "timeline": [
-            {
-                "start_s": round(window.start_s, 3),
-                "end_s": round(window.end_s, 3),
-                "label": window.label,
-                "probability": round(max(window.probabilities), 4),
-            }
-            for window in windows
-        ],
-    }
-
-
-def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write ``summary.json``: strict JSON, with the names of the files of this run and an id of the run."""
-    files = sorted({file.name for file in folder.iterdir()} | {"summary.json"})
-    write_json(folder / "summary.json", summary | {"run": uuid.uuid4().hex, "files": files})

@@ -18,8 +18,8 @@ from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.motion import JointScatterers
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
-from tensorsim.results import people_of
 from tensorsim.streaming import maps_of_pose
+from tensorsim.summary import people_of
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 from tests.film import RectangleDetector, StandingPose, film, walker

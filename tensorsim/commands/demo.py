@@ -75,6 +75,7 @@ class Demo(NetworkOptions, RadarOptions):
         from tensorsim.pipeline import PoseToDoppler, VideoToPose
         from tensorsim.sources import drawn_by, film_source
         from tensorsim.streaming import maps_of_pose
+        from tensorsim.summary import summary_of, write_summary
 
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
@@ -115,9 +116,9 @@ class Demo(NetworkOptions, RadarOptions):
                     "options": self.described(),
                     "warnings": messages,
                 }
-                summary = label | results.summary_of(source, config, seen, maps) | about
+                summary = label | summary_of(source, config, seen, maps) | about
                 self.write_report(folder, done, strip.result(), summary, true_maps)
-                results.write_summary(folder, summary)
+                write_summary(folder, summary)
         print_warnings(messages)
         count = int(pose.valid[0].any(1).sum())
         found = f"{number_of_people(count)} found, {described_label(label)}"

@@ -39,6 +39,7 @@ def write_each_person(folder: Path, run: "Run", options: "RadarOptions") -> list
     from tensorsim import plot, results
     from tensorsim.report.page import map_contents
     from tensorsim.streaming import maps_of_pose
+    from tensorsim.summary import label_of
 
     people = [int(person) for person in torch.nonzero(run.pose.valid[0].any(dim=-1)).flatten()]
     if len(people) < 2:
@@ -53,7 +54,7 @@ def write_each_person(folder: Path, run: "Run", options: "RadarOptions") -> list
         pose = run.pose._replace(valid=there)
         maps = maps_of_pose(run.stage, pose, run.fps, run.device, options.quiet)
         axes = results.axes_of(run.stage, maps)
-        label = results.label_of(run.recognizer, maps, duration_s, options.least_probability)
+        label = label_of(run.recognizer, maps, duration_s, options.least_probability)
         pictures = options.pictures(run.stage, label["label"], f"{run.film}, person {number}", True)
         results.save_maps(folder / f"maps_person_{number}", maps, axes, array_formats(options.save))
         name = f"doppler_time_person_{number}"

@@ -181,10 +181,11 @@ class RadarOptions(PanelOptions, ReceiverOptions):
             What ``summary.json`` says of the label.
         """
         from tensorsim import results
+        from tensorsim.summary import label_of
 
         pose, maps, stage = run.pose, run.maps, run.stage
         duration_s = pose.valid.shape[2] / run.fps
-        label = results.label_of(run.recognizer, maps, duration_s, self.least_probability)
+        label = label_of(run.recognizer, maps, duration_s, self.least_probability)
         warn_of_label(run.recognizer, int(pose.valid.any(-1).sum()), duration_s)
         pictures = self.pictures(stage, label["label"], run.film, run.somebody)
         axes, formats = results.axes_of(stage, maps), array_formats(self.save)
@@ -304,7 +305,7 @@ def number_of_people(count: int) -> str:
 
 
 def described_label(label: dict[str, Any]) -> str:
-    """``S8 Walking (0.98)``: the label and its probability, of what :func:`tensorsim.results.label_of` says."""
+    """``S8 Walking (0.98)``: the label and its probability, of what :func:`tensorsim.summary.label_of` says."""
     name = label["label"]
     probabilities = label["probabilities"] or {}
     return f"{name} ({probabilities[name]:.2f})" if name in probabilities else name or "no label"

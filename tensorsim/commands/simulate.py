@@ -117,6 +117,7 @@ class Simulate(NetworkOptions, RadarOptions):
         from tensorsim.files import complete_or_nothing
         from tensorsim.pipeline import PoseToDoppler
         from tensorsim.sources import KINDS, kind_of
+        from tensorsim.summary import summary_of, write_summary
 
         kind = kind_of(self.source)
         for field in fields(self):
@@ -145,14 +146,14 @@ class Simulate(NetworkOptions, RadarOptions):
                     )
                     label = self.write_results(folder, done)
                     alone = write_each_person(folder, done, self) if self.per_person else []
-                summary = label | results.summary_of(source, config, found, maps)
+                summary = label | summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
                 for row, person in zip(summary["people"], alone, strict=len(alone) > 0):
                     row |= person.label
                 self.write_report(
                     folder, done, strip.result(), summary, further=[person.map for person in alone]
                 )
-                results.write_summary(folder, summary)
+                write_summary(folder, summary)
         print_warnings(messages)
         people = number_of_people(int(pose.valid[0].any(1).sum()))
         print(f"{self.out}: {people} in {pose.valid.shape[2]} frames, {described_label(label)}")

@@ -24,7 +24,6 @@ from tensorsim.evaluation.film_variants import Observed, over_variants
 from tensorsim.files import complete_file
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
-from tensorsim.results import label_of, people_of
 from tensorsim.streaming import (
     Found,
     detections_of_film,
@@ -34,6 +33,7 @@ from tensorsim.streaming import (
     steps_of_camera,
     within_reach,
 )
+from tensorsim.summary import label_of, people_of
 from tensorsim.types import Detections, Pose, RadarMaps
 from tensorsim.vision.calibration.calibrator import camera_row
 from tensorsim.vision.calibration.camera_motion import MOVING_SHARE, BackgroundMotion
@@ -291,7 +291,7 @@ def judged(
 
 
 def followed(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]]:
-    """A row per person: those of :func:`~tensorsim.results.people_of`, for how long, and the fastest joint."""
+    """A row per person: those of :func:`~tensorsim.summary.people_of`, for how long, and the fastest joint."""
     rows = people_of(pose, fps, radar)
     for row in rows:
         person = row["id"] - 1

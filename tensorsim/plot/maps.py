@@ -234,7 +234,7 @@ def _add_speed_axis(axes: Axes, speed_per_axis: float) -> None:
     right = axes.twinx()
     low, high = axes.get_ylim()
     right.set_ylim(low * speed_per_axis, high * speed_per_axis)
-    right.set_ylabel("radial speed in m/s, positive = approaching")
+    right.set_ylabel("radial speed in m/s")
 
 
 def clear_ridges(ridges: np.ndarray, axis: np.ndarray, shown: np.ndarray, least_height: float) -> np.ndarray:

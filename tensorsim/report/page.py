@@ -140,7 +140,7 @@ def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = 
     doppler = {
         **_content("doppler_time", maps, axes.doppler_hz, rows, pictures),
         "title": f"Doppler-time map{of}",
-        "axis": "Doppler in Hz, positive = approaching",
+        "axis": axes.doppler_label,
         "start_s": float(axes.time_s[0]) - step_s / 2,
         "end_s": float(axes.time_s[-1]) + step_s / 2,
         "second_axis": {"label": "m/s", "per_unit": axes.speed_per_hz},

@@ -14,7 +14,7 @@ from tensorsim.recognition.timeline import (
     scene_probabilities,
     window_starts,
 )
-from tensorsim.results import label_of
+from tensorsim.summary import label_of
 from tensorsim.types import RadarMaps
 
 RADAR = ts.RadarConfig.through_wall()

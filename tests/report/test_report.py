@@ -16,7 +16,8 @@ from tensorsim.plot import RIDGE_COLOURS, decibels
 from tensorsim.report import FilmStrip, write_report
 from tensorsim.report import film as film_module
 from tensorsim.report.page import STORED_DB, timeline_content
-from tensorsim.results import Axes, Pictures, axes_of, people_of
+from tensorsim.results import Axes, Pictures, axes_of
+from tensorsim.summary import people_of
 from tensorsim.types import Pose, RadarMaps
 from tests.browser import chromium
 
@@ -215,3 +216,13 @@ def centre(page: Any, selector: str) -> tuple[float, float]:
     page.locator(selector).scroll_into_view_if_needed()
     box = page.locator(selector).bounding_box()
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def test_the_axis_of_the_papers_map_promises_no_sign(run: tuple[Pose, RadarMaps, Axes, Any]) -> None:
+    """The spectrum of real magnitudes is symmetric: approaching and receding look the same."""
+    pose, _, axes, _ = run
+    assert axes.doppler_label == "Doppler in Hz, positive = approaching"
+    stage = ts.PoseToDoppler.from_config(ts.SimulationConfig.paper())
+    of_paper = RadarMaps(*(field[0] for field in stage(pose.joints, pose.valid, FPS)))
+    torch.testing.assert_close(of_paper.doppler_time, of_paper.doppler_time.roll(-1, 0).flip(0))
+    assert axes_of(stage, of_paper).doppler_label == "Doppler in Hz, without its sign"
