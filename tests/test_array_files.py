@@ -8,7 +8,8 @@ import pytest
 from scipy.io import loadmat
 
 from tensorsim.array_files import array_formats, save_arrays
-from tensorsim.commands.options import FIELDS, RadarOptions
+from tensorsim.commands.clip_options import ClipOptions
+from tensorsim.commands.options import FIELDS
 from tensorsim.commands.panel import PANEL, PanelOptions
 from tensorsim.commands.simulate import Simulate
 from tensorsim.config import SimulationConfig
@@ -62,6 +63,6 @@ def test_every_parameter_of_the_panel_is_an_option_and_a_field() -> None:
         value = config
         for name in parameter.field.split("__"):
             value = getattr(value, name)
-        if parameter.option in RadarOptions.__dataclass_fields__:
+        if parameter.option in ClipOptions.__dataclass_fields__:
             assert FIELDS[parameter.option] == parameter.field
     assert {p.option for p in PANEL} >= set(PanelOptions.__dataclass_fields__)

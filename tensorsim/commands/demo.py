@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tensorsim.array_files import save_arrays
+from tensorsim.commands.clip_options import ClipOptions, Run
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import (
-    RadarOptions,
-    Run,
     at_display_rate,
     check_drawable,
     described_label,
@@ -37,7 +36,7 @@ CAMERA_M = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Demo(NetworkOptions, RadarOptions):
+class Demo(NetworkOptions, ClipOptions):
     """Film a rendered person and turn the film into what a radar would have seen. Needs no file.
 
     Writes what `simulate` writes, film.mp4, and the truth: maps_truth.npz, pose_truth.npz; every picture of a map

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from tensorsim.array_files import array_formats
 
 if TYPE_CHECKING:
-    from tensorsim.commands.options import RadarOptions, Run
+    from tensorsim.commands.clip_options import ClipOptions, Run
 
 
 class Alone(NamedTuple):
@@ -23,7 +23,7 @@ class Alone(NamedTuple):
     map: dict[str, Any]
 
 
-def write_each_person(folder: Path, run: "Run", options: "RadarOptions") -> list[Alone]:
+def write_each_person(folder: Path, run: "Run", options: "ClipOptions") -> list[Alone]:
     """Simulate and label each person of a run as if nobody else were there, if there are several.
 
     Writes ``maps_person_N`` and a picture of the Doppler-time map for person N. Noise is relative to the person's own

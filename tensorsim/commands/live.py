@@ -2,7 +2,7 @@
 
 import sys
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     from tensorsim.live import LiveFrame, LiveSimulator
     from tensorsim.live.camera import Camera
 
-#: Options of other commands that say nothing of a live simulation.
-_UNUSED = (
-    "figure_format",
-    "hide_ridges",
-    "sound",
-    "full_rate",
-    "save",
-    "motion",
-    "device",
-    "denoiser",
-    "people",
-)
-
 
 @dataclass(frozen=True)
 class Live(NetworkOptions, RadarOptions):
@@ -38,9 +25,6 @@ class Live(NetworkOptions, RadarOptions):
 
     The page has the camera's picture with the people in it, the Doppler-time map that scrolls, and the labels. Frames
     that come faster than they can be worked on are dropped and counted. Ends with the film, or with Ctrl-C.
-
-    Refuses the options of `simulate` for its files, and those that look ahead or choose among people: --figure-format,
-    --hide-ridges, --sound, --full-rate, --save, --motion, --denoiser, --people, and --device.
     """
 
     camera: str
@@ -149,11 +133,6 @@ class Live(NetworkOptions, RadarOptions):
 
     def _check(self) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
-        for field in fields(self):
-            if field.name in _UNUSED and getattr(self, field.name) != field.default:
-                raise TensorsimError(
-                    f"--{field.name.replace('_', '-')}: got it for live, which has no use for it"
-                )
         super().check(Path(self.record or ".").parent)
         for value in self.person_height or ():
             check_range(value, "body height", "--person-height")

@@ -3,15 +3,12 @@
 import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from tensorsim.array_files import array_formats
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
@@ -19,14 +16,9 @@ from tensorsim.exceptions import TensorsimError, TensorsimWarning, check_count
 from tensorsim.files import check_folder
 
 if TYPE_CHECKING:
-    import torch
-
     from tensorsim.config import SimulationConfig
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.recognition import ActivityRecognizer
-    from tensorsim.report import FilmStrip
-    from tensorsim.results import Pictures
-    from tensorsim.types import Pose, RadarMaps
 
 #: Columns per second of the range-time maps that are written, unless every pulse is asked for.
 DISPLAY_RATE_HZ = 256.0
@@ -53,7 +45,7 @@ def check_seed(seed: int, option: str = "--seed") -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RadarOptions(PanelOptions, ReceiverOptions):
-    """How people's joints become maps. Options without a value keep that of the configuration."""
+    """How people's joints become maps, and how these look. Options without a value keep that of the configuration."""
 
     config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
     """Configuration of a run: a YAML file with fields of SimulationConfig, or the summary.json of an earlier run. Other
@@ -67,19 +59,10 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall, and
     the arrays ti-awr1843-array, infineon-bgt60tr13c-array) or a YAML file with fields of RadarConfig; a wall that it
     comes with replaces the scene's, a floor adds its reflections."""
-    people: Annotated[Option[str], tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
-    """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
     body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
     """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
     cross section follows the aspect, the 13 points of the original's first version, or points over torso and limbs
     with the energy over speed of measured walks. Default: joints."""
-    sway: bool = False
-    """People sway while they stand."""
-    vital_signs: bool = False
-    """People breathe and their hearts beat."""
-    motion: Option[Literal["smooth", "paper"]] = None
-    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay.
-    Default: smooth."""
     integration: Option[Literal["noncoherent", "paper"]] = None
     """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler. Default: noncoherent."""
     wall_paths: Option[Literal["series", "paper"]] = None
@@ -92,9 +75,6 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     """Static mirror reflection of the wall."""
     snr: Option[float] = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
-    denoiser: Option[str] = None
-    """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
-    .safetensors or a name of `tensorsim models list`). Default: none."""
     classifier: Option[str] = None
     """Activity classifier: SPGNet or SPNet as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
@@ -106,18 +86,6 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     """Colours of the maps."""
     dynamic_range: float = 50.0
     """Decibels below the peak that the maps show."""
-    figure_format: Literal["png", "pdf", "svg"] = "png"
-    """Format of the pictures."""
-    hide_ridges: bool = False
-    """Draw no ridges over the Doppler-time map."""
-    sound: bool = False
-    """Write doppler.wav as well, the micro-Doppler as sound: approaching motion left, receding motion right."""
-    full_rate: bool = False
-    """Keep a column of the range-time maps for every pulse, not 256 per second."""
-    save: Annotated[str, tyro.conf.arg(metavar="npz,mat,h5")] = "npz"
-    """Formats of maps and poses: .npz, which is always written, and mat for MATLAB or h5 for HDF5 beside it."""
-    device: str = "auto"
-    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
     quiet: bool = False
     """No progress bars."""
 
@@ -135,93 +103,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
             raise TensorsimError(
                 f"--least-probability: got {self.least_probability}, expected a number from 0 to 1"
             )
-        array_formats(self.save)
         check_folder(out)
-
-    def described(self) -> dict[str, Any]:
-        """The options that were given, as ``summary.json`` has them."""
-        defaults = {field.name: field.default for field in dataclasses.fields(self)}
-        return {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in asdict(self).items()
-            if value != defaults[name]
-        }
-
-    def pictures(
-        self, stage: "PoseToDoppler", label: str | None, film: str | None, somebody: bool
-    ) -> "Pictures":
-        """How the maps of this run are drawn.
-
-        Args:
-            stage: made them.
-            label: activity, where there is a classifier.
-            film: what the people come from.
-            somebody: whether a person is in the scene; the maps of an empty one refer to the echo of a person.
-        """
-        from tensorsim import plot
-        from tensorsim.results import Pictures
-
-        simulator = stage.simulator
-        return Pictures(
-            plot.MapStyle(self.colormap, self.dynamic_range, not self.hide_ridges),
-            self.figure_format,
-            plot.caption(simulator.radar, label, film),
-            None if somebody else plot.person_peaks(simulator),
-        )
-
-    def write_results(self, folder: Path, run: "Run", truth: "RadarMaps | None" = None) -> dict[str, Any]:
-        """Label the maps of a run and write them, the poses, their pictures and the sound.
-
-        Args:
-            folder: where to.
-            run: what was simulated.
-            truth: maps of the true motion, where it is known; drawn beside the others.
-
-        Returns:
-            What ``summary.json`` says of the label.
-        """
-        from tensorsim import results
-        from tensorsim.summary import label_of
-
-        pose, maps, stage = run.pose, run.maps, run.stage
-        duration_s = pose.valid.shape[2] / run.fps
-        label = label_of(run.recognizer, maps, duration_s, self.least_probability)
-        warn_of_label(run.recognizer, int(pose.valid.any(-1).sum()), duration_s)
-        pictures = self.pictures(stage, label["label"], run.film, run.somebody)
-        axes, formats = results.axes_of(stage, maps), array_formats(self.save)
-
-        def save() -> None:
-            results.save_maps(folder / "maps", maps, axes, formats)
-            if truth is not None:
-                results.save_maps(folder / "maps_truth", truth, axes, formats)
-            results.save_pose(folder, pose, run.fps, formats)
-
-        with ThreadPoolExecutor(1) as pool:
-            saved = pool.submit(save)
-            results.draw_maps(folder, maps, axes, truth, pictures)
-            results.draw_pose(folder, pose, run.fps, pictures, run.config.scene.radar)
-            saved.result()
-        if self.sound:
-            results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
-        return label
-
-    def write_report(
-        self,
-        folder: Path,
-        run: "Run",
-        strip: "FilmStrip",
-        summary: dict[str, Any],
-        truth: "RadarMaps | None" = None,
-        further: Sequence[dict[str, Any]] = (),
-    ) -> None:
-        """Write ``report.html`` of a run with its overlay film and this summary, and further maps below the others."""
-        from tensorsim import report, results
-
-        axes = results.axes_of(run.stage, run.maps)
-        pictures = self.pictures(run.stage, summary["label"], run.film, run.somebody)
-        report.write_report(
-            folder, summary, run.pose, run.fps, run.maps, axes, strip, pictures, truth, further
-        )
 
     def configuration(self) -> "SimulationConfig":
         """The configuration of the run: that of ``--config``, with the other options in place of its fields.
@@ -229,27 +111,28 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         Raises:
             TensorsimError: a file that cannot be read, or values out of range.
         """
-        from tensorsim.config import SimulationConfig, SmoothingConfig
-
-        config = SimulationConfig() if self.config is None else SimulationConfig.from_yaml(self.config)
-        config = self._with_scene(config)
-        if self.paper:
-            config = SimulationConfig.paper(config)
-        if self.motion is not None:
-            smoothing = SimulationConfig.paper().smoothing if self.motion == "paper" else SmoothingConfig()
-            config = config.replace(smoothing=smoothing)
-        for switch in ("leakage", "wall_echo", "sway", "vital_signs"):
-            if getattr(self, switch):
-                config = config.replace(**{f"scene__{switch}": True})
-        config = self.with_receiver(config)
+        config = self.with_receiver(self._begun())
+        own = {field.name for field in dataclasses.fields(self)}
         for option, field in FIELDS.items():
-            value = getattr(self, option)
+            value = getattr(self, option) if option in own else None
             if value is not None:
                 try:
                     config = config.replace(**{field: value})
                 except TensorsimError as error:
                     raise TensorsimError(f"--{option.replace('_', '-')}: {error}") from None
         return config
+
+    def _begun(self) -> "SimulationConfig":
+        """The configuration before options that set one field each."""
+        from tensorsim.config import SimulationConfig
+
+        config = SimulationConfig() if self.config is None else SimulationConfig.from_yaml(self.config)
+        config = self._with_scene(config)
+        if self.paper:
+            config = SimulationConfig.paper(config)
+        if self.leakage:
+            config = config.replace(scene__leakage=True)
+        return config.replace(scene__wall_echo=True) if self.wall_echo else config
 
     def _with_scene(self, config: "SimulationConfig") -> "SimulationConfig":
         """The configuration with the radar, wall and floor that ``--scene`` and ``--radar`` name."""
@@ -266,31 +149,6 @@ class RadarOptions(PanelOptions, ReceiverOptions):
             raise TensorsimError(f"--radar: {error}") from None
         wall = chosen.wall if chosen.wall is not None else config.scene.wall
         return config.replace(scene__radar=chosen.radar, scene__wall=wall, scene__floor=chosen.floor)
-
-
-class Run(NamedTuple):
-    """What was simulated, and how.
-
-    Attributes:
-        config: of the run.
-        stage: made the maps.
-        recognizer: of the maps; None gives no label.
-        pose, maps: what came out, on the CPU; the maps without batch dimensions.
-        fps: frames per second of the poses.
-        film: what the people come from, for the titles.
-        somebody: whether a person is in the scene.
-        device: that ``stage`` is on.
-    """
-
-    config: "SimulationConfig"
-    stage: "PoseToDoppler"
-    recognizer: "ActivityRecognizer | None"
-    pose: "Pose"
-    maps: "RadarMaps"
-    fps: float
-    film: str
-    somebody: bool
-    device: "torch.device"
 
 
 def check_drawable(stage: "PoseToDoppler") -> None:

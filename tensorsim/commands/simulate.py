@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tensorsim.commands.arguments import Option, numbers
+from tensorsim.commands.clip_options import ClipOptions, Run
 from tensorsim.commands.each_person import write_each_person
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import (
-    RadarOptions,
-    Run,
     at_display_rate,
     check_drawable,
     described_label,
@@ -58,7 +57,7 @@ _MEANT_FOR = {
 
 
 @dataclass(frozen=True)
-class Simulate(NetworkOptions, RadarOptions):
+class Simulate(NetworkOptions, ClipOptions):
     """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
 
     Writes report.html, maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.

@@ -27,9 +27,9 @@ import cv2
 import torch
 
 from tensorsim import cli, results, streaming
+from tensorsim.commands.clip_options import ClipOptions
 from tensorsim.commands.demo import film_person
 from tensorsim.commands.networks import default_networks, load_networks
-from tensorsim.commands.options import RadarOptions
 from tensorsim.config import SimulationConfig
 from tensorsim.data import video
 from tensorsim.data.video_writer import write_video
@@ -49,7 +49,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (results, "draw_maps", "maps: pictures"),
     (results, "draw_pose", "poses: picture"),
     (results, "save_arrays", "writing arrays"),
-    (RadarOptions, "write_report", "report"),
+    (ClipOptions, "write_report", "report"),
 )
 #: Stages that the peer has as well.
 FOUND = ("decoding", "detection", "tracking", "key points")

@@ -11,7 +11,7 @@ import torch
 
 import tensorsim as ts
 from tensorsim import cli
-from tensorsim.commands.options import RadarOptions
+from tensorsim.commands.clip_options import ClipOptions
 from tensorsim.commands.receiver import ReceiverOptions
 from tensorsim.config import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.errors import TensorsimError
@@ -51,7 +51,7 @@ def test_each_option_sets_its_field_and_changes_the_maps(option: str) -> None:
     value, expected = CASES[option]
     beside = BESIDE.get(option, {})
     plain, config = (
-        RadarOptions(scene="through-wall", **beside, **more).configuration().replace(scene__snr_db=None)
+        ClipOptions(scene="through-wall", **beside, **more).configuration().replace(scene__snr_db=None)
         for more in ({}, {option: value})
     )
     for name, part in expected.items():
@@ -88,15 +88,15 @@ def test_numbers_that_are_missing_or_none_are_said(
 
 
 def test_the_paper_has_an_ideal_receiver(tmp_path: Path) -> None:
-    typical = RadarOptions(receiver="typical", clutter="room", sway=True, interference=(2.0, 6.0, 1.5))
+    typical = ClipOptions(receiver="typical", clutter="room", sway=True, interference=(2.0, 6.0, 1.5))
     typical.configuration().to_yaml(tmp_path / "run.yaml")
-    paper = RadarOptions(config=tmp_path / "run.yaml", paper=True).configuration().scene
+    paper = ClipOptions(config=tmp_path / "run.yaml", paper=True).configuration().scene
     assert (paper.receiver, paper.clutter, paper.interference) == (ReceiverConfig(), None, None)
     assert not paper.sway
     assert not paper.vital_signs
-    assert RadarOptions(paper=True, adc_bits=8).configuration().scene.receiver == ReceiverConfig(adc_bits=8)
+    assert ClipOptions(paper=True, adc_bits=8).configuration().scene.receiver == ReceiverConfig(adc_bits=8)
     with pytest.raises(TensorsimError, match=r"--adc-bits: .*adc_bits: got 40, expected bits of a converter"):
-        RadarOptions(adc_bits=40).configuration()
+        ClipOptions(adc_bits=40).configuration()
 
 
 def test_simulate_with_an_array(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from scipy.io import loadmat
 
 import tensorsim as ts
 from tensorsim import cli
-from tensorsim.commands.options import RadarOptions
+from tensorsim.commands.clip_options import ClipOptions
 from tensorsim.geometry.framing import camera_on, seen_keypoints
 from tests.bvh import write_bvh
 from tests.test_cli import FILES
@@ -207,7 +207,7 @@ def test_a_body_has_its_scatterers(walk: np.ndarray) -> None:
     valid = torch.ones(1, 1, 45, dtype=torch.bool)
     scenes = {}
     for body, count in (("joints", 14), ("limbs", 36), ("version1", 13)):
-        options = RadarOptions(body=body, scene="through-wall")  # type: ignore[arg-type]
+        options = ClipOptions(body=body, scene="through-wall")  # type: ignore[arg-type]
         stage = ts.PoseToDoppler.from_config(options.configuration())
         points, rcs = stage.scene(stage.resampler.coefficients(joints, FPS), valid, FPS, 0, 100)
         assert points.shape == (1, 100, count, 3)

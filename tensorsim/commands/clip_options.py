@@ -1,0 +1,180 @@
+"""Options of commands that simulate a whole clip: those that look ahead, and what is written of it."""
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import tyro
+
+from tensorsim.array_files import array_formats
+from tensorsim.commands.arguments import Option
+from tensorsim.commands.options import RadarOptions, warn_of_label
+
+if TYPE_CHECKING:
+    import torch
+
+    from tensorsim.config import SimulationConfig
+    from tensorsim.pipeline import PoseToDoppler
+    from tensorsim.recognition import ActivityRecognizer
+    from tensorsim.report import FilmStrip
+    from tensorsim.results import Pictures
+    from tensorsim.types import Pose, RadarMaps
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipOptions(RadarOptions):
+    """How a whole clip is simulated, and what is written of it."""
+
+    people: Annotated[Option[str], tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
+    """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
+    sway: bool = False
+    """People sway while they stand."""
+    vital_signs: bool = False
+    """People breathe and their hearts beat."""
+    motion: Option[Literal["smooth", "paper"]] = None
+    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay.
+    Default: smooth."""
+    denoiser: Option[str] = None
+    """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
+    .safetensors or a name of `tensorsim models list`). Default: none."""
+    figure_format: Literal["png", "pdf", "svg"] = "png"
+    """Format of the pictures."""
+    hide_ridges: bool = False
+    """Draw no ridges over the Doppler-time map."""
+    sound: bool = False
+    """Write doppler.wav as well, the micro-Doppler as sound: approaching motion left, receding motion right."""
+    full_rate: bool = False
+    """Keep a column of the range-time maps for every pulse, not 256 per second."""
+    save: Annotated[str, tyro.conf.arg(metavar="npz,mat,h5")] = "npz"
+    """Formats of maps and poses: .npz, which is always written, and mat for MATLAB or h5 for HDF5 beside it."""
+    device: str = "auto"
+    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
+
+    def check(self, out: Path) -> None:
+        """Refuse options that cannot work, before anything heavy is imported."""
+        super().check(out)
+        array_formats(self.save)
+
+    def _begun(self) -> "SimulationConfig":
+        config = super()._begun()
+        if self.motion is not None:
+            from tensorsim.config import SimulationConfig, SmoothingConfig
+
+            smoothing = SimulationConfig.paper().smoothing if self.motion == "paper" else SmoothingConfig()
+            config = config.replace(smoothing=smoothing)
+        if self.sway:
+            config = config.replace(scene__sway=True)
+        return config.replace(scene__vital_signs=True) if self.vital_signs else config
+
+    def described(self) -> dict[str, Any]:
+        """The options that were given, as ``summary.json`` has them."""
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        return {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in asdict(self).items()
+            if value != defaults[name]
+        }
+
+    def pictures(
+        self, stage: "PoseToDoppler", label: str | None, film: str | None, somebody: bool
+    ) -> "Pictures":
+        """How the maps of this run are drawn.
+
+        Args:
+            stage: made them.
+            label: activity, where there is a classifier.
+            film: what the people come from.
+            somebody: whether a person is in the scene; the maps of an empty one refer to the echo of a person.
+        """
+        from tensorsim import plot
+        from tensorsim.results import Pictures
+
+        simulator = stage.simulator
+        return Pictures(
+            plot.MapStyle(self.colormap, self.dynamic_range, not self.hide_ridges),
+            self.figure_format,
+            plot.caption(simulator.radar, label, film),
+            None if somebody else plot.person_peaks(simulator),
+        )
+
+    def write_results(self, folder: Path, run: "Run", truth: "RadarMaps | None" = None) -> dict[str, Any]:
+        """Label the maps of a run and write them, the poses, their pictures and the sound.
+
+        Args:
+            folder: where to.
+            run: what was simulated.
+            truth: maps of the true motion, where it is known; drawn beside the others.
+
+        Returns:
+            What ``summary.json`` says of the label.
+        """
+        from tensorsim import results
+        from tensorsim.summary import label_of
+
+        pose, maps, stage = run.pose, run.maps, run.stage
+        duration_s = pose.valid.shape[2] / run.fps
+        label = label_of(run.recognizer, maps, duration_s, self.least_probability)
+        warn_of_label(run.recognizer, int(pose.valid.any(-1).sum()), duration_s)
+        pictures = self.pictures(stage, label["label"], run.film, run.somebody)
+        axes, formats = results.axes_of(stage, maps), array_formats(self.save)
+
+        def save() -> None:
+            results.save_maps(folder / "maps", maps, axes, formats)
+            if truth is not None:
+                results.save_maps(folder / "maps_truth", truth, axes, formats)
+            results.save_pose(folder, pose, run.fps, formats)
+
+        with ThreadPoolExecutor(1) as pool:
+            saved = pool.submit(save)
+            results.draw_maps(folder, maps, axes, truth, pictures)
+            results.draw_pose(folder, pose, run.fps, pictures, run.config.scene.radar)
+            saved.result()
+        if self.sound:
+            results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
+        return label
+
+    def write_report(
+        self,
+        folder: Path,
+        run: "Run",
+        strip: "FilmStrip",
+        summary: dict[str, Any],
+        truth: "RadarMaps | None" = None,
+        further: Sequence[dict[str, Any]] = (),
+    ) -> None:
+        """Write ``report.html`` of a run with its overlay film and this summary, and further maps below the others."""
+        from tensorsim import report, results
+
+        axes = results.axes_of(run.stage, run.maps)
+        pictures = self.pictures(run.stage, summary["label"], run.film, run.somebody)
+        report.write_report(
+            folder, summary, run.pose, run.fps, run.maps, axes, strip, pictures, truth, further
+        )
+
+
+class Run(NamedTuple):
+    """What was simulated, and how.
+
+    Attributes:
+        config: of the run.
+        stage: made the maps.
+        recognizer: of the maps; None gives no label.
+        pose, maps: what came out, on the CPU; the maps without batch dimensions.
+        fps: frames per second of the poses.
+        film: what the people come from, for the titles.
+        somebody: whether a person is in the scene.
+        device: that ``stage`` is on.
+    """
+
+    config: "SimulationConfig"
+    stage: "PoseToDoppler"
+    recognizer: "ActivityRecognizer | None"
+    pose: "Pose"
+    maps: "RadarMaps"
+    fps: float
+    film: str
+    somebody: bool
+    device: "torch.device"
