@@ -219,58 +219,91 @@ class MetricPose(nn.Module):
             joints = paper_pose(image, lifted, valid, height, distance)
         else:
             pose = self._pose(keypoints, camera_pose)
-            weights = scores.clamp(min=0.0)
-            weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
-            # The fitted scale is that at the mean depth of the joints, not of the hips.
-            offset = fill_gaps((weights * lifted.depth).sum(dim=-1), valid)
-            scale = fill_gaps(lifted.scale, valid).clamp(min=1e-3)
-            focal = torch.full_like(scale, self.pinhole.focal_length(image_width))
-            if self.distance_gives_focal:
-                focal = self._focal_from(distance, height, scale, offset, valid, fps)
-            # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
-            # reliable: those frames follow the others.
-            many = seen.sum(dim=-1) >= self.whole_body_joints
-            # Where the left or right edge of the picture cuts a body off, the network puts what is beyond at the edge.
-            across = keypoints[..., 0] / max(image_width - 1, 1)
-            beside = (across < 0.01) | (across > 0.99)
-            beyond = (seen & beside).any(dim=-1)
-            if cut_off is not None:
-                beyond = beyond | cut_off
-            whole = valid & many & (lifted.distance < self.poor_fit)
-            whole = where_any(where_any(where_any(whole & ~beyond, whole), valid & many), valid)
-            center = torch.tensor(self.pinhole.principal_point(image_height, image_width)).to(keypoints)
-            hips_range = camera_range(focal, height, scale) - height * offset
-            image = torch.where(seen[..., None], keypoints, lifted.keypoints)
-            depth = height[..., None] * lifted.depth
-            # What is found at the lower edge of the picture is cut off by it, and no foot on the floor.
-            inside = seen & (keypoints[..., 1] < 0.97 * image_height)
-            hips_range, whole, stands, precision = self._on_floor(
-                hips_range, image, depth, focal, center, pose, height, inside, whole, fps
+            joints, seen, valid = self._by_camera(
+                keypoints,
+                scores,
+                lifted,
+                seen,
+                valid,
+                height,
+                distance,
+                image_height,
+                image_width,
+                fps,
+                pose,
+                cut_off,
             )
-            whole = where_any(whole & ~beyond, whole)
-            hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
-            body_px = standing_px(focal, height, hips_range, offset)
-            tells = whole.to(precision.dtype) * precision + 1e-4
-            hips_range = range_over_feet(hips_range, image, depth, inside & ~beside, body_px, tells, fps)
-            # A network that sees a leg alone may take it for a small body: such a frame is discarded.
-            body_px = standing_px(focal, height, hips_range, offset)
-            valid = valid & (many | (scale > self.least_size * body_px))
-            seen = seen & valid[..., None]
-            # Hidden joints are where the lifted pose has them, at the size of the reliable frames.
-            middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)
-            placed = middle + (body_px / scale)[..., None, None] * (lifted.keypoints - middle)
-            image = torch.where(seen[..., None], keypoints, placed)
-            joints = back_project(image, hips_range[..., None] + depth, focal, center, pose)
-            if not self.calibrated:
-                stands = torch.where(stands.any(dim=-1, keepdim=True), stands & valid, valid)
-                floor = floor_under(joints, stands, fps, self.floor_window_s)
-                joints = lowered(joints, floor)
-                if not self.distance_gives_focal:
-                    person = on_the_same_floor(floor - pose[..., 2, 3], hips_range, valid)
-                    valid = valid & person[..., None]
-                    seen = seen & valid[..., None]
         joints = joints.gather(-3, nearest_valid(valid)[..., None, None].expand_as(joints))
         return joints * valid.any(dim=-1)[..., None, None, None], seen
+
+    def _by_camera(
+        self,
+        keypoints: Tensor,
+        scores: Tensor,
+        lifted: Lifted,
+        seen: Tensor,
+        valid: Tensor,
+        height: Tensor,
+        distance: Tensor,
+        image_height: int,
+        image_width: int,
+        fps: float,
+        pose: Tensor,
+        cut_off: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """World joints (..., P, T, 14, 3), which are seen, and frames that show a person: what is left of both."""
+        weights = scores.clamp(min=0.0)
+        weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+        # The fitted scale is that at the mean depth of the joints, not of the hips.
+        offset = fill_gaps((weights * lifted.depth).sum(dim=-1), valid)
+        scale = fill_gaps(lifted.scale, valid).clamp(min=1e-3)
+        focal = torch.full_like(scale, self.pinhole.focal_length(image_width))
+        if self.distance_gives_focal:
+            focal = self._focal_from(distance, height, scale, offset, valid, fps)
+        center = torch.tensor(self.pinhole.principal_point(image_height, image_width)).to(keypoints)
+        # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
+        # reliable: those frames follow the others.
+        many = seen.sum(dim=-1) >= self.whole_body_joints
+        # Where the left or right edge of the picture cuts a body off, the network puts what is beyond at the edge.
+        across = keypoints[..., 0] / max(image_width - 1, 1)
+        beside = (across < 0.01) | (across > 0.99)
+        beyond = (seen & beside).any(dim=-1)
+        if cut_off is not None:
+            beyond = beyond | cut_off
+        whole = valid & many & (lifted.distance < self.poor_fit)
+        whole = where_any(where_any(where_any(whole & ~beyond, whole), valid & many), valid)
+
+        hips_range = camera_range(focal, height, scale) - height * offset
+        image = torch.where(seen[..., None], keypoints, lifted.keypoints)
+        depth = height[..., None] * lifted.depth
+        # What is found at the lower edge of the picture is cut off by it, and no foot on the floor.
+        inside = seen & (keypoints[..., 1] < 0.97 * image_height)
+        hips_range, whole, stands, precision = self._on_floor(
+            hips_range, image, depth, focal, center, pose, height, inside, whole, fps
+        )
+        whole = where_any(whole & ~beyond, whole)
+        hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
+        body_px = standing_px(focal, height, hips_range, offset)
+        tells = whole.to(precision.dtype) * precision + 1e-4
+        hips_range = range_over_feet(hips_range, image, depth, inside & ~beside, body_px, tells, fps)
+
+        # A network that sees a leg alone may take it for a small body: such a frame is discarded.
+        body_px = standing_px(focal, height, hips_range, offset)
+        valid = valid & (many | (scale > self.least_size * body_px))
+        seen = seen & valid[..., None]
+        # Hidden joints are where the lifted pose has them, at the size of the reliable frames.
+        middle = (weights[..., None] * lifted.keypoints).sum(dim=-2, keepdim=True)
+        placed = middle + (body_px / scale)[..., None, None] * (lifted.keypoints - middle)
+        image = torch.where(seen[..., None], keypoints, placed)
+        joints = back_project(image, hips_range[..., None] + depth, focal, center, pose)
+        if self.calibrated:
+            return joints, seen, valid
+        stands = torch.where(stands.any(dim=-1, keepdim=True), stands & valid, valid)
+        floor = floor_under(joints, stands, fps, self.floor_window_s)
+        if not self.distance_gives_focal:
+            person = on_the_same_floor(floor - pose[..., 2, 3], hips_range, valid)
+            valid = valid & person[..., None]
+        return lowered(joints, floor), seen & valid[..., None], valid
 
     def _pose(self, keypoints: Tensor, camera_pose: Tensor | None) -> Tensor:
         """World-from-camera pose, broadcast to (..., P, T, 3, 4)."""
