@@ -57,7 +57,9 @@ class EchoConfig:
 
     def __post_init__(self) -> None:
         if self.clips < 2:
-            raise TensorsimError(f"clips: got {self.clips}, expected at least 2: another clip is a guess")
+            raise TensorsimError(
+                f"clips: got {self.clips}, expected at least 2: each is compared with another clip of its activity as well"
+            )
 
 
 class _Echoes:

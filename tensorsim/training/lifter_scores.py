@@ -1,6 +1,5 @@
 """How well people are lifted: the whole way from key points to smooth joints, with known camera and height."""
 
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import CameraConfig
+from tensorsim.evaluation.camera import known_camera
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH
 from tensorsim.pipeline import VideoToPose
 from tensorsim.training.film_errors import films_of
@@ -79,21 +79,12 @@ class Seen(NamedTuple):
 MakeLifter = Callable[[Seen], nn.Module]
 
 
-def camera_of(tilt_deg: float, height_m: float, fov_deg: float) -> CameraConfig:
-    """A camera above the origin that looks down by ``tilt_deg``."""
-    return CameraConfig(
-        horizontal_fov_rad=math.radians(fov_deg),
-        position_m=(0.0, 0.0, height_m),
-        pitch_rad=-math.radians(tilt_deg),
-    )
-
-
 def views(pool: MotionPool, kinds: tuple[str, ...], errors: bool, seed: int = 0) -> Iterator[Seen]:
     """People of some kinds of motion before each of ``CAMERAS``."""
     chosen = torch.isin(pool.kind, torch.tensor([list(KINDS).index(kind) for kind in kinds]))
     some = MotionPool(*(field[chosen] for field in pool))
     for i, numbers in enumerate(CAMERAS):
-        camera, extent = camera_of(*numbers), (640, 480)
+        camera, extent = known_camera(*numbers), (640, 480)
         draw = Draw(PEOPLE, torch.Generator().manual_seed(seed * 100 + i))
         joints, height, fps = windows_of(some, FRAMES, draw, FPS)
         view = before_camera(joints, camera, extent, draw)

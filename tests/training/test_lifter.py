@@ -10,6 +10,7 @@ from tensorsim.body.kinematics import rotation
 from tensorsim.body.skeleton import body_height, body_to_coco, mid_hips
 from tensorsim.cli import main
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.camera import known_camera
 from tensorsim.training import lifter_motion
 from tensorsim.training.lifter import (
     LifterRecipe,
@@ -20,7 +21,7 @@ from tensorsim.training.lifter import (
     target,
 )
 from tensorsim.training.lifter_motion import FRAMES, KINDS, MotionPool, build_pool, captures, with_other_bones
-from tensorsim.training.lifter_scores import camera_of, judge, lifted, nearest, temporal, views
+from tensorsim.training.lifter_scores import judge, lifted, nearest, temporal, views
 from tensorsim.training.lifter_views import Draw, before_camera, film, seen_in, windows_of
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
@@ -82,7 +83,7 @@ def test_exact_key_points_are_the_projection(pool: MotionPool) -> None:
     """Against NumPy: a camera that looks down by 20 degrees."""
     draw = Draw(3, torch.Generator().manual_seed(1))
     joints, height, fps = windows_of(pool, 20, draw, 30.0)
-    camera = camera_of(20.0, 2.0, 60.0)
+    camera = known_camera(20.0, 2.0, 60.0)
     view = before_camera(joints, camera, (640, 480), draw)
     window = seen_in(view, height, fps, draw, errors=False)
     points = body_to_coco(view.joints).numpy().astype(np.float64)
@@ -147,7 +148,7 @@ def test_videopose3d_sees_and_learns_the_same_body(pool: MotionPool) -> None:
     """Exact key points are the projection of the target; forty steps halve the error."""
     draw = Draw(8, torch.Generator().manual_seed(1))
     joints, height, fps = windows_of(pool, 24, draw, 30.0)
-    view = before_camera(joints, camera_of(20.0, 2.0, 60.0), (640, 480), draw)
+    view = before_camera(joints, known_camera(20.0, 2.0, 60.0), (640, 480), draw)
     window = seen_in(view, height, fps, draw, errors=False)
     torch.manual_seed(0)
     net = VideoPose3D((3, 3), 64, dropout=0.0)
