@@ -57,9 +57,7 @@ class EchoConfig:
 
     def __post_init__(self) -> None:
         if self.clips < 2:
-            raise TensorsimError(
-                f"clips: got {self.clips}, expected at least 2: each is compared with another clip of its activity as well"
-            )
+            raise TensorsimError(f"clips: got {self.clips}, expected at least 2 to compare with each other")
 
 
 class _Echoes:

@@ -72,7 +72,7 @@ class VideoConfig:
             )
 
     def rows(self) -> dict[str, list[ActivityClip]]:
-        """The clips by activity, and one more for each: another clip of the activity, with which the last is compared."""
+        """The clips by activity; one more of each, with which the last is compared."""
         found = activity_clips(self.activities, self.clips + 1, self.seed)
         return {
             row: [
