@@ -60,14 +60,12 @@ class ClipOptions(RadarOptions):
 
     def _begun(self) -> "SimulationConfig":
         config = super()._begun()
-        if self.motion is not None:
-            from tensorsim.config import SimulationConfig, SmoothingConfig
+        if self.motion is None:
+            return config
+        from tensorsim.config import SimulationConfig, SmoothingConfig
 
-            smoothing = SimulationConfig.paper().smoothing if self.motion == "paper" else SmoothingConfig()
-            config = config.replace(smoothing=smoothing)
-        if self.sway:
-            config = config.replace(scene__sway=True)
-        return config.replace(scene__vital_signs=True) if self.vital_signs else config
+        smoothing = SimulationConfig.paper().smoothing if self.motion == "paper" else SmoothingConfig()
+        return config.replace(smoothing=smoothing)
 
     def described(self) -> dict[str, Any]:
         """The options that were given, as ``summary.json`` has them."""

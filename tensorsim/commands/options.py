@@ -36,6 +36,8 @@ FIELDS: dict[str, str] = {
     "people": "pose__people",
 }
 FIELDS |= PANEL_FIELDS | RECEIVER_FIELDS
+#: Options that switch on the part of the scene of the same name.
+SWITCHES = ("leakage", "wall_echo", "sway", "vital_signs")
 
 
 def check_seed(seed: int, option: str = "--seed") -> None:
@@ -111,8 +113,12 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         Raises:
             TensorsimError: a file that cannot be read, or values out of range.
         """
-        config = self.with_receiver(self._begun())
         own = {field.name for field in dataclasses.fields(self)}
+        config = self._begun()
+        for switch in SWITCHES:
+            if switch in own and getattr(self, switch):
+                config = config.replace(**{f"scene__{switch}": True})
+        config = self.with_receiver(config)
         for option, field in FIELDS.items():
             value = getattr(self, option) if option in own else None
             if value is not None:
@@ -128,11 +134,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
 
         config = SimulationConfig() if self.config is None else SimulationConfig.from_yaml(self.config)
         config = self._with_scene(config)
-        if self.paper:
-            config = SimulationConfig.paper(config)
-        if self.leakage:
-            config = config.replace(scene__leakage=True)
-        return config.replace(scene__wall_echo=True) if self.wall_echo else config
+        return SimulationConfig.paper(config) if self.paper else config
 
     def _with_scene(self, config: "SimulationConfig") -> "SimulationConfig":
         """The configuration with the radar, wall and floor that ``--scene`` and ``--radar`` name."""

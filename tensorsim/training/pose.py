@@ -189,10 +189,10 @@ def person_loss(
 
 
 def sharpened(maps: Tensor, sigma: float, of_teacher: float = 2.0) -> Tensor:
-    """Heat maps (..., h, w) of Gaussians of one sigma, map pixels, with another, at the same heights.
+    """Heat maps (..., h, w) with their Gaussian peaks made as narrow as those of ``sigma`` map pixels, of equal height.
 
-    ``h (m / h)^((s / sigma)^2)``, h the height of the map m and s the sigma it has, by default that of B. Xiao et al.,
-    "Simple baselines for human pose estimation and tracking", ECCV 2018.
+    ``h (m / h)^((s / sigma)^2)``, where h is the height of the map m and s is ``of_teacher``, the sigma that it has: by
+    default that of B. Xiao et al., "Simple baselines for human pose estimation and tracking", ECCV 2018.
     """
     maps = maps.clamp(0, 1)
     heights = maps.amax((-2, -1), keepdim=True).clamp_min(1e-6)
@@ -248,8 +248,8 @@ class PoseRecipe(Recipe):
         first_samples: how many; 0 trains at the network's size from the start.
         shares: of ``sided``, ``films``, ``unsided`` and ``rendered`` in the stream, in relation to each other.
         augmentation: of the crops.
-        teacher: a better network, crops to heat maps of the same size, whose answers are learnt besides the labels;
-            None learns from labels alone.
+        teacher: a better network, crops to heat maps of the same size, whose answers HRNet learns besides the labels;
+            None: from labels alone.
 
     Raises:
         TensorsimError: a source without people.
@@ -339,7 +339,8 @@ class PoseRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Mean over the batch, and over the stages of CPM, of :func:`person_loss` and :func:`distillation_loss`."""
+        """Mean over the batch, and over the stages of CPM, of :func:`person_loss`; with a teacher of
+        :func:`distillation_loss` besides."""
         crops = batch["crops"].float() / 255
         maps = net(crops.contiguous(memory_format=torch.channels_last)).float()
         labels = {name: batch[name] for name in ("points", "known", "gone", "rivals", "sided")}
@@ -351,7 +352,7 @@ class PoseRecipe(Recipe):
         if self.teacher is None:
             return {"loss": loss}
         told = (batch["taught"].float(), batch["points"] / self.stride, batch["known"], batch["gone"])
-        difference = torch.stack([distillation_loss(of_stage, *told) for of_stage in stages]).mean()
+        difference = distillation_loss(maps, *told).mean()
         return {"loss": loss + difference, "distillation": difference.detach()}
 
     def optimiser(self) -> torch.optim.Optimizer:

@@ -555,6 +555,9 @@ def test_command(
     assert "1 person, 40 frames dropped" in said.out
     assert said.out.splitlines()[0].startswith("     4.")
     assert sum(chunk.shape[0] for chunk in VideoReader(tmp_path / "third.webm").chunks(16)) == FRAMES
+    with pytest.raises(SystemExit):
+        cli.main([*arguments, "--sound"])
+    assert "--sound (applied to tensorsim live)" in capsys.readouterr().err
 
 
 def test_a_film_is_not_recorded_onto_itself(clip: Path) -> None:
