@@ -5,13 +5,11 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from tensorsim import process
-from tensorsim.files import complete_or_nothing
 
 
 def run_python(code: str, **options: object) -> subprocess.CompletedProcess[str]:
@@ -59,21 +57,32 @@ def test_a_deleted_working_directory_is_said(tmp_path: Path) -> None:
     assert done.stderr == "tensorsim: error: the working directory was deleted, go to one that exists\n"
 
 
+#: A process that is ended by a signal while it writes a folder.
+ENDED_WHILE_WRITING = """
+import os, signal, time
+from pathlib import Path
+from tensorsim import process
+from tensorsim.files import complete_or_nothing
+with process.ending_cleanly(), complete_or_nothing(Path("out")) as folder:
+    (folder / "half").touch()
+    os.kill(os.getpid(), signal.{name})
+    time.sleep(5)
+"""
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_signals_leave_nothing_behind(name: str, tmp_path: Path) -> None:
-    number = signal.Signals[name]
-    before = signal.getsignal(number)
-    with (  # noqa: PT012
-        pytest.raises(SystemExit) as exit_,
-        process.ending_cleanly(),
-        complete_or_nothing(tmp_path / "out") as folder,
-    ):
-        (folder / "half").touch()
-        os.kill(os.getpid(), number)
-        time.sleep(5)
-    assert exit_.value.code == 128 + number
+    done = run_python(ENDED_WHILE_WRITING.format(name=name), cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (128 + signal.Signals[name], "")
     assert list(tmp_path.iterdir()) == []
-    assert signal.getsignal(number) is before
+
+
+def test_handlers_of_signals_are_put_back() -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    with process.ending_cleanly():
+        assert signal.getsignal(signal.SIGTERM) is not before[1]
+    assert [signal.getsignal(number) for number in numbers] == before
 
 
 @pytest.mark.parametrize("redirect", [">&-", ">/dev/full"])

@@ -26,7 +26,7 @@ from unittest import mock
 import cv2
 import torch
 
-from tensorsim import cli, results, streaming
+from tensorsim import cli, results, streaming, summary
 from tensorsim.commands.clip_options import ClipOptions
 from tensorsim.commands.demo import film_person
 from tensorsim.commands.networks import default_networks, load_networks
@@ -44,7 +44,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (VideoToPose, "lift", "lifting, position, smoothing"),
     (streaming, "maps_of_pose", "radar"),
     (results, "maps_of_pose", "radar"),
-    (results, "label_of", "label"),
+    (summary, "label_of", "label"),
     (results, "write_overlay", "overlay"),
     (results, "draw_maps", "maps: pictures"),
     (results, "draw_pose", "poses: picture"),

@@ -1,0 +1,20 @@
+"""The benchmark of the command times every stage that it names."""
+
+from pathlib import Path
+
+import pytest
+
+from tensorsim.commands.demo import film_person
+from tensorsim.data.video_writer import write_video
+from tests.benchmarks import bench_video
+
+
+@pytest.mark.slow
+def test_every_stage_of_the_benchmark_is_timed(tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    frames = film_person(7, 45, 0).film.frames
+    write_video(film, iter(frames.permute(0, 2, 3, 1).numpy()), 30.0)
+    seconds, wall = bench_video.simulate(film, [])
+    assert set(seconds) == {stage for *_, stage in bench_video.STAGES} | {"decoding", "the rest"}
+    assert min(seconds.values()) > 0
+    assert wall > 0
