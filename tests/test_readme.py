@@ -1,5 +1,6 @@
 """What README says, works as it is written."""
 
+import importlib.util
 import json
 import os
 import re
@@ -21,7 +22,8 @@ from tests.bvh import write_bvh
 from tests.film import STANDING
 from tests.test_sources import coco_json
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+PROJECT = Path(__file__).parents[1]
+README = (PROJECT / "README.md").read_text(encoding="utf-8")
 
 
 def blocks(language: str) -> list[str]:
@@ -55,7 +57,7 @@ def test_the_recipe_for_data_sets_cuts_nobody_off() -> None:
 def test_the_picture_is_small() -> None:
     pictures = re.findall(r"!\[.*\]\((.*)\)", README)
     assert pictures
-    assert all((Path(__file__).parents[1] / path).stat().st_size < 150_000 for path in pictures)
+    assert all((PROJECT / path).stat().st_size < 150_000 for path in pictures)
 
 
 def test_recipes_of_the_shipped_files_are_commands() -> None:
@@ -65,6 +67,16 @@ def test_recipes_of_the_shipped_files_are_commands() -> None:
         program, *words = shlex.split(recipe)
         assert program == "tensorsim"
         assert callable(cli.parse(words).run)
+
+
+@pytest.mark.parametrize("card", sorted((PROJECT / "models").glob("*.md")), ids=lambda card: card.stem)
+def test_commands_of_cards_are_commands(card: Path) -> None:
+    text = card.read_text(encoding="utf-8").replace("\\\n", " ")
+    commands = re.findall(r"^ {4}(tensorsim .*)$|`(tensorsim [^`]*--[^`]*)`", text, flags=re.MULTILINE)
+    for command in (indented or within for indented, within in commands):
+        assert callable(cli.parse(shlex.split(command)[1:]).run), command
+    for name in re.findall(r"python -m (tests\.benchmarks\.\w+)", text):
+        assert importlib.util.find_spec(name), name
 
 
 @pytest.mark.slow
