@@ -440,6 +440,14 @@ def test_gradients_flow_from_maps_to_frames() -> None:
     assert bool((frames.grad != 0).any())
 
 
+@pytest.mark.parametrize(("fps", "interval"), [(5.0, 2), (30.0, 2), (44.0, 2), (60.0, 4), (120.0, 8)])
+def test_detections_per_second_do_not_grow_with_the_frame_rate(fps: float, interval: int) -> None:
+    """The tracker ends a person after so many of them without anybody."""
+    stage = VideoToPose(RectangleDetector(), StandingPose())
+    observed = stage.observed_frames(torch.ones(1, 20, dtype=torch.bool), fps)[0]
+    assert observed.nonzero()[:, 0].tolist() == sorted({*range(0, 20, interval), 19})
+
+
 def test_refuses_bad_intervals() -> None:
     with pytest.raises(ts.TensorsimError, match="detection_interval: got 0"):
         VideoToPose(RectangleDetector(), StandingPose(), detection_interval=0)

@@ -26,7 +26,8 @@ class TrackerConfig:
 
     Attributes:
         detector: name or file of the detector's weights; None is the shipped network.
-        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2).
+        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2), of films faster than
+            45 frames per second more seldom, see :class:`~tensorsim.pipeline.VideoToPose`.
         min_box_px: smallest width and height of a detection in pixels (panel: minimum detection size, 5 x 5).
         max_tracks: people at a time (panel: maximum number of tracks, 5).
         confirm_hits: detections that confirm a track (panel: confirmation threshold, 2 of 5) ...

@@ -199,7 +199,7 @@ class FilmReader:
             quiet: no progress bars.
         """
         stage = self.stage
-        cut = f"{film.start_s} {film.end_s} {self.stride} {stage.detection_interval} with times"
+        cut = f"{film.start_s} {film.end_s} {self.stride} {stage.interval_at(reader.fps)} with times"
         key = _digest(film.path.read_bytes(), cut.encode(), self.detector.encode())
 
         def detect() -> tuple[Tensor, ...]:

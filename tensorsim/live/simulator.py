@@ -158,7 +158,7 @@ class LiveSimulator:
         self.index += 1
         detections = None
         # Not by the number of the frame: of those that a busy machine drops, too many may be the ones to look at.
-        if self.detected is None or self.index - self.detected >= self.config.tracking.detection_interval:
+        if self.detected is None or self.index - self.detected >= self.vision.interval_at(self.fps):
             self.detected = self.index
             detections = Detections(*(field[0] for field in self.vision.detect(frame[None])))
         self.tracks = self.tracker.step(self.tracks, detections)

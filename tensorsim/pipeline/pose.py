@@ -38,7 +38,8 @@ class VideoToPose(nn.Module):
     """Video -> people with metric 3D joints.
 
     Detects in every ``detection_interval``-th frame and in the last one, tracks, estimates COCO-17 keypoints in
-    every frame, lifts them to 3D, places them in the world and smooths them.
+    every frame, lifts them to 3D, places them in the world and smooths them. Of films faster than 45 frames per second
+    it detects in about as many frames per second as of one of 30, because the tracker counts in frames with detections.
 
     Args:
         detector: images -> :class:`~tensorsim.types.Detections`, e.g. :class:`tensorsim.vision.RTMDet`.
@@ -49,7 +50,7 @@ class VideoToPose(nn.Module):
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
         camera: where the camera stands and its focal length.
         keypoint_threshold: score from which a keypoint counts as seen.
-        detection_interval: run the detector on every n-th frame (panel: 2).
+        detection_interval: run the detector on every n-th frame (panel: 2), of faster films more seldom, see above.
         fewest_joints: of the 14, in a frame that says anything of the pose.
         brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
@@ -232,7 +233,7 @@ class VideoToPose(nn.Module):
                 f"video: got shape {list(video.shape)}, expected at least 1 clip of at least 2 frames"
             )
         present = self.frames_present(b, t, lengths, video.device)
-        observed = self.observed_frames(present)
+        observed = self.observed_frames(present, fps)
 
         frames = video.flatten(0, 1)
         detections = self.detect(frames[observed.flatten()])
@@ -262,11 +263,15 @@ class VideoToPose(nn.Module):
             raise TensorsimError(f"lengths: got {counts}, expected {clips} counts from 1 to {frames}")
         return index < lengths.to(device).unsqueeze(-1)
 
-    def observed_frames(self, present: Tensor) -> Tensor:
+    def interval_at(self, fps: float) -> int:
+        """The number n of every n-th frame in which the detector runs, at this frame rate."""
+        return self.detection_interval * max(int(fps / 30.0 + 0.5), 1)
+
+    def observed_frames(self, present: Tensor, fps: float) -> Tensor:
         """(B, T) bool: frames in which the detector runs, every n-th and the last of each clip."""
         index = torch.arange(present.shape[-1], device=present.device)
         last = present.sum(dim=-1, keepdim=True) - 1
-        return present & ((index % self.detection_interval == 0) | (index == last))
+        return present & ((index % self.interval_at(fps) == 0) | (index == last))
 
     def detect(self, frames: Tensor) -> Detections:
         """Detect in frames (n, 3, H, W), ``frames_per_batch`` at a time."""

@@ -155,19 +155,24 @@ class TemporalLifter(nn.Module):
         check_image_size(image_height, image_width)
         check_positive(fps, "fps")
         lead, frames = keypoints.shape[:-3], keypoints.shape[-3]
-        tracks = keypoints[..., 0, 0, 0].numel()
+        people = keypoints[..., 0, 0, 0].numel()
         dtype = self.network.leave.weight.dtype
-        k = keypoints.reshape(tracks, frames, 17, 2).to(dtype)
-        s, b = scores.reshape(tracks, frames, 17).to(dtype), boxes.reshape(tracks, frames, 4).to(dtype)
-        v = valid.reshape(tracks, frames)
-        height_of_each = self._height_of_each(keypoints).to(dtype)
+        # The window of the network is a number of frames, of films of up to 45 frames per second: it sees a faster one
+        # as several, each of about 30.
+        films = max(int(fps / 30.0 + 0.5), 1)
+        tracks, fps = films * people, fps / films
+        k = _interleaved(keypoints.reshape(people, frames, 34).to(dtype), films).unflatten(-1, [17, 2])
+        s = _interleaved(scores.reshape(people, frames, 17).to(dtype), films)
+        b = _interleaved(boxes.reshape(people, frames, 4).to(dtype), films)
+        v = _interleaved(valid.reshape(people, frames, 1), films)[..., 0]
+        height_of_each = self._height_of_each(keypoints).to(dtype).repeat_interleave(films)
         joints: list[Tensor] = []
         spreads: list[Tensor] = []
         ranges: list[Tensor] = []
         turns: list[Tensor] = []
-        for start in range(0, frames, self.frames_per_block):
-            first, stop = max(start - self.reach, 0), min(start + self.frames_per_block, frames)
-            last = min(stop + self.reach, frames)
+        for start in range(0, v.shape[1], self.frames_per_block):
+            first, stop = max(start - self.reach, 0), min(start + self.frames_per_block, v.shape[1])
+            last = min(stop + self.reach, v.shape[1])
             rows = v[:, first:last].any(dim=1).nonzero()[:, 0]
             found, azimuth = self._block(
                 k[rows, first:last], s[rows, first:last], b[rows, first:last], v[rows, first:last],
@@ -187,12 +192,9 @@ class TemporalLifter(nn.Module):
         off = math.sqrt(2.0) * torch.cat(ranges, dim=1).exp() * root[..., :2].square().sum(dim=-1).sqrt()
         deviation = along_axes(spread[..., 0], spread[..., 1], azimuth[..., None, :])
         place = self.pinhole.pose[:, 3].to(dtype)
-        return TemporalPose(
-            (points - root[..., None, :]).to(keypoints.dtype).unflatten(0, lead),
-            (root + place).to(keypoints.dtype).unflatten(0, lead),
-            deviation.to(keypoints.dtype).unflatten(0, lead),
-            along_axes(0.3 * off, off, azimuth).to(keypoints.dtype).unflatten(0, lead),
-        )
+        parts = [points - root[..., None, :], root + place, deviation, along_axes(0.3 * off, off, azimuth)]
+        parts = [_in_order(part, films)[:, :frames].to(keypoints.dtype).unflatten(0, lead) for part in parts]
+        return TemporalPose(parts[0], parts[1], parts[2], parts[3])
 
     def in_picture(
         self, found: TemporalPose, keypoints: Tensor, weights: Tensor, image_height: int, image_width: int
@@ -322,6 +324,18 @@ class TemporalLifter(nn.Module):
         network = TemporalNet(enter.shape[0])
         load_strict(network, weights, path)
         return cls(network, camera, person_height_m, keypoint_threshold).eval()
+
+
+def _interleaved(x: Tensor, films: int) -> Tensor:
+    """Every n-th frame of (S, T, D), from each of the first n on, as tracks of their own: (S n, ceil(T / n), D)."""
+    lacking = -x.shape[1] % films
+    padded = torch.cat([x, x.new_zeros(x.shape[0], lacking, x.shape[2])], dim=1)
+    return padded.unflatten(1, [-1, films]).transpose(1, 2).flatten(0, 1)
+
+
+def _in_order(x: Tensor, films: int) -> Tensor:
+    """Tracks (S n, T, ...) of :func:`_interleaved` in the order of time, (S, T n, ...)."""
+    return x.unflatten(0, [-1, films]).transpose(1, 2).flatten(1, 2)
 
 
 def _in_rows(found: Tensor, rows: Tensor, tracks: int) -> Tensor:

@@ -53,7 +53,7 @@ class SteadySides(nn.Module):
 
     Args:
         change: squared sizes of the person at 30 frames per second; twice that at 15 and below.
-        exchanged: cost of an exchanged frame.
+        exchanged: cost of an exchanged frame at up to 30 frames per second; per second it is the same above.
         threshold: score from which a point counts.
 
     Shape:
@@ -107,4 +107,4 @@ class SteadySides(nn.Module):
         stay = (trust * (after - before).square().sum(dim=-1)).sum(dim=-1)
         change = (trust * (after + before).square().sum(dim=-1)).sum(dim=-1)
         penalty = self.change * min(max(30.0 / fps, 1.0), 2.0)
-        return viterbi_two_states(stay, change + penalty, self.exchanged)
+        return viterbi_two_states(stay, change + penalty, self.exchanged * min(30.0 / fps, 1.0))

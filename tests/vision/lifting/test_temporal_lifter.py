@@ -214,6 +214,23 @@ def test_blocks_equal_the_whole(known: bool) -> None:
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("fps", "films"), [(44.0, 1), (50.0, 2), (120.0, 4)])
+def test_a_fast_film_is_seen_as_several_of_about_30_frames_per_second(fps: float, films: int) -> None:
+    """The window of the network is a number of frames, so that of a fast film would be short."""
+    _, keypoints, scores, boxes, valid = filmed(40)
+    inputs = [x.expand(2, *x.shape[1:]) for x in (keypoints, scores, boxes, valid)]
+    lifter = TemporalLifter(network().double(), CAMERA, (1.7, 1.6), frames_per_block=7)
+    with torch.no_grad():
+        found = lifter(*inputs, HEIGHT, WIDTH, fps)
+        for first in range(films):
+            alone = lifter(*(x[:, first::films] for x in inputs), HEIGHT, WIDTH, fps / films)
+            for one, other in zip(found, alone, strict=True):
+                torch.testing.assert_close(one[:, first::films], other, atol=1e-9, rtol=0)
+        shorter = lifter(*(x[:, :39] for x in inputs), HEIGHT, WIDTH, fps)
+    assert shorter.joints.shape == (2, 39, 14, 3)
+    assert bool(torch.isfinite(shorter.joints).all())
+
+
 def test_tracks_cost_time_only_around_the_frames_in_which_they_are() -> None:
     keypoints, scores, boxes, valid = (x.expand(2, *x.shape[1:]) for x in filmed(600)[1:])
     valid = valid.clone()

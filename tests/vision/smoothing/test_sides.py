@@ -21,9 +21,9 @@ FPS = 25.0
 OPPOSITE = [0, 1, 2, 3, 4, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
 
 
-def seen(activity: str, heading_deg: float, seed: int = 0) -> Tensor:
+def seen(activity: str, heading_deg: float, seed: int = 0, fps: float = FPS) -> Tensor:
     """Key points (T, 17, 2) of a generated person 4.5 m from a level camera."""
-    joints = ActivityGenerator().generate(activity, seed=seed, duration_s=4.0, rate_hz=FPS).joints[0].double()
+    joints = ActivityGenerator().generate(activity, seed=seed, duration_s=4.0, rate_hz=fps).joints[0].double()
     joints = joints - mid_hips(joints)[:1] * joints.new_tensor([1.0, 1.0, 0.0])
     joints = joints @ rotation(2, torch.tensor(math.radians(heading_deg), dtype=torch.float64)).mT
     joints = joints + joints.new_tensor([0.0, 4.5 + max(0.0, -float(joints[..., 1].min()) - 2.0), 0.0])
@@ -105,6 +105,17 @@ def test_exchanged_limbs_are_exchanged_back(activity: str, heading: float) -> No
 
     assert share_wrong(spoilt) > 0.04
     assert share_wrong(steady) < 0.5 * share_wrong(spoilt)
+
+
+@pytest.mark.parametrize("fps", [15.0, 30.0, 60.0, 120.0])
+def test_legs_are_exchanged_back_for_as_long_at_any_frame_rate(fps: float) -> None:
+    for seed in (3, 5, 7):
+        keypoints = seen("S8 Walking", 0.0, seed, fps)
+        spoilt, scores = keypoints.clone(), torch.full(keypoints.shape[:-1], 0.85, dtype=torch.float64)
+        wrong = slice(int(fps), int(1.4 * fps))
+        spoilt[wrong, 11:] = keypoints[wrong][:, OPPOSITE][:, 11:]
+        steady, _ = SteadySides()(spoilt, scores, scores[:, 0] > 0, fps)
+        torch.testing.assert_close(steady, keypoints)
 
 
 def test_scores_go_with_their_points() -> None:
