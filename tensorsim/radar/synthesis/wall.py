@@ -76,7 +76,9 @@ def fresnel(
     """
     real, imaginary = refractive_index(relative_permittivity, loss_tangent)
     n = torch.complex(real, -imaginary)
-    cos_refracted = (1 - (1 - cos_incidence.square()) / n.square()).sqrt()
+    # A wall of air has the quotient 0 / 0 at grazing incidence and beyond, where no wave arrives.
+    cos_incidence = cos_incidence.clamp_min(1e-9)
+    cos_refracted = (n.square() - 1 + cos_incidence.square()).sqrt() / n
     if polarization == "te":
         return (cos_incidence - n * cos_refracted) / (cos_incidence + n * cos_refracted)
     return (cos_refracted - n * cos_incidence) / (cos_refracted + n * cos_incidence)

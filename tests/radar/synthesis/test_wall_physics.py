@@ -96,6 +96,31 @@ def test_fresnel_brewster_normal_and_signs():
 
 
 @pytest.mark.parametrize("polarization", ["te", "tm"])
+def test_air_reflects_nothing_at_any_angle(polarization):
+    """Nor where no wave arrives: there the value is not used, but its gradient would spoil that of the others."""
+    eps, cosine = torch.ones(5).double().requires_grad_(), f64(1.0, 0.3, 1e-12, 0.0, -0.4).requires_grad_()
+    reflection = fresnel(eps, torch.zeros(5).double(), cosine, polarization)
+    assert float(reflection.detach().abs().max()) < 1e-12
+    torch.view_as_real(reflection).sum().backward()
+    assert bool(torch.isfinite(eps.grad).all() & torch.isfinite(cosine.grad).all())
+
+
+@pytest.mark.parametrize("incidence", ["oblique", "airy"])
+def test_echoes_of_a_wall_of_air_have_gradients(incidence):
+    """Also where its faces reflect: at the antennas it is a reflection of 0, not of 0 / 0."""
+    p, rcs = tensors(swinging(3, 3, THROUGH.prf_hz), np.ones(3))
+    p.requires_grad_()
+    wall = WallConfig(relative_permittivity=1.0, loss_tangent=0.0)
+    options = {"incidence": incidence, "multipath": True, "wall_echo": True}
+    module = EchoSynthesizer(THROUGH, wall, learnable=("relative_permittivity",), **options).double()
+    echo = module(p, rcs)
+    assert reference.relative(echo.detach(), EchoSynthesizer(THROUGH).double()(p, rcs).detach()) < 1e-8
+    echo.abs().sum().backward()
+    for tensor in (p, *module.parameters()):
+        assert bool(torch.isfinite(tensor.grad).all())
+
+
+@pytest.mark.parametrize("polarization", ["te", "tm"])
 @pytest.mark.parametrize("cosine", [1.0, 0.8, 0.3])
 def test_closed_slab_equals_its_matrix_and_keeps_energy(polarization, cosine):
     for frequency in (2.0e9, 2.37e9, 3e9):
