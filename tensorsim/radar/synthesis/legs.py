@@ -15,9 +15,11 @@ from tensorsim.config import SPEED_OF_LIGHT_M_S, FloorConfig, RadarConfig, WallC
 from tensorsim.ops import safe_sqrt
 from tensorsim.radar.synthesis.wall import (
     Slab,
+    bounce_ratio,
     fresnel,
     near_face_m,
     paper_transmission,
+    passage_phase,
     refracted_leg,
     refractive_index,
     slab_coefficients,
@@ -186,14 +188,12 @@ class TracedLegs(nn.Module):
 
     def _transmission(self, slab: Slab, bounces: int) -> Tensor:
         """Transmission of one leg with this number of internal bounce pairs; relative to none if nothing is lost."""
-        if self.attenuates:
-            return self._slab_transmission(slab, bounces)
-        return self._slab_transmission(slab, bounces) / self._slab_transmission(slab, 0)
-
-    def _slab_transmission(self, slab: Slab, bounces: int) -> Tensor:
-        if self.paper:
+        if self.attenuates and self.paper:
             return paper_transmission(slab, bounces, self.carrier_hz)
-        return transmission(slab, bounces)
+        if self.attenuates:
+            return transmission(slab, bounces)
+        ratio = bounce_ratio(slab, bounces)
+        return ratio * passage_phase(slab, 2 * bounces, self.carrier_hz) if self.paper else ratio
 
     def _face_reflection(self, cosine: Tensor) -> Tensor:
         """Reflection coefficient G of the near face for this cosine of the angle of incidence."""

@@ -121,6 +121,11 @@ def slab_coefficients(
     )
 
 
+def bounce_ratio(slab: Slab, bounces: int) -> Tensor:
+    """``T_k / T_0 = (G exp(-alpha d))^(2k)`` of :func:`transmission`, also where T_0 is too small for a number."""
+    return (slab.reflection * torch.exp(-slab.loss_neper)).pow(2 * bounces)
+
+
 def transmission(slab: Slab, bounces: int) -> Tensor:
     """One-way transmission ``T_k = T12 T21 G^(2k) exp(-(2k + 1) alpha d)`` with k pairs of internal bounces.
 
@@ -129,7 +134,13 @@ def transmission(slab: Slab, bounces: int) -> Tensor:
     straight = (1 - slab.reflection.square()) * torch.exp(-slab.loss_neper)
     if bounces == 0:
         return straight
-    return straight * (slab.reflection * torch.exp(-slab.loss_neper)).pow(2 * bounces)
+    return straight * bounce_ratio(slab, bounces)
+
+
+def passage_phase(slab: Slab, passages: int, frequency_hz: float) -> Tensor:
+    """Propagation phase ``exp(-j beta d)`` of a passage, to the power of their number."""
+    angle = -passages * math.pi * frequency_hz * slab.bounce_s  # a pair of bounces is 2 d long
+    return torch.polar(torch.ones_like(angle), angle)
 
 
 def paper_transmission(slab: Slab, bounces: int, frequency_hz: float) -> Tensor:
@@ -139,8 +150,7 @@ def paper_transmission(slab: Slab, bounces: int, frequency_hz: float) -> Tensor:
 
     The propagation phase of the wall is then counted twice, here and in the delay.
     """
-    angle = -(2 * bounces + 1) * math.pi * frequency_hz * slab.bounce_s  # a pair of bounces is 2 d long
-    return transmission(slab, bounces) * torch.polar(torch.ones_like(angle), angle)
+    return transmission(slab, bounces) * passage_phase(slab, 2 * bounces + 1, frequency_hz)
 
 
 def two_way_wall_transmission(slab: Slab) -> WallTerms:

@@ -9,7 +9,7 @@ import torch
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S as C
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tests.radar import reference
 from tests.radar.scenes import SMALL, SceneCase, swinging, tensors
@@ -57,6 +57,23 @@ def test_without_attenuation_the_delay_stays(wall_paths):
     assert float((lossy.gain[..., 0] / lossless.gain[..., 0])[behind].abs().min()) < 0.9
     ratio = lossless.gain[behind] / lossless.gain[behind][:, :1]
     assert_same(ratio, lossy.gain[behind] / lossy.gain[behind][:, :1], atol=1e-10)
+
+
+@pytest.mark.parametrize("wall_paths", ["series", "paper"])
+def test_without_attenuation_a_wall_may_let_nothing_through(wall_paths):
+    """The ratio of bounces to the straight passage has no quotient of numbers that are both 0."""
+    wall = WallConfig(loss_tangent=100.0)
+    options = {"wall_paths": wall_paths, "multipath": True, "wall_attenuation": False}
+    p, rcs = scene()
+    radar = replace(THROUGH, carrier_hz=77e9)
+    with pytest.warns(TensorsimWarning, match="practically invisible"):
+        module = EchoSynthesizer(radar, wall, **options).double()
+    rcs = rcs.expand(p.shape[:-1])
+    gain, air = module.paths(p, rcs).gain, EchoSynthesizer(radar).paths(p, rcs).gain
+    assert_same(gain[..., :1].abs(), air.abs(), atol=1e-12)
+    assert float(gain[..., 1:].abs().max()) == 0
+    module(p.requires_grad_(), rcs).abs().sum().backward()
+    assert bool(torch.isfinite(p.grad).all())
 
 
 def test_bounces_and_images_are_apart():
