@@ -43,8 +43,8 @@ class SynchrosqueezedMap(DopplerFrames):
 
     Args:
         radar, window_s, overlap: see :class:`~tensorsim.radar.processing.doppler.DopplerFrames`.
-        hop: pulses from frame to frame instead of ``overlap``; 1 for a transform that can be inverted at
-            every pulse.
+        hop: pulses from frame to frame instead of ``overlap``, at most those of a window; 1 for a transform that can
+            be inverted at every pulse.
         threshold_db: values this far below the strongest of their frame and range bin are not moved.
 
     Shapes: (..., M, R) complex -> (..., F, K) magnitude, ``sqrt(sum over range bins of |T|^2)``; for one
@@ -52,7 +52,7 @@ class SynchrosqueezedMap(DopplerFrames):
     by the values, not by their bins.
 
     Raises:
-        TensorsimError: as :class:`~tensorsim.radar.processing.doppler.DopplerFrames`; a hop below 1, real
+        TensorsimError: as :class:`~tensorsim.radar.processing.doppler.DopplerFrames`; a hop below 1 or above L, real
             profiles, fewer than L pulses.
     """
 
@@ -69,9 +69,8 @@ class SynchrosqueezedMap(DopplerFrames):
         super().__init__(radar, window_s, overlap)
         check_positive(threshold_db, "threshold_db")
         if hop is not None:
-            check_count(hop, "hop")
-            self.hop = hop
-            self.frame_rate_hz = self.prf_hz / hop
+            self.hop = check_count(hop, "hop", 1, self.length)
+            self.frame_rate_hz = self.prf_hz / self.hop
         self.threshold = 10 ** (-threshold_db / 20)
         angle = 2 * math.pi / self.length * torch.arange(self.length, dtype=torch.float64)
         self.register_buffer("slope", math.pi / self.length * angle.sin(), persistent=False)

@@ -129,6 +129,7 @@ def test_scripted_inverse():
     ("arguments", "message"),
     [
         ({"hop": 0}, "hop: got 0"),
+        ({"hop": 52}, "hop: got 52"),
         ({"threshold_db": -3.0}, "threshold_db: got -3.0"),
         ({"overlap": 1.0}, "overlap: got 1.0"),
         ({"window_s": math.inf}, "window_s: got inf"),
