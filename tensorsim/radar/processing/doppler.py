@@ -108,7 +108,8 @@ class DopplerFrames(nn.Module):
             )
         self.prf_hz = float(radar.prf_hz)
         self.length = round(window_s * radar.prf_hz)
-        self.hop = self.length - math.floor(overlap * self.length)
+        # 0.7 of 90 pulses are 63, in floating point 62.99...
+        self.hop = max(1, self.length - math.floor(overlap * self.length + 1e-9))
         self.frame_rate_hz = self.prf_hz / self.hop
         self.bins = 1 << (max(self.length, 256) - 1).bit_length()
         # Block size: spectra of about 1 MB (complex64) stay in the cache.

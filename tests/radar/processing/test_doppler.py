@@ -127,6 +127,14 @@ def test_settings_of_the_presets():
     assert (through.length, through.hop, through.bins) == (13, 2, 256)
 
 
+@pytest.mark.parametrize(
+    ("pulses", "overlap", "hop"), [(90, 0.7, 27), (50, 0.58, 21), (90, 0.0, 90), (90, 1 - 1e-12, 1)]
+)
+def test_hop_is_exact(pulses, overlap, hop):
+    frames = DopplerTimeMap(RadarConfig.through_wall(prf_hz=1000.0), pulses / 1000, overlap)
+    assert (frames.length, frames.hop) == (pulses, hop)
+
+
 @pytest.mark.parametrize("speed", [-2.0, -0.5, 1.0, 3.0])
 def test_approaching_is_positive_at_the_centre_of_the_sweep(speed):
     """A point closing in at `speed` shows at +2 v (fc + B/2) / c."""
