@@ -192,9 +192,10 @@ class MapMaker:
         self.scatterers = JointScatterers()
         self.resampler = PoseResampler(self.radar.prf_hz)
         pulses = round(settings.duration_s * self.radar.prf_hz)
-        # One frame per column is enough: a pixel averages over those between.
+        # One frame per column is enough, a pixel averages over those between; but windows leave no pulse out.
         usual = DopplerFrames(self.radar)
         hop = max(usual.hop, (pulses - 1 - usual.length) // max(1, settings.size - 1))
+        hop = min(hop, usual.length)
         self.frames = DopplerFrames(self.radar, overlap=1 - (hop - 0.5) / usual.length)
         self.image = MapToImage.doppler(self.radar, settings.speed_m_s, settings.size)
         shown = torch.nonzero(self.image.rows(usual.bins).sum(0)).flatten()

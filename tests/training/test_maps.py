@@ -103,6 +103,12 @@ def test_any_ratio_from_three_pictures() -> None:
     assert bool((cross.square() <= a * c * (1 + 1e-6)).all())
 
 
+@pytest.mark.parametrize("settings", [MapSettings(size=32), MapSettings(size=64, duration_s=20.0)])
+def test_few_columns_of_long_clips_see_every_pulse(settings: MapSettings) -> None:
+    frames = MapMaker("free-space", settings).frames
+    assert frames.hop == frames.length
+
+
 def test_empty_scene_is_noise(folder: Path) -> None:
     store = MapStore(folder)
     assert float(store.power("through-wall", 0, 0, None).max()) == 0
