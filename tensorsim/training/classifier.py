@@ -22,8 +22,8 @@ from tensorsim.weights import load_state_dict, load_strict
 NETWORKS: dict[str, tuple[type[nn.Module], int]] = {"spnet": (SPNet, 224), "spgnet": (SPGNet, 32)}
 RANGE_DB = 40.0
 LEARNING_RATE = 1.47e-3
-#: Between the seeds of ratios and of masks: equal ones would mask the clearest pictures most. Below 2**32, as the
-#: generator of the CPU takes the low 32 bits of a seed only.
+#: Between the seeds of masks and of what else is drawn for a picture: equal ones would mask the clearest pictures
+#: most. Below 2**32, as the generator of the CPU takes the low 32 bits of a seed only.
 MASK_STREAM = 0x9E3779B1
 
 

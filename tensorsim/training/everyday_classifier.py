@@ -14,7 +14,7 @@ from tensorsim.radar.presets import PRESETS
 from tensorsim.recognition.calibration import expected_calibration_error, fit_temperature
 from tensorsim.recognition.map_image import MapToImage, area_weights, scaled
 from tensorsim.recognition.networks import find_classifier
-from tensorsim.training.classifier import RANGE_DB, held_out
+from tensorsim.training.classifier import MASK_STREAM, RANGE_DB, held_out
 from tensorsim.training.everyday_maps import EverydayStore
 from tensorsim.training.expected_map import noise_rows
 from tensorsim.training.loop import Batch, Recipe, decay_groups
@@ -179,7 +179,8 @@ class EverydayRecipe(Recipe):
     def collate(self, samples: list[dict[str, Any]]) -> Batch:
         """A batch, with bands masked."""
         batch = super().collate(samples)
-        generator = torch.Generator().manual_seed(self.seed * 999_983 + samples[0]["index"])
+        seed = self.seed * 1_000_003_139 + samples[0]["index"] + MASK_STREAM
+        generator = torch.Generator().manual_seed(seed)
         return {"picture": masked(batch["picture"], generator), "label": batch["label"]}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:

@@ -129,6 +129,19 @@ def test_masks_are_bands():
     assert 0.0 < float(blank.double().mean()) < 0.2
 
 
+def test_masks_do_not_depend_on_the_augmentation(folder, monkeypatch):
+    recipe, flips = EverydayRecipe("spgnet", EverydayStore(folder)), []
+
+    def noted(power, activity, noise, generator):
+        flips.append(float(torch.rand((), generator=generator)))
+        return torch.ones_like(power), activity
+
+    monkeypatch.setattr("tensorsim.training.everyday_classifier.augmented", noted)
+    looks = torch.stack([recipe.collate([recipe.sample(k)])["picture"][0, 0] for k in range(200)])
+    rows = (looks == 0).all(2).sum(1).float()
+    assert abs(float(torch.corrcoef(torch.stack([torch.tensor(flips), rows]))[0, 1])) < 0.25
+
+
 def test_samples_come_from_groups_that_are_not_held_out_and_depend_on_their_number(folder):
     store = EverydayStore(folder)
     recipe = EverydayRecipe("spgnet", store, seed=1)
