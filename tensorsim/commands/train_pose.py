@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tensorsim.commands.arguments import Option
-from tensorsim.commands.training import PeopleOptions, digest
+from tensorsim.commands.training import PeopleOptions
 from tensorsim.exceptions import TensorsimError, check_positive
 
 if TYPE_CHECKING:
@@ -144,7 +144,6 @@ class TrainPose(PeopleOptions):
             augmentation=Augmentation() if self.augmentation == "full" else MILD_AUGMENTATION,
             teacher=teacher,
         )
-        recipe.settings["teacher"] = digest(self.teacher)
         self.train(recipe, loop)
 
 

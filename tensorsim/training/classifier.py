@@ -167,6 +167,7 @@ class ClassifierRecipe(Recipe):
             "learning_rate": learning_rate,
             "masks": list(masks),
             "filmed": None if filmed is None else [filmed.settings.seed, filmed_people],
+            "films": None if filmed is None else filmed.settings.films,
         }
         metadata = {
             "network": kind.__name__,

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.skeleton import MIRRORED
 from tensorsim.errors import TensorsimError
+from tensorsim.files import sha256_of
 from tensorsim.training.colours import Picture, recoloured
 from tensorsim.training.loop import Batch, Recipe, decay_groups
 from tensorsim.training.pose_data import (
@@ -37,6 +38,7 @@ from tensorsim.training.second_labels import put_right, read_results
 from tensorsim.training.shards import Shards, find_shards, read_coco_shards, split
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
+from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
 
 #: Of the pictures of LSPE, never trained on, see :func:`tensorsim.training.shards.split`.
 LSPET_HELD_OUT_PERCENT = 3
@@ -268,7 +270,7 @@ class PoseRecipe(Recipe):
         first_samples: int = 0,
         shares: tuple[float, float, float, float] = SHARES,
         augmentation: Augmentation | None = None,
-        teacher: nn.Module | None = None,
+        teacher: OnnxHeatmaps | None = None,
     ) -> None:
         self.augmentation = Augmentation() if augmentation is None else augmentation
         height, width = net.input_size
@@ -284,6 +286,7 @@ class PoseRecipe(Recipe):
             "first_samples": first_samples,
             "shares": list(shares),
             "augmentation": asdict(self.augmentation),
+            "teacher": None if teacher is None else sha256_of(teacher.path),
         }
         network = "CPM" if isinstance(net, CPM) else "HRNet"
         super().__init__(net, settings, {"network": network, "input_size": f"{height}x{width}"})

@@ -1,5 +1,5 @@
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -103,6 +103,15 @@ def test_trains_on_motion_that_a_camera_saw_as_well(store: MapStore) -> None:
     with torch.no_grad():
         figures = mine.validate(mine.net.eval())
     assert set(figures) == {"score", "loss", "accuracy through-wall", "accuracy through-wall films"}
+
+
+def test_a_training_does_not_go_on_with_other_films(store: MapStore) -> None:
+    runs = []
+    for films in ("a", "b"):
+        filmed = MapStore(store.folder)
+        filmed.settings = replace(filmed.settings, films=films)
+        runs.append(recipe(store, filmed=filmed, filmed_people=5))
+    assert runs[0].settings != runs[1].settings
 
 
 def test_an_epoch_shows_every_clip_once_in_another_order(store: MapStore) -> None:

@@ -1,3 +1,5 @@
+import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -140,10 +142,24 @@ def test_patch_and_noise_are_cut_and_mirrored_alike(folder: Path) -> None:
     assert turned > 5
 
 
+def test_a_training_does_not_go_on_with_other_patches(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "pairs"
+    shutil.copytree(folder, other)
+    same = DenoiserRecipe(untrained(2), other, 10).settings
+    assert same == DenoiserRecipe(untrained(2), folder, 10).settings
+    for made in ({"seed": 1, "per_map": 6}, {"seed": 0, "per_map": 7}):
+        (other / "settings.json").write_text(json.dumps(made))
+        assert DenoiserRecipe(untrained(2), other, 10).settings != same
+    (other / "settings.json").unlink()
+    with pytest.raises(TensorsimError, match=r"settings.json: got a file that cannot be read as settings"):
+        DenoiserRecipe(untrained(2), other, 10)
+
+
 def test_every_activity_is_held_out(tmp_path: Path) -> None:
     for clip in range(12 * 11):
         patch = torch.full((1, 2, 2), float(clip % 12))
         save_file({"image": patch, "noise": patch.clone()}, tmp_path / f"free-space-{clip:05d}.safetensors")
+    (tmp_path / "settings.json").write_text('{"seed": 0}')
     recipe = DenoiserRecipe(untrained(2), tmp_path, 12 * 11)
     assert recipe.held_out["image"][:, 0, 0].sort().values.tolist() == list(range(12))
     assert recipe.training["image"][:, 0, 0].unique().tolist() == list(range(12))

@@ -30,7 +30,7 @@ from tensorsim.vision.pose2d.hrnet import HRNet, HRNetConfig
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
 from tests.training.test_pose_data import BOX, drawn, sample, standing, write_cutouts
 from tests.training.test_shards import jpg
-from tests.vision.pose2d.test_onnx_heatmaps import write_network
+from tests.vision.pose2d.test_onnx_heatmaps import WEIGHT, write_network
 
 TINY = HRNetConfig(4, blocks=1, modules=(1, 1, 1), bottlenecks=1, planes=4)
 
@@ -276,6 +276,14 @@ def test_a_teacher_is_asked_about_what_the_network_is_shown(tmp_path: Path) -> N
     labels = alone.loss(with_teacher.net, batch)
     assert labels.keys() == {"loss"}
     torch.testing.assert_close(losses["loss"], labels["loss"] + expected)
+
+
+def test_the_settings_tell_teachers_apart(tmp_path: Path) -> None:
+    settings = [recipe(tmp_path).settings]
+    for weight in (WEIGHT, 2 * WEIGHT):
+        path = write_network(tmp_path / "teacher.onnx", size=(64, 64), weight=weight)
+        settings.append(recipe(tmp_path, teacher=OnnxHeatmaps(path)).settings)
+    assert len({each["teacher"] for each in settings}) == 3
 
 
 def recipe(folder: Path, **options: object) -> PoseRecipe:
