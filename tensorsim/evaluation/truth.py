@@ -23,6 +23,7 @@ from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captu
 from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
+from tensorsim.experiments.work import digest
 from tensorsim.files import write_text
 from tensorsim.process import end_with_parent
 from tensorsim.radar.presets import PRESETS
@@ -149,7 +150,7 @@ class TruthLoop:
         return [self.cell(row, c, n) for row, clips in self.rows().items() for c in clips for n in names]
 
     def cell(self, row: str, clip: Clip, setting: str) -> Path:
-        """File of a cell; its name has a hash of the options that its figures depend on."""
+        """File of a cell; its name has a hash of the options and the version that its figures depend on."""
         options: dict[str, Any] = {"scenes": self.scenes, "clips": 0, "fps": FPS}
         if setting in GUESSES:  # made of the other clips
             options |= {"clips": self.clips, "seed": self.seed}
@@ -159,7 +160,7 @@ class TruthLoop:
             options |= {"source": clip.source}
         if setting.startswith("c"):
             options |= {"networks": self._networks()}
-        return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{_key(options)}.json"
+        return self.out / "cells" / _plain(row) / f"{_plain(clip.name)}-{setting}-{digest(options)}.json"
 
     def film(self, clip: Clip) -> Path:
         """File of the results of the networks on a clip."""

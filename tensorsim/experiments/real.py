@@ -24,7 +24,7 @@ from tensorsim.experiments.real_films import (
     film_pictures,
     titled,
 )
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, digest, mean_and_spread
 from tensorsim.files import complete_file, sha256_of
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.registry import shipped_weights
@@ -159,8 +159,8 @@ def _on_films(config: RealConfig, work: Work) -> Report:
         for film in read_labels(Path(config.films))[: config.film_count or None]
     ]
     filmed, true = config.group_clips
-    maps = Path(config.maps) if config.maps else work.cache / f"everyday-maps-{filmed}-{true}"
     made = EverydaySettings(filmed=filmed, true=true)
+    maps = Path(config.maps) if config.maps else work.cache / f"everyday-maps-{digest(made)}"
     training = EverydayTraining(maps, config.groups, config.size, config.film_steps, made, work.quiet)
     jobs = [(name, seed) for seed in range(config.film_seeds) for name in config.networks]
     results: dict[str, list[dict[str, float]]] = {name: [] for name in config.networks}
@@ -217,7 +217,8 @@ def _simulated(config: RealConfig, measured: MeasuredSet, work: Work) -> tuple[T
     """Simulated pictures of a set and their labels, kept in the cache."""
     from safetensors.torch import load_file, save_file
 
-    path = work.cache / "results" / f"simulated-{measured.name}-{config.clips}-{config.seed}.safetensors"
+    settings = {"set": measured.name, "clips": config.clips, "seed": config.seed}
+    path = work.cache / "results" / f"simulated-{digest(settings)}.safetensors"
     if not path.is_file():
         shown, labels = measured.simulate(config.clips, config.seed, work.quiet)
         with complete_file(path) as scratch:

@@ -419,6 +419,13 @@ def test_cells_of_other_lifter_weights_are_made_anew(tmp_path: Path, monkeypatch
     assert loop.cell("row", clip, "b") != before
 
 
+def test_cells_of_another_version_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, clip = truth.TruthLoop(tmp_path), walk()
+    before = [loop.cell("row", clip, name) for name in ("b", "mean")]
+    monkeypatch.setattr("tensorsim.experiments.work.version", lambda _: "99.0")
+    assert not {loop.cell("row", clip, name) for name in ("b", "mean")} & set(before)
+
+
 def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

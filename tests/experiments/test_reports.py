@@ -13,6 +13,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip
 from tensorsim.evaluation.labelled_films import LabelledFilm
+from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
 from tensorsim.experiments import ablations, catalogue, networks, paper, real, real_films, video
 from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
@@ -25,6 +26,7 @@ from tensorsim.training.loop import fit
 from tensorsim.training.maps import to_bytes
 from tensorsim.weights import load_state_dict, load_strict
 
+SHARES = [f"{scene} {kind}" for scene in real_films.SCENES for kind in ("clips", "films")]
 QUICK = replace(networks.quick_networks(), networks=("ccln", "diat-radharnet"), seeds=2, snr_db=(50.0, 10.0))
 
 
@@ -173,6 +175,32 @@ def test_real_runs_and_goes_on(tmp_path: Path, shared_data: Path) -> None:
     assert real.real_report(config, work).tables[0].csv() == report.tables[0].csv()
 
 
+def test_another_version_simulates_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clips as of a measured set and maps of everyday motion lie in the cache by version and settings."""
+    made: list[str] = []
+
+    def simulate(self: MeasuredSet, clips: int, seed: int, quiet: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        made.append(f"{clips} {seed}")
+        return torch.zeros(clips, 1, 8, 8), torch.zeros(clips, dtype=torch.int64)
+
+    def films(training: real_films.EverydayTraining) -> str:
+        made.append(str(training.maps))
+        return "digest"
+
+    monkeypatch.setattr(MeasuredSet, "simulate", simulate)
+    monkeypatch.setattr(real_films.EverydayTraining, "digest", property(films))
+    monkeypatch.setattr(real, "film_pictures", lambda *_: [real_films.FilmPictures((), {})])
+    monkeypatch.setattr(real, "read_labels", lambda _: [])
+    monkeypatch.setattr(real, "film_accuracy", lambda *_: dict.fromkeys(SHARES, 0.5))
+    config, work = replace(real.quick_real(), films="films", networks=("ccln",)), Work(tmp_path, quiet=True)
+    for version in ("1", "1", "2"):
+        monkeypatch.setattr("tensorsim.experiments.work.version", lambda _, version=version: version)
+        real._simulated(config, SETS[0], work)
+        real.real_report(config, work)
+    clips, maps = [x for x in made if x == "4 0"], [x for x in made if x != "4 0"]
+    assert (len(clips), len(maps), len(set(maps))) == (2, 3, 2)
+
+
 def everyday_store(folder: Path, groups: int) -> None:
     """Pictures of two activities that differ in the place of one bright band."""
     folder.mkdir(parents=True)
@@ -264,7 +292,7 @@ def test_trainings_on_other_maps_in_the_same_folder_are_not_taken(
 
     def accuracy(name: str, *_: Any) -> dict[str, float]:
         trained.append(name)
-        return {f"{scene} {kind}": 0.5 for scene in real_films.SCENES for kind in ("clips", "films")}
+        return dict.fromkeys(SHARES, 0.5)
 
     monkeypatch.setattr(real, "film_pictures", lambda *_: films)
     monkeypatch.setattr(real, "read_labels", lambda _: [])
