@@ -37,6 +37,8 @@ class Window(NamedTuple):
 def window_starts(duration_s: float, window_s: float = WINDOW_S, step_s: float = STEP_S) -> list[float]:
     """Starts of windows that cover a duration: every ``step_s``, the last one at the end.
 
+    It begins half to one and a half steps after the one before.
+
     A duration of less than a window and a step is one window, so that nobody is asked twice about nearly the same.
     """
     check_positive(window_s, "window_s")
@@ -46,8 +48,7 @@ def window_starts(duration_s: float, window_s: float = WINDOW_S, step_s: float =
     last = duration_s - window_s
     starts = [step_s * k for k in range(math.floor(last / step_s + 1e-9) + 1)]
     # The last window ends with the scene; one that begins just before it would repeat it.
-    starts[-1] = last
-    return starts
+    return [*(start for start in starts if last - start >= step_s / 2), last]
 
 
 def label_windows(
