@@ -174,8 +174,11 @@ def boulic_gait(relative_speed: Tensor, phase: Tensor) -> Gait:
             f"boulic_gait: got speeds of shape {list(relative_speed.shape)} and phases of shape "
             f"{list(phase.shape)}, expected (...) and (..., T)"
         )
-    if not bool(((relative_speed > 0) & (relative_speed <= 3)).all()):
-        raise TensorsimError("relative_speed: expected above 0 and at most 3 leg lengths per second")
+    outside = relative_speed[~((relative_speed > 0) & (relative_speed <= 3))]
+    if len(outside):
+        raise TensorsimError(
+            f"relative_speed: got {float(outside[0]):g}, expected above 0 and at most 3 leg lengths per second"
+        )
     relative_speed = relative_speed.to(phase.dtype)
     curves = control_points(relative_speed)
     rv = relative_speed.unsqueeze(-1)

@@ -128,7 +128,7 @@ class MapRecipe(Recipe):
         }
 
     def sample(self, index: int) -> dict[str, Any]:
-        """Map (C, H, W), label and the seed of its augmentation."""
+        """Map (C, H, W), label and id of the sample."""
         return self.training[shuffled(index, len(self.training), self.seed)]
 
     def collate(self, samples: list[dict[str, Any]]) -> Batch:

@@ -185,9 +185,9 @@ def test_gradients_against_finite_differences() -> None:
 @pytest.mark.parametrize(
     ("speed", "phase", "message"),
     [
-        (torch.tensor(0.0), torch.zeros(3), "relative_speed: expected above 0 and at most 3"),
-        (torch.tensor(3.1), torch.zeros(3), "relative_speed"),
-        (torch.tensor(float("nan")), torch.zeros(3), "relative_speed"),
+        (torch.tensor(0.0), torch.zeros(3), "relative_speed: got 0, expected above 0 and at most 3"),
+        (torch.tensor([1.0, 3.1]), torch.zeros(2, 3), "relative_speed: got 3.1, expected"),
+        (torch.tensor(float("nan")), torch.zeros(3), "relative_speed: got nan"),
         (torch.ones(2), torch.zeros(3), r"got speeds of shape \[2\] and phases of shape \[3\]"),
         (torch.tensor(1.0), torch.zeros(3, dtype=torch.int64), "phase: got dtype"),
         (torch.tensor(1.0), torch.full((3,), float("nan")), "phase: got NaN"),
