@@ -6,6 +6,8 @@ import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -45,14 +47,15 @@ def measure(
     crowds: list[Tensor] = []
     found_boxes: list[Tensor] = []
     for sample in samples:
-        boxes, scores = people_in(detector, sample)
+        image = sample.image()
+        boxes, scores = people_in(detector, image)
         truth, crowd = torch.from_numpy(sample.boxes), torch.from_numpy(sample.crowds)
         truths.append(truth)
         crowds.append(crowd)
         found_boxes.append(torch.cat([boxes, scores[:, None]], dim=1))
         sure = boxes[scores > score]
         hit = _matches(sure, truth)
-        tall = (truth[:, 3] - truth[:, 1]) > 0.2 * sample.image().shape[0]
+        tall = (truth[:, 3] - truth[:, 1]) > 0.2 * image.shape[0]
         people += len(truth)
         found += int(hit.any(dim=0).sum())
         large += int(tall.sum())
@@ -126,11 +129,11 @@ def average_precision(
     return float(evaluation.stats[0]), float(evaluation.stats[1])
 
 
-def people_in(detector: RTMDet | AcfDetector, sample: Sample) -> tuple[Tensor, Tensor]:
-    """Boxes (n, 4) and scores (n,) of the people that a detector finds in a picture, on the CPU."""
-    image = torch.from_numpy(sample.image()).permute(2, 0, 1)[None]
+def people_in(detector: RTMDet | AcfDetector, image: npt.NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
+    """Boxes (n, 4) and scores (n,) of the people that a detector finds in a picture (H, W, 3) RGB, on the CPU."""
+    picture = torch.from_numpy(image).permute(2, 0, 1)[None]
     with torch.no_grad():
-        seen: Detections = detector(image.to(next(detector.buffers()).device))
+        seen: Detections = detector(picture.to(next(detector.buffers()).device))
     persons = seen.valid[0] & (seen.labels[0] == 0)
     return seen.boxes[0][persons].cpu(), seen.scores[0][persons].cpu()
 
@@ -161,7 +164,9 @@ def calibrate(
     if not empty:
         raise TensorsimError(f"calibrate: got {len(samples)} pictures with people, expected some without")
     bar = tqdm(empty, desc="calibrate", unit="picture", disable=quiet)
-    highest = torch.cat([people_in(detector, sample)[1] for sample in bar]).sort(descending=True).values
+    highest = (
+        torch.cat([people_in(detector, sample.image())[1] for sample in bar]).sort(descending=True).values
+    )
     allowed = int(alarms_per_picture * len(empty))
     if allowed >= len(highest):
         return 0.0

@@ -4,6 +4,7 @@ import copy
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from tensorsim.training.detector_metrics import (
     people_in,
 )
 from tensorsim.training.loop import LoopConfig, fit
-from tensorsim.training.shards import read_coco_folder
+from tensorsim.training.shards import Sample, read_coco_folder
 from tensorsim.types import Detections, Tracks
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.detection.rtmdet_layers import RTMDET_SIZES, RTMDetSize
@@ -255,7 +256,9 @@ def test_average_precision_by_hand() -> None:
     assert ap == pytest.approx(5 / 10 * 51 / 101)
 
 
-def test_figures_of_a_detector_that_is_told_the_answer(tmp_path: Path) -> None:
+def test_figures_of_a_detector_that_is_told_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     samples = shard(tmp_path / "p.tar", True) + shard(tmp_path / "e.tar", False)
 
     class Told(nn.Module):
@@ -268,7 +271,16 @@ def test_figures_of_a_detector_that_is_told_the_answer(tmp_path: Path) -> None:
             scores = torch.tensor([[0.9, 0.6, 0.4]])
             return Detections(boxes, scores, torch.zeros(1, 3, dtype=torch.int64), scores > 0)
 
+    decoded: list[Sample] = []
+    image = Sample.image
+
+    def counted(self: Sample) -> Any:
+        decoded.append(self)
+        return image(self)
+
+    monkeypatch.setattr(Sample, "image", counted)
     figures = measure(Told(), samples)  # type: ignore[arg-type]
+    assert len(decoded) == len(samples), "a picture is decoded once"
     assert figures["recall"] == figures["recall_large"] == 1
     assert figures["false_per_picture"] == 1.5  # one, and two where nobody is; 0.4 does not count
     assert figures["people"] == 1
@@ -318,12 +330,12 @@ def test_calibrated_scores_mean_the_same_number_of_alarms(tmp_path: Path, recipe
     torch.manual_seed(1)
     detector = RTMDet("test", score_threshold=0.0).eval()
     empty, peopled = shard(tmp_path / "n.tar", False) * 5, shard(tmp_path / "o.tar", True)
-    before = [people_in(detector, sample) for sample in empty]
+    before = [people_in(detector, sample.image()) for sample in empty]
     assert max(float(scores.max()) for _, scores in before) < 0.5
     # However many people there are, and however badly they are found, only the pictures without any count.
     shift = calibrate(detector, empty + 5 * peopled, alarms_per_picture=0.6)
     assert shift > 0
-    after = [people_in(detector, sample) for sample in empty]
+    after = [people_in(detector, sample.image()) for sample in empty]
     for (boxes, scores), (shifted_boxes, shifted_scores) in zip(before, after, strict=True):
         torch.testing.assert_close(shifted_boxes, boxes)
         torch.testing.assert_close(shifted_scores.logit(), scores.logit() + shift, rtol=0, atol=1e-3)
