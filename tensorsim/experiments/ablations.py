@@ -21,6 +21,7 @@ from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_sp
 from tensorsim.files import sha256_of
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
+from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.registry import shipped_weights
 from tensorsim.training.denoiser import simulate_pair
 from tensorsim.training.denoiser_scores import COLUMNS, scores
@@ -265,8 +266,7 @@ def _denoised(
         for n in (clip, clip + 1000 * people)
     ]
     radar = PRESETS[scene].radar
-    bins = pairs[0][0].doppler_time.shape[0]
-    speed = (torch.arange(bins) - bins // 2) * (radar.prf_hz / bins * radar.doppler_wavelength_m / 2)
+    speed = DopplerFrames(radar).doppler_hz * radar.doppler_wavelength_m / 2
     result: dict[str, dict[str, list[float]]] = {}
     for view, axis in (("range_time_mti", None), ("doppler_time", speed)):
         whole = [getattr(maps, view).float() for maps in (*pairs[0], pairs[1][1])]

@@ -22,16 +22,17 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError, check_choice
+from tensorsim.evaluation.measured.training import predict
 from tensorsim.experiments.pictures import INPUTS, SNR_DB, PictureSet
 from tensorsim.experiments.work import Work, digest, read_result, write_result
 from tensorsim.process import end_with_parent
 from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.networks import find_classifier
-from tensorsim.training.classifier import held_out
+from tensorsim.training.classifier import LEARNING_RATE, held_out
 from tensorsim.training.loop import Batch, LoopConfig, Recipe, decay_groups, fit
+from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict
 
-LEARNING_RATE = 1.47e-3
 L2 = 1e-4
 
 
@@ -110,9 +111,7 @@ class PaperRecipe(Recipe):
 
     def sample(self, index: int) -> dict[str, Any]:
         """Picture and label; the clips in a new order in each epoch."""
-        epoch, place = divmod(index, len(self.training[1]))
-        generator = torch.Generator().manual_seed(self.seed * 7919 + epoch)
-        chosen = int(torch.randperm(len(self.training[1]), generator=generator)[place])
+        chosen = shuffled(index, len(self.training[1]), self.seed)
         return {"picture": self.training[0][chosen], "label": int(self.training[1][chosen])}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
@@ -129,16 +128,10 @@ class PaperRecipe(Recipe):
 
     def validate(self, net: nn.Module) -> dict[str, float]:
         """Accuracy and loss; the score is the negative loss."""
-        found = logits_of(net, self.validation[0])
+        found = predict(net, self.validation[0], batch=64)
         loss = float(F.cross_entropy(found, self.validation[1]))
         accuracy = float((found.argmax(1) == self.validation[1]).float().mean())
         return {"score": -loss, "loss": loss, "accuracy": accuracy}
-
-
-@torch.no_grad()
-def logits_of(net: nn.Module, pictures: Tensor, batch: int = 64) -> Tensor:
-    """Logits (N, classes) of pictures (N, C, H, W)."""
-    return torch.cat([net(part) for part in pictures.split(batch)])
 
 
 def run_trial(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, Any]:
@@ -164,7 +157,7 @@ def run_trial(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, 
         people = range(trial.clips, trial.clips + trial.test_clips)
         for ratio in missing:
             pictures, labels = trial.pictures(work).get(people, trial.inputs, ratio)
-            counts[f"{ratio:g}"] = confusion(logits_of(net, pictures), labels).tolist()
+            counts[f"{ratio:g}"] = confusion(predict(net, pictures, batch=64), labels).tolist()
         write_result(path, result)
     return result | {"confusion": counts}
 

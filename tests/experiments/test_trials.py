@@ -8,9 +8,10 @@ import torch
 from torch import nn
 
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation.measured.training import predict
 from tensorsim.experiments import pictures, trials
 from tensorsim.experiments.pictures import PictureSet, RangeAndRidges
-from tensorsim.experiments.trials import PaperRecipe, Trial, logits_of, run_trial
+from tensorsim.experiments.trials import PaperRecipe, Trial, run_trial
 from tensorsim.experiments.work import Work, write_result
 from tensorsim.recognition.ccln import CCLN
 
@@ -103,7 +104,7 @@ def test_logits_are_those_of_the_network() -> None:
     net = CCLN(12).eval()
     x = torch.rand(5, 1, 32, 32)
     with torch.no_grad():
-        torch.testing.assert_close(logits_of(net, x, batch=2), net(x), rtol=0, atol=1e-5)
+        torch.testing.assert_close(predict(net, x, batch=2), net(x), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
