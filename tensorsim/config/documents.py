@@ -2,9 +2,12 @@
 
 import dataclasses
 import difflib
+import hashlib
+import json
 import types
 import typing
 from collections.abc import Mapping
+from importlib.metadata import version
 from typing import Any, TypeVar
 
 from tensorsim.errors import TensorsimError
@@ -18,6 +21,12 @@ def to_document(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_document(getattr(value, f.name)) for f in dataclasses.fields(value)}
     return [to_document(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+def digest(settings: Any) -> str:
+    """Ten hexadecimal digits that tell configurations, and versions of this package, apart."""
+    text = json.dumps([version("tensorsim"), to_document(settings)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
 def from_document(where: str, config: type, document: Any, more_keys: tuple[str, ...] = ()) -> Any:

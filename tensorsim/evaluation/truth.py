@@ -17,13 +17,13 @@ from tqdm import tqdm
 
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import PoseConfig
+from tensorsim.config.documents import digest
 from tensorsim.config.people import Lifting
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_count
 from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captured_clips
 from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
 from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
-from tensorsim.experiments.work import digest
 from tensorsim.files import write_text
 from tensorsim.process import end_with_parent
 from tensorsim.radar.presets import PRESETS

@@ -14,8 +14,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
+from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimWarning, check_choice
-from tensorsim.experiments.work import Work, digest
+from tensorsim.experiments.work import Work
 from tensorsim.files import complete_file
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers, visibility_fade

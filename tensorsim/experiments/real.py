@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimError, check_count
 from tensorsim.evaluation.labelled_films import read_labels
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
@@ -24,7 +25,7 @@ from tensorsim.experiments.real_films import (
     film_pictures,
     titled,
 )
-from tensorsim.experiments.work import Report, Table, Work, counted, digest, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
 from tensorsim.files import complete_file, sha256_of
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.registry import shipped_weights

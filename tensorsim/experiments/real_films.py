@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES, SimulationConfig
+from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimError, collected_warnings
 from tensorsim.evaluation.labelled_films import FilmReader, LabelledFilm, Scene, read_labels
-from tensorsim.experiments.work import Work, digest
+from tensorsim.experiments.work import Work
 from tensorsim.files import complete_file, sha256_of_arrays
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.recognition import ActivityRecognizer

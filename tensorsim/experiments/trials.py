@@ -21,10 +21,11 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
+from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimError, check_choice
 from tensorsim.evaluation.measured.training import predict
 from tensorsim.experiments.pictures import INPUTS, SNR_DB, PictureSet
-from tensorsim.experiments.work import Work, digest, read_result, write_result
+from tensorsim.experiments.work import Work, read_result, write_result
 from tensorsim.process import end_with_parent
 from tensorsim.recognition.confusion import confusion
 from tensorsim.recognition.networks import find_classifier

@@ -1,27 +1,18 @@
 """What every experiment has in common: its folder, results that are kept, tables and figures."""
 
 import csv
-import hashlib
 import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tensorsim.config.documents import to_document
 from tensorsim.errors import TensorsimError
 from tensorsim.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-def digest(settings: Any) -> str:
-    """Ten hexadecimal digits that tell configurations, and versions of this package, apart."""
-    text = json.dumps([version("tensorsim"), to_document(settings)], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimError
 from tensorsim.experiments.ablations import EchoConfig
 from tensorsim.experiments.catalogue import EXPERIMENTS, configuration, find_experiment, run_experiment
 from tensorsim.experiments.networks import NetworksConfig, accuracy, multiply_adds
-from tensorsim.experiments.work import Report, Table, Work, digest, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, mean_and_spread
 
 
 def test_names() -> None:
