@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimError
 from tensorsim.files import write_text
 

@@ -422,7 +422,7 @@ def test_cells_of_other_lifter_weights_are_made_anew(tmp_path: Path, monkeypatch
 def test_cells_of_another_version_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loop, clip = truth.TruthLoop(tmp_path), walk()
     before = [loop.cell("row", clip, name) for name in ("b", "mean")]
-    monkeypatch.setattr("tensorsim.experiments.work.version", lambda _: "99.0")
+    monkeypatch.setattr("tensorsim.config.documents.version", lambda _: "99.0")
     assert not {loop.cell("row", clip, name) for name in ("b", "mean")} & set(before)
 
 

@@ -194,7 +194,7 @@ def test_another_version_simulates_anew(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(real, "film_accuracy", lambda *_: dict.fromkeys(SHARES, 0.5))
     config, work = replace(real.quick_real(), films="films", networks=("ccln",)), Work(tmp_path, quiet=True)
     for version in ("1", "1", "2"):
-        monkeypatch.setattr("tensorsim.experiments.work.version", lambda _, version=version: version)
+        monkeypatch.setattr("tensorsim.config.documents.version", lambda _, version=version: version)
         real._simulated(config, SETS[0], work)
         real.real_report(config, work)
     clips, maps = [x for x in made if x == "4 0"], [x for x in made if x != "4 0"]
