@@ -397,7 +397,7 @@ class VideoToPose(nn.Module):
         usable = usable & self.is_person(scores, tracks.valid, fps).unsqueeze(-1)
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
-            lifted = self.temporal.in_picture(found, body, body_scores, height, width)
+            lifted = self.temporal.in_picture(found, body, body_scores, height, width, fps)
             body, noise = lifted.keypoints, self.noise_share * found.deviation
         else:
             assert self.lifter is not None

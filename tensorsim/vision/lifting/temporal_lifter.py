@@ -38,6 +38,7 @@ from tensorsim.vision.lifting.sight import (
     windowed_mean,
 )
 from tensorsim.vision.lifting.temporal_net import DILATIONS, Located, TemporalNet
+from tensorsim.vision.smoothing.along_time import raised_slowly
 
 #: Lengths of all bones together, in standing heights; between people they differ by 2 %.
 _ALL_BONES = 2.39
@@ -121,6 +122,8 @@ class TemporalLifter(nn.Module):
         self.camera_known, self.log_bones = camera_known, math.log(_ALL_BONES)
         #: Body heights within which a key point counts as right; at twice as much it is wrong.
         self.near = 0.06
+        #: Seconds in which a joint goes from its key point to where the network has it.
+        self.gives_way_s = 0.2
         #: Frames before and after one that have a say in its result.
         # The size of the body is about its averaged direction, that of its bones is averaged afterwards.
         self.reach = self.network.reach + 3 * RADIUS
@@ -197,18 +200,27 @@ class TemporalLifter(nn.Module):
         return TemporalPose(parts[0], parts[1], parts[2], parts[3])
 
     def in_picture(
-        self, found: TemporalPose, keypoints: Tensor, weights: Tensor, image_height: int, image_width: int
+        self,
+        found: TemporalPose,
+        keypoints: Tensor,
+        weights: Tensor,
+        image_height: int,
+        image_width: int,
+        fps: float,
     ) -> Lifted:
         """The pose as :class:`~tensorsim.vision.lifting.metric_pose.MetricPose` takes it.
 
         A joint that is seen stays at its key point as long as the network has it nearby, so that fast motion is not
-        smoothed; one that is not, or seems to be wrong, is where the network has it.
+        smoothed; one that is not, or seems to be wrong, is where the network has it. Between the two a joint moves
+        over :attr:`gives_way_s`, and key points beside a wrong one give way as well: a foot that is taken for the other
+        one in some frames would jump there and back.
 
         Args:
             found: of :meth:`forward`.
             keypoints: (..., P, T, 14, 2) joints in pixels, see :func:`tensorsim.body.skeleton.coco_to_body`.
             weights: (..., P, T, 14) their scores, those that MetricPose is given.
             image_height, image_width: of the picture, pixels.
+            fps: frames per second.
         """
         focal = self.pinhole.focal_length(image_width)
         center = self.pinhole.principal_point(image_height, image_width)
@@ -225,6 +237,8 @@ class TemporalLifter(nn.Module):
         apart = (pixels - keypoints).square().sum(dim=-1).clamp(min=1e-12).sqrt() / scale[..., None]
         wrong = ((apart - self.near) / self.near).clamp(0.0, 1.0)
         wrong = torch.where(weights >= self.keypoint_threshold, wrong, torch.ones_like(wrong))
+        reach_frames = int(self.gives_way_s * fps / 2 + 0.5)
+        wrong = raised_slowly(wrong.transpose(-1, -2), reach_frames).transpose(-1, -2)
         image = keypoints + wrong[..., None] * (pixels - keypoints)
         none = torch.zeros_like(middle)
         # What it says of its errors is of joints in the world, see :class:`TemporalPose`, not of depths.

@@ -105,7 +105,9 @@ def test_joints_lie_on_the_lines_of_sight_of_their_key_points() -> None:
     with torch.no_grad():
         found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
         body, _ = coco_to_body(keypoints, scores)
-        lifted = lifter.in_picture(found, body + 1.0, scores[..., :14] * 0, HEIGHT, WIDTH)  # none is seen
+        lifted = lifter.in_picture(
+            found, body + 1.0, scores[..., :14] * 0, HEIGHT, WIDTH, 30.0
+        )  # none is seen
     points = (found.joints + found.root[..., None, :])[0].numpy() - np.array(CAMERA.position_m)
     pose = camera_to_world(CAMERA).numpy()[:, :3]
     local = points @ pose
@@ -130,7 +132,7 @@ def test_metric_pose_places_what_the_lifter_found() -> None:
     with torch.no_grad():
         found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
         body, _ = coco_to_body(keypoints, scores)
-        lifted = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH)
+        lifted = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH, 30.0)
         place = ts.vision.MetricPose(CAMERA, (1.7,), calibrated=True)
         joints, _ = place(lifted.keypoints, scores[..., :14], lifted, valid, HEIGHT, WIDTH, 30.0)
     torch.testing.assert_close(joints, found.joints + found.root[..., None, :], atol=1e-5, rtol=0)
@@ -144,13 +146,32 @@ def test_key_points_that_are_nearly_right_stay_and_others_move() -> None:
     jittery, wrong = body.clone(), body.clone()
     with torch.no_grad():
         found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
-        unit = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH).scale[0, :, None]
+        unit = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH, 30.0).scale[0, :, None]
         jittery[..., 4, :] += 0.05 * unit * torch.tensor([1.0, 0.0])
         wrong[..., 4, :] += 0.2 * unit * torch.tensor([1.0, 0.0])
-        near = lifter.in_picture(found, jittery, scores[..., :14], HEIGHT, WIDTH).keypoints
-        far = lifter.in_picture(found, wrong, scores[..., :14], HEIGHT, WIDTH).keypoints
+        near = lifter.in_picture(found, jittery, scores[..., :14], HEIGHT, WIDTH, 30.0).keypoints
+        far = lifter.in_picture(found, wrong, scores[..., :14], HEIGHT, WIDTH, 30.0).keypoints
     torch.testing.assert_close(near, jittery, atol=1e-6, rtol=0)
     torch.testing.assert_close(far, body, atol=1e-6, rtol=0)
+
+
+def test_a_joint_does_not_jump_to_a_wrong_key_point_and_back() -> None:
+    _, keypoints, scores, boxes, valid = filmed(40)
+    torch.manual_seed(0)
+    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()  # moves no key point
+    body, _ = coco_to_body(keypoints, scores)
+    spoilt = body.clone()
+    with torch.no_grad():
+        found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
+        unit = lifter.in_picture(found, body, scores[..., :14], HEIGHT, WIDTH, 30.0).scale[0, :, None]
+        spoilt[0, :, 4, 0] += 0.05 * unit[:, 0]  # near enough
+        spoilt[0, 20, 4, 0] += 0.2 * unit[20, 0]
+        lifted = lifter.in_picture(found, spoilt, scores[..., :14], HEIGHT, WIDTH, 30.0)
+    share = (lifted.keypoints - body)[0, :, 4, 0] / (0.05 * unit[:, 0])
+    # Three frames to each side make a tenth of a second.
+    expected = torch.ones(40, dtype=share.dtype)
+    expected[14:27] = torch.tensor([1, 2, 3, 4, 5, 6, 7, 6, 5, 4, 3, 2, 1]) / -7 + 1
+    torch.testing.assert_close(share, expected, atol=1e-6, rtol=0)
 
 
 def test_a_mirrored_film_gives_the_mirrored_motion() -> None:
@@ -461,10 +482,10 @@ def test_key_points_far_from_the_found_body_give_way_to_it(shift: float, moved: 
         found = lifter(keypoints, scores, boxes, valid, HEIGHT, WIDTH, 30.0)
         body, seen = coco_to_body(keypoints, scores)
         exact = lifter.in_picture(
-            found, body, 0 * seen, HEIGHT, WIDTH
+            found, body, 0 * seen, HEIGHT, WIDTH, 30.0
         )  # the found body, where nothing is seen
         away = exact.keypoints + torch.tensor([1.0, 0.0]) * shift * lifter.near * exact.scale[..., None, None]
-        lifted = lifter.in_picture(found, away, torch.ones_like(seen), HEIGHT, WIDTH)
+        lifted = lifter.in_picture(found, away, torch.ones_like(seen), HEIGHT, WIDTH, 30.0)
     share = ((away - lifted.keypoints)[..., 0] / (away - exact.keypoints)[..., 0]).mean()
     assert float(share) == pytest.approx(moved, abs=0.005)  # the scale is that of the joints that count
     if shift < 1.0:

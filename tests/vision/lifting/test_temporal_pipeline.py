@@ -141,5 +141,5 @@ def test_nobody_is_lifted() -> None:
         boxes, valid = torch.zeros(*lead, 12, 4), torch.zeros(*lead, 12, dtype=torch.bool)
         found = lifter(keypoints, scores, boxes, valid, 360, 640, 30.0)
         assert found.joints.shape == (*lead, 12, 14, 3)
-        placed = lifter.in_picture(found, keypoints[..., :14, :], scores[..., :14], 360, 640)
+        placed = lifter.in_picture(found, keypoints[..., :14, :], scores[..., :14], 360, 640, 30.0)
         assert placed.depth.shape == (*lead, 12, 14)

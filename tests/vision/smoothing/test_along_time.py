@@ -11,6 +11,7 @@ from tensorsim.vision.smoothing.along_time import (
     gaps_with,
     local_linear,
     masked_median,
+    raised_slowly,
     ridge_in_gaps,
     robust_smooth,
     running_quantile,
@@ -174,3 +175,16 @@ def test_gaps_with_an_event() -> None:
     assert both[0].nonzero()[:, 0].tolist() == [2, 3, 4, 7]
     assert both[1].nonzero()[:, 0].tolist() == [2, 3, 4]
     assert not gaps_with(event, torch.zeros_like(seen)).any()
+
+
+@pytest.mark.parametrize(("frames", "reach"), [(1, 3), (5, 3), (40, 0), (40, 4)])
+def test_raised_slowly_is_a_mean_of_running_maxima(frames: int, reach: int) -> None:
+    x = np.random.default_rng(0).random((2, 3, frames))
+    window = np.arange(-reach, reach + 1)
+    index = np.arange(frames)[:, None] + window
+    inside = (index >= 0) & (index < frames)
+    highest = np.where(inside, x[..., index.clip(0, frames - 1)], -np.inf).max(-1)
+    expected = highest[..., index.clip(0, frames - 1)].mean(-1)
+    found = raised_slowly(torch.from_numpy(x), reach)
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+    assert bool((found >= torch.from_numpy(x) - 1e-12).all())
