@@ -270,6 +270,44 @@ def test_somebody_of_whom_one_key_point_is_seen_keeps_the_place(tmp_path: Path) 
     assert found.valid.tolist() == [[True, True, False]] * 2 + [[True] * 3]
 
 
+def test_somebody_far_from_everybody_before_is_somebody_new(tmp_path: Path) -> None:
+    """One leaves and another comes elsewhere; then the first one, who was gone for a while, is back nearby."""
+    body = np.random.default_rng(0).uniform(0, 100, (17, 2))
+    keypoints = np.stack([np.stack([body + 250.0 * p + [3.0 * t, 0.0] for t in range(60)]) for p in range(2)])
+    scores = np.full((2, 60, 17), 0.9)
+    who = [(0,)] * 20 + [(1,)] * 20 + [(0,)] * 20
+    write_results(tmp_path / "both.json", keypoints, scores, who)
+    found = load_coco_keypoints(tmp_path / "both.json")
+    assert found.valid.tolist() == [[0 in here, 1 in here] for here in who]
+    torch.testing.assert_close(found.keypoints[50, 0], torch.tensor(keypoints[0, 50]).float())
+
+
+def test_hidden_key_points_make_nobody_new(tmp_path: Path) -> None:
+    """Of somebody who walks only the ankles are seen for a while, then only the head, then nothing."""
+    body = np.random.default_rng(0).uniform(0, 100, (17, 2))
+    body[15:] = [[40.0, 90.0], [42.0, 91.0]]
+    keypoints = np.stack([body + np.array([8.0 * t, 0.0]) for t in range(20)])[None]
+    scores = np.full((1, 20, 17), 0.9)
+    scores[0, 5:12, :15] = 0.0
+    scores[0, 12:16, 5:] = 0.0
+    scores[0, 16:18] = 0.0
+    write_results(tmp_path / "one.json", keypoints, scores, [(0,)] * 20)
+    assert load_coco_keypoints(tmp_path / "one.json").valid.tolist() == [[True]] * 20
+
+
+def test_more_people_one_after_the_other_than_a_scene_has_are_refused(tmp_path: Path) -> None:
+    body = np.random.default_rng(0).uniform(0, 10, (17, 2))
+    keypoints = np.stack([body + np.array([40.0 * p, 0.0]) for p in range(300)])[:, None]
+    write_results(tmp_path / "many.json", keypoints, np.full((300, 1, 17), 0.9), [tuple(range(60))])
+    assert load_coco_keypoints(tmp_path / "many.json").valid.shape == (1, 60)
+    results = [
+        {"image_id": p, "keypoints": np.c_[keypoints[p, 0], np.ones(17)].ravel().tolist()} for p in range(300)
+    ]
+    (tmp_path / "many.json").write_text(json.dumps(results))
+    with pytest.raises(TensorsimError, match=r"many\.json: got 257, expected people from 1 to 256"):
+        load_coco_keypoints(tmp_path / "many.json")
+
+
 def test_scores_above_one_count_as_one_and_percents_are_refused(
     filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:
@@ -294,7 +332,8 @@ def test_names_of_pictures_and_files_go_by_their_numbers(tmp_path: Path) -> None
     """Results of AlphaPose have the names of pictures as image ids, without those in which nobody is."""
     numbers = [0, 1, 2, 3, 8, 9, 10, 11]
     results = [
-        {"image_id": f"{n}.jpg", "keypoints": [float(n), 2.0, 0.9] * 17} for n in sorted(numbers, key=str)
+        {"image_id": f"{n}.jpg", "keypoints": [float(n), 2.0, 0.9] * 16 + [50.0, 50.0, 0.9]}
+        for n in sorted(numbers, key=str)
     ]
     (tmp_path / "results.json").write_text(json.dumps(results))
     found = load_coco_keypoints(tmp_path / "results.json")

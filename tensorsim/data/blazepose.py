@@ -26,7 +26,7 @@ def load_keypoints(path: str | os.PathLike[str], size: tuple[int, int] | None = 
     list of these per person, an object that has them as ``pose_landmarks``, ``poseLandmarks``, ``landmarks`` or
     ``landmark``, or null or nothing where nobody is. A landmark has ``x`` and ``y``, 0 to 1 over the picture, and
     ``visibility``.
-    People are told apart by where they were last seen. 17 of the 33 landmarks are those of COCO.
+    People are told apart by where they were last seen, as those of COCO. 17 of the 33 landmarks are those of COCO.
 
     Args:
         path: the file or folder.
@@ -70,7 +70,7 @@ def _in_pixels(frames: list[list[Any]], size: tuple[int, int], path: Path) -> Ke
     # 0 and 1 are the borders of a picture; the centres of its pixels are at whole numbers.
     pixels = data[..., :2] * torch.tensor([size[1], size[0]]) - 0.5
     scores = data[..., 2:].clamp(0.0, 1.0)
-    data, valid = told_apart(torch.cat([pixels, scores], dim=-1), valid)
+    data, valid = told_apart(torch.cat([pixels, scores], dim=-1), valid, path)
     return Keypoints2D(data[..., :2], data[..., 2], valid, size)
 
 

@@ -16,7 +16,7 @@ from tensorsim.files import reading
 from tensorsim.limits import check_range
 from tensorsim.vision.tracking.assignment import assign
 
-#: Somebody never seen before is as far away as a person that moved by this many body sizes.
+#: Whoever is more than this many body sizes from where everybody was last is somebody new.
 _NEW = 2.0
 
 
@@ -42,8 +42,9 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     Frames are in ascending order of their image ids, or of the names of the files in a folder; names go by the numbers
     in them, ``2.jpg`` before ``10.jpg``. Results do not list images in which nobody was found: numbers that are left
     out between others, in even steps, are such frames. People are told apart by ``track_id`` where there is one, else
-    by where they were last seen, in the order in which they come. ``keypoints`` are 51 numbers: x, y, and visibility
-    (0, 1 or 2) or score (0 to 1) of each; scores a little above 1 count as 1.
+    by where they were last seen, in the order in which they come; whoever is more than two body sizes from there is
+    somebody new. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a
+    little above 1 count as 1.
 
     Raises:
         TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, scores
@@ -121,7 +122,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
                 valid[t, place] = True
     check_finite(data, str(path))
     if not tracked:
-        data, valid = told_apart(data, valid)
+        data, valid = told_apart(data, valid, path)
     # Annotations flag visibility by 0, 1 or 2; networks write scores.
     scores = data[..., 2]
     if float(scores.max()) > 2:
@@ -132,20 +133,30 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
     return Keypoints2D(data[..., :2], scores, valid, size)
 
 
-def told_apart(data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def told_apart(data: Tensor, valid: Tensor, path: Path) -> tuple[Tensor, Tensor]:
     """People (T, P, 17, 3), the first ones of each frame ``valid`` (T, P), each in the place of the nearest before.
 
-    Places are in the order in which people come, those of one frame as they are listed.
+    Whoever is far from everybody before gets a place of their own. Places are in the order in which people come, those
+    of one frame as they are listed.
+
+    Raises:
+        TensorsimError: more people than a file may have; ``path`` is that of the file.
     """
-    ordered, there = torch.zeros_like(data), torch.zeros_like(valid)
-    last, known = torch.zeros_like(data[0]), 0
-    for t in range(len(data)):
+    last, places = data.new_zeros(0, 17, 3), {}
+    for t in valid.any(dim=1).nonzero().flatten().tolist():
         people = data[t, valid[t]]
-        place = assign(_apart(people, last), torch.ones(len(people), len(last), dtype=torch.bool), 1e9)
-        new = place >= known
-        place[new] = torch.arange(known, known + int(new.sum()))
-        known += int(new.sum())
-        ordered[t, place], there[t, place], last[place] = people, True, people
+        place = assign(_apart(people, last), torch.ones(len(people), len(last), dtype=torch.bool), _NEW)
+        new = place < 0
+        place[new] = torch.arange(len(last), len(last) + int(new.sum()))
+        last = torch.cat([last, people[new]])
+        check_range(len(last), "people", str(path))
+        # Key points that are hidden stay where they were: of a foot alone nobody could tell the size of the body.
+        last[place] = torch.where(people[..., 2:] > 0, people, last[place])
+        places[t] = place
+    ordered = data.new_zeros(len(data), len(last), 17, 3)
+    there = valid.new_zeros(len(data), len(last))
+    for t, place in places.items():
+        ordered[t, place], there[t, place] = data[t, valid[t]], True
     return ordered, there
 
 
@@ -155,7 +166,8 @@ def _apart(people: Tensor, others: Tensor) -> Tensor:
     both = (people[:, None, :, 2] > 0) & (others[None, :, :, 2] > 0)
     size = torch.maximum(_size(people)[:, None], _size(others)[None])
     apart = ((here - other).norm(dim=-1) * both).sum(dim=-1) / both.sum(dim=-1).clamp(min=1) / size
-    return torch.where(both.any(dim=-1), apart, _NEW)
+    # Nothing says that people without a key point in common are others.
+    return torch.where(both.any(dim=-1), apart, 0.99 * _NEW)
 
 
 def _size(people: Tensor) -> Tensor:
