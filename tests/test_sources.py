@@ -354,10 +354,49 @@ def test_frames_without_anybody_are_not_left_out_of_results(step: int, tmp_path:
     (tmp_path / "results.json").write_text(json.dumps(results))
     found = load_coco_keypoints(tmp_path / "results.json")
     assert torch.nonzero(found.valid[:, 0]).flatten().tolist() == numbers
-    # Pictures of a data set are not frames of a film.
-    pictures = [{"image_id": number, **person} for number in (139, 397133, 37777)]
-    (tmp_path / "pictures.json").write_text(json.dumps(pictures))
-    assert load_coco_keypoints(tmp_path / "pictures.json").valid.shape == (3, 1)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cam1_{:06d}.jpg",
+        "walk-2/{:06d}.jpg",
+        "S001_frame_{:06d}.png",
+        "frame-{:04d}.jpg",
+        "2026-01-31 {}.jpg",
+    ],
+)
+def test_the_last_number_of_a_name_numbers_the_frame(name: str, tmp_path: Path) -> None:
+    numbers = [*range(4), *range(7, 12)]
+    results = [{"image_id": name.format(number), "keypoints": [1.0, 2.0, 0.9] * 17} for number in numbers]
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    found = load_coco_keypoints(tmp_path / "results.json")
+    assert torch.nonzero(found.valid[:, 0]).flatten().tolist() == numbers
+
+
+@pytest.mark.parametrize(
+    ("numbers", "frames"),
+    [
+        ([*range(20), *range(280, 300)], 300),  # seen in a small part of the film
+        ([*range(0, 40, 2), 39], 40),  # in every second frame and in the last one
+        ([0, 3, 4, 7, 9, 12, 13, 16], 17),
+        ([139, 397133, 37777], 3),  # pictures of a data set
+        ([*range(0, 5000, 9), 5001, 5003], 558),
+        ([*range(20), 2_000_000_000], 21),
+        ([*range(20), 99_999], 100_000),
+        (["1.jpg", "01.jpg", "2.jpg", "5.jpg"], 4),
+        (["a1.jpg", "a2.jpg", "b4.jpg", "b5.jpg"], 4),
+        (["a", "b", "c"], 3),
+        ([-7, -3, -2, -1], 4),
+        ([1, 5], 2),
+    ],
+)
+def test_which_ids_number_frames(numbers: list[int | str], frames: int, tmp_path: Path) -> None:
+    results = [{"image_id": number, "keypoints": [1.0, 2.0, 0.9] * 17} for number in numbers]
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    found = load_coco_keypoints(tmp_path / "results.json")
+    assert found.valid.shape == (frames, 1)
+    assert int(found.valid.sum()) == len(numbers)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import statistics
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ from tensorsim.vision.tracking.assignment import assign
 
 #: Whoever is more than this many body sizes from where everybody was last is somebody new.
 _NEW = 2.0
+#: Image ids that span more frames than this, almost an hour at 30 per second, do not number those of a film.
+_LONGEST = 100_000
 
 
 class Keypoints2D(NamedTuple):
@@ -41,7 +44,10 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
 
     Frames are in ascending order of their image ids, or of the names of the files in a folder; names go by the numbers
     in them, ``2.jpg`` before ``10.jpg``. Results do not list images in which nobody was found: numbers that are left
-    out between others, in even steps, are such frames. People are told apart by ``track_id`` where there is one, else
+    out between others are such frames. That holds for three or more ids that are numbers, or names that differ in their
+    last number alone, if half of the steps between them or more are at most three frames, a frame being the largest
+    step of which all are multiples, and if they span 100 000 frames at most; else they are pictures with numbers that
+    count nothing, and frames are those that are listed. People are told apart by ``track_id`` where there is one, else
     by where they were last seen, in the order in which they come; whoever is more than two body sizes from there is
     somebody new. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a
     little above 1 count as 1.
@@ -183,14 +189,23 @@ def _size(people: Tensor) -> Tensor:
 def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:
     """The image ids of results in order, with None for frames without anybody where ids number the frames."""
     ids = sorted(people, key=_by_number)
-    names = [name for id_ in ids if (name := re.fullmatch(r"([^\d-]*)(\d+)(\D*)", str(id_)))]
-    id_of = {int(name[2]): id_ for name, id_ in zip(names, ids, strict=False)}
-    if len(id_of) < max(len(ids), 3) or len({(name[1], name[3]) for name in names}) > 1:
+    parts = [re.split(r"(\d+)", str(id_)) for id_ in ids]
+    if len(ids) < 3 or any(len(name) < 3 or _but_number(name) != _but_number(parts[0]) for name in parts):
         return ids
-    step = math.gcd(*(after - before for before, after in itertools.pairwise(id_of)))
-    every = range(min(id_of), max(id_of) + step, step)
-    # Numbers of a data set's pictures are far apart and count nothing.
-    return ids if len(every) > 4 * len(ids) else [id_of.get(number) for number in every]
+    id_of = {int(name[-2]): id_ for name, id_ in zip(parts, ids, strict=True)}
+    steps = [after - before for before, after in itertools.pairwise(id_of)]
+    if len(id_of) < len(ids) or min(steps) < 0:  # 1.jpg beside 01.jpg, negative numbers
+        return ids
+    frame = math.gcd(*steps)
+    every = range(min(id_of), max(id_of) + frame, frame)
+    if statistics.median_low(steps) > 3 * frame or len(every) > _LONGEST:
+        return ids
+    return [id_of.get(number) for number in every]
+
+
+def _but_number(name: list[str]) -> list[str]:
+    """What is before and after the last number of a name, which is split at its numbers."""
+    return [*name[:-2], name[-1]]
 
 
 def _by_number(name: Any) -> Any:
