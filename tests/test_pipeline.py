@@ -145,6 +145,11 @@ def test_shipped_networks_look_into_the_mirror_unless_told_not_to() -> None:
     assert not torch.equal(asked_twice(crops), once(crops))
 
 
+def test_a_pretrained_detector_may_be_of_another_kind() -> None:
+    graph = VideoToActivity.from_pretrained("acf-person").video_to_doppler
+    assert isinstance(graph.video_to_pose.detector, ts.vision.AcfDetector)
+
+
 @pytest.mark.parametrize(
     "make",
     [

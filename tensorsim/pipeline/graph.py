@@ -11,14 +11,13 @@ from torch import Tensor, nn
 from tensorsim.config import CameraConfig, RadarConfig, SceneConfig, SimulationConfig, WallConfig
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_replaced
 from tensorsim.pipeline.maps import PoseToDoppler
-from tensorsim.pipeline.networks import pretrained_pose
+from tensorsim.pipeline.networks import pretrained_detector, pretrained_pose
 from tensorsim.pipeline.pose import VideoToPose
 from tensorsim.protocols import check_instance, check_part
 from tensorsim.radar.presets import radar_scene
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.recognition.recognizer import ActivityRecognizer
 from tensorsim.types import RadarMaps, Recognition, Simulation
-from tensorsim.vision.detection.rtmdet import RTMDet
 
 
 class VideoToDoppler(nn.Module):
@@ -151,7 +150,7 @@ class VideoToDoppler(nn.Module):
         Raises:
             TensorsimError: weights that are not there or of another network.
         """
-        whole = cls(RTMDet.from_pretrained(detector), pretrained_pose(pose, flip_test), **options).eval()
+        whole = cls(pretrained_detector(detector), pretrained_pose(pose, flip_test), **options).eval()
         whole.video_to_pose.requires_grad_(False)
         return whole
 
@@ -163,7 +162,8 @@ class VideoToDoppler(nn.Module):
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
-            lengths: (B,) frames of each clip when the shorter ones are padded.
+            lengths: (B,) frames of each clip when the shorter ones are padded. The level of the noise follows the mean
+                power of the echo over all T frames: that of a clip that is half padding is 3 dB lower.
             times_s: (B, T) seconds of frames that are not evenly spaced.
 
         Raises:
