@@ -1,9 +1,9 @@
-"""Video files in, through OpenCV: whatever its build decodes, streamed in chunks."""
+"""Video files in, through OpenCV, streamed in chunks."""
 
 import math
 import os
 import warnings
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ KEPT_MB = 1000.0
 #: A file that announces this many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
 
+_JPEG = b"\xff\xd8\xff"
 #: First bytes of films, and where they are: FFmpeg would also open playlists, which name further files and addresses.
 _CONTAINERS = (
     *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")),  # mp4, mov, 3gp
@@ -36,7 +37,9 @@ _CONTAINERS = (
     (0, b"OggS"),
     (0, b"\x30\x26\xb2\x75"),  # Windows Media
     (0, b"YUV4MPEG2 "),
-    (0, b"DKIF"),
+    (0, b"DKIF"),  # IVF
+    (0, b"\x06\x0e\x2b\x34"),  # MXF
+    (0, _JPEG),  # one picture after the other
 )
 
 
@@ -49,7 +52,7 @@ class VideoReader:
     are turned upright as the file says.
 
     Args:
-        path: a file that OpenCV decodes (mp4, avi, gif, ...).
+        path: an mp4, mov, 3gp, mkv, webm, avi, gif, mpg, ts, flv, ogv, wmv, mxf, mjpeg, y4m or ivf that OpenCV decodes.
         fps: frames per second of the film, instead of those that the file announces.
         start_s, end_s: keep the frames from ``start_s`` on that are before ``end_s``, in seconds of the film.
         stride: keep every stride-th of them.
@@ -76,8 +79,8 @@ class VideoReader:
         torch.uint8 torch.Size([3, 3, 48, 64])
 
     Raises:
-        TensorsimError: no such file, no frame in it that OpenCV decodes, a frame rate that is neither
-            sensible nor given, or a range without frames.
+        TensorsimError: no such file, one of another kind, a single picture, no frame that OpenCV decodes, a frame rate
+            that is neither sensible nor given, or a range without frames.
     """
 
     def __init__(
@@ -95,6 +98,10 @@ class VideoReader:
         _check_is_film(self.path)
         self._stride, self._own_times = stride, fps is None
         self._end_s = math.inf if end_s is None or end_s > RANGES["time"].high else end_s
+        if _begins_with(self.path, [(0, _JPEG)]):
+            with self._opened() as capture:
+                if not (capture.grab() and capture.grab()):
+                    raise TensorsimError(f"{self.path}: got a single picture, expected a video")
         with self._opened() as capture:
             file_fps, announced = properties(capture)
             if fps is None and not 0 < file_fps < ABSURD_FPS:
@@ -327,14 +334,17 @@ def _check_is_film(path: Path) -> None:
         raise TensorsimError(f"{path}: no such file, expected a video")
     if not path.is_file():
         raise TensorsimError(f"{path}: got a folder, expected a video file")
-    if not _begins_like_a_film(path):
-        raise TensorsimError(f"{path}: OpenCV cannot read this, expected a video")
+    if not _begins_with(path, _CONTAINERS):
+        raise TensorsimError(
+            f"{path}: not a kind of film that is read, expected a video (mp4, mov, mkv, avi, ...)"
+        )
 
 
-def _begins_like_a_film(path: Path) -> bool:
+def _begins_with(path: Path, marks: Iterable[tuple[int, bytes]]) -> bool:
+    """Whether some of these bytes are at their place in a file."""
     with path.open("rb") as file:
         head = file.read(16)
-    return any(head[at : at + len(kind)] == kind for at, kind in _CONTAINERS)
+    return any(head[at : at + len(kind)] == kind for at, kind in marks)
 
 
 def properties(capture: Any) -> tuple[float, int | None]:

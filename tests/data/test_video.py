@@ -34,7 +34,11 @@ def write_clip(path: Path, frames: int = 20, fps: float = 25.0) -> Path:
         pictures = [image.fromarray(picture(i)) for i in range(frames)]
         pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps))
         return path
-    code = {".avi": "MJPG", ".mp4": "mp4v", ".mkv": "FFV1"}[path.suffix]
+    if path.suffix == ".mjpeg":
+        pictures = [cv2.imencode(".jpg", picture(i)[..., ::-1])[1].tobytes() for i in range(frames)]
+        path.write_bytes(b"".join(pictures))
+        return path
+    code = {".avi": "MJPG", ".mp4": "mp4v", ".mkv": "FFV1", ".mxf": "mpg2"}[path.suffix]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), fps, (WIDTH, HEIGHT))
     assert writer.isOpened()
     for i in range(frames):
@@ -222,6 +226,20 @@ def test_refuses_chunks_of_nothing(clip: Path) -> None:
         VideoReader(clip).chunks(0)
 
 
+@pytest.mark.parametrize("name", ["clip.mjpeg", "clip.mxf"])
+def test_films_of_cameras_and_studios_are_read(name: str, tmp_path: Path) -> None:
+    frames = read(write_clip(tmp_path / name))
+    assert len(frames) == 20
+    assert square_of(frames[10])[0] == pytest.approx(square_of(frames[0])[0] + 20, abs=0.5)
+
+
+@pytest.mark.parametrize("name", ["clip.jpg", "clip.mjpeg", "clip"])
+def test_a_single_picture_is_no_film(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(cv2.imencode(".jpg", picture(0))[1].tobytes())
+    with pytest.raises(TensorsimError, match=f"{name}: got a single picture, expected a video"):
+        VideoReader(tmp_path / name)
+
+
 def test_refuses_what_is_no_film(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no such file"):
         VideoReader(tmp_path / "missing.mp4")
@@ -233,7 +251,9 @@ def test_refuses_what_is_no_film(tmp_path: Path) -> None:
         ("zeros.mp4", bytes(4096)),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(TensorsimError, match=f"{name}: OpenCV cannot read this, expected a video"):
+        with pytest.raises(
+            TensorsimError, match=f"{name}: not a kind of film that is read, expected a video"
+        ):
             VideoReader(tmp_path / name)
     # A header, and not one frame behind it.
     path = write_clip(tmp_path / "head.avi")
@@ -366,7 +386,9 @@ def test_playlists_are_not_opened(clip: Path) -> None:
     ):
         path = clip.with_name(name)
         path.write_text(text)
-        with pytest.raises(TensorsimError, match=f"{name}: OpenCV cannot read this, expected a video"):
+        with pytest.raises(
+            TensorsimError, match=f"{name}: not a kind of film that is read, expected a video"
+        ):
             VideoReader(path)
 
 
