@@ -20,6 +20,7 @@ from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.geometry.camera import focal_length
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
+from tensorsim.pipeline.pose import joined
 from tensorsim.pipeline.reach import radar_ahead_m
 from tensorsim.progress import picture, progress_bar
 from tensorsim.threads import spread
@@ -263,7 +264,7 @@ def detections_of_film(
         )
     if (count - 1) % interval:
         found.append(stage.detect(last.to(device)))
-    whole = Detections(*(torch.cat(field) for field in zip(*found, strict=True)))
+    whole = joined(found)
     present = stage.frames_present(1, count, None, whole.boxes.device)
     return whole, stage.observed_frames(present, reader.fps)
 

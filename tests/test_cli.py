@@ -89,6 +89,31 @@ def test_streaming_equals_the_graph(walk: Path, threads: int, request: pytest.Fi
             assert_same(maps, [f[0] for f in expected], atol=1e-5)
 
 
+class Growing(RectangleDetector):
+    """Pads every call to one more."""
+
+    calls = 0
+
+    def forward(self, images: torch.Tensor) -> ts.types.Detections:
+        found = super().forward(images)
+        self.calls += 1
+        more = [field.new_zeros(len(images), self.calls, *field.shape[2:]) for field in found]
+        return ts.types.Detections(*(torch.cat(pair, dim=1) for pair in zip(found, more, strict=True)))
+
+
+def test_a_detector_may_pad_every_part_of_a_film_to_another_count(walk: Path) -> None:
+    reader = VideoReader(walk)
+    found = [
+        streaming.detections_of_film(
+            VideoToPose(detector, StandingPose(), frames_per_batch=3), reader, torch.device("cpu"), quiet=True
+        )[0]
+        for detector in (RectangleDetector(), Growing())
+    ]
+    count = found[0].valid.shape[1]
+    assert found[1].valid.shape[1] > count + 1
+    assert_same([field[:, :count] for field in found[1]], found[0])
+
+
 def test_simulate_writes_everything(
     walk: Path, tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

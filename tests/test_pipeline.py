@@ -18,6 +18,7 @@ from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.motion import JointScatterers
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
+from tensorsim.pipeline.pose import joined
 from tensorsim.streaming import maps_of_pose
 from tensorsim.summary import people_of
 from tensorsim.vision.lifting.bone_fit import BoneFit
@@ -331,6 +332,27 @@ def test_ranges_of_people_are_those_from_the_antennas() -> None:
     range_m = np.sqrt(x_m**2 + (1.2 - RADAR.middle_m[1]) ** 2 + (1.3 - RADAR.middle_m[2]) ** 2)
     assert row["mean_range_m"] == pytest.approx(range_m.mean(), abs=1e-3)
     assert row["mean_approach_m_s"] == pytest.approx((range_m[0] - range_m[-1]) / (20 / FPS), abs=1e-3)
+
+
+class AsManyAsThereAre(nn.Module):
+    """Finds as many boxes in all images of a call, from none on, as the brightest pixel says."""
+
+    def forward(self, images: Tensor) -> ts.types.Detections:
+        count, most = images.shape[0], int(images.max())
+        box = torch.tensor([10.0, 10.0, 40.0, 100.0]).expand(count, most, 4)
+        scores = torch.full((count, most), 0.9)
+        labels = torch.zeros(count, most, dtype=torch.int64)
+        return ts.types.Detections(box, scores, labels, scores > 0)
+
+
+def test_a_detector_may_pad_every_call_to_another_count() -> None:
+    stage = VideoToPose(AsManyAsThereAre(), StandingPose(), frames_per_batch=2).eval()
+    frames = torch.tensor([1, 1, 0, 0, 3, 3], dtype=torch.uint8).reshape(6, 1, 1, 1).expand(6, 3, 8, 8)
+    found = stage.detect(frames)
+    assert found.valid.sum(dim=1).tolist() == [1, 1, 0, 0, 3, 3]
+    assert found.boxes[..., 3].tolist() == [[100.0 * there for there in row] for row in found.valid.tolist()]
+    parts = [found, ts.types.Detections(*(field[:, :1] for field in found))]
+    assert_same(torch.jit.script(joined)(parts), joined(parts))
 
 
 class FlatPose(nn.Module):

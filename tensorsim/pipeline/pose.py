@@ -4,6 +4,7 @@ import copy
 from typing import Final
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.skeleton import coco_to_body, mid_hips
@@ -275,19 +276,13 @@ class VideoToPose(nn.Module):
 
     def detect(self, frames: Tensor) -> Detections:
         """Detect in frames (n, 3, H, W), ``frames_per_batch`` at a time."""
-        boxes: list[Tensor] = []
-        scores: list[Tensor] = []
-        labels: list[Tensor] = []
-        valid: list[Tensor] = []
+        parts: list[Detections] = []
         for start in range(0, frames.shape[0], self.frames_per_batch):
             found = self.detector(frames[start : start + self.frames_per_batch])
             if not torch.jit.is_scripting():
                 check_detections(found)
-            boxes.append(found.boxes)
-            scores.append(found.scores)
-            labels.append(found.labels)
-            valid.append(found.valid)
-        return Detections(torch.cat(boxes), torch.cat(scores), torch.cat(labels), torch.cat(valid))
+            parts.append(Detections(found.boxes, found.scores, found.labels, found.valid))
+        return joined(parts)
 
     def follow(self, detections: Detections, observed: Tensor) -> Tracks:
         """Track the detections (n, K) of the ``observed`` frames (B, T), n = observed.sum(), in row-major order."""
@@ -431,6 +426,22 @@ class VideoToPose(nn.Module):
             joints = self.hidden_legs(joints, reliable, there, fps)
         joints = limit_speed(joints, fps, self.top_speed_m_s)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
+
+
+def joined(parts: list[Detections]) -> Detections:
+    """Detections (n, K) of several calls of a detector, one after the other, padded to the largest K of them."""
+    most = max([part.valid.shape[1] for part in parts])
+    boxes: list[Tensor] = []
+    scores: list[Tensor] = []
+    labels: list[Tensor] = []
+    valid: list[Tensor] = []
+    for part in parts:
+        missing = most - part.valid.shape[1]
+        boxes.append(F.pad(part.boxes, [0, 0, 0, missing]))
+        scores.append(F.pad(part.scores, [0, missing]))
+        labels.append(F.pad(part.labels, [0, missing]))
+        valid.append(F.pad(part.valid, [0, missing]))
+    return Detections(torch.cat(boxes), torch.cat(scores), torch.cat(labels), torch.cat(valid))
 
 
 def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> TemporalLifter:
