@@ -142,6 +142,24 @@ def check_key_points(keypoints: Tensor, scores: Tensor, valid: Tensor, rank: int
     check_finite(scores, "scores")
 
 
+def check_images(images: Tensor) -> None:
+    """Refuse anything but images (B, 3, H, W), uint8 or floating point in [0, 1]."""
+    layout = "(B, 3, H, W)"
+    check_rank(images, 4, "images", layout)
+    check_size(images, 1, 3, "images", layout)
+    check_not_empty(images, "images")
+    if images.is_floating_point():
+        if not is_exporting():
+            low, high = images.detach().aminmax()
+            # Interpolation overshoots a little; images from 0 to 255 or normalised exceed this. NaN fails.
+            if not bool((low >= -0.5) & (high <= 1.5)):
+                raise TensorsimError(
+                    f"images: got values from {float(low)} to {float(high)}, expected RGB in [0, 1]"
+                )
+    elif images.dtype != torch.uint8:
+        raise TensorsimError(f"images: got dtype {images.dtype}, expected uint8 or floating point")
+
+
 def check_image_size(height: int, width: int) -> None:
     """Refuse a picture without pixels."""
     if height < 1 or width < 1:

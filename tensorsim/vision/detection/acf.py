@@ -9,7 +9,7 @@ import os
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_not_empty, check_rank, check_size
+from tensorsim.errors import TensorsimError, check_images
 from tensorsim.geometry.boxes import box_area, box_intersection
 from tensorsim.types import Detections
 from tensorsim.vision.detection.acf_features import CELL, CHANNELS, pyramid
@@ -81,7 +81,7 @@ class AcfDetector(nn.Module):
     pixels of the images. Not differentiable (trees).
 
     Raises:
-        TensorsimError: settings out of range; another shape or dtype, an empty batch, NaN.
+        TensorsimError: settings out of range; another shape or dtype, an empty batch, values far from [0, 1], NaN.
     """
 
     feature: Tensor
@@ -121,14 +121,7 @@ class AcfDetector(nn.Module):
 
     def forward(self, images: Tensor) -> Detections:
         """People in images."""
-        layout = "(B, 3, H, W)"
-        check_rank(images, 4, "images", layout)
-        check_size(images, 1, 3, "images", layout)
-        check_not_empty(images, "images")
-        if images.is_floating_point():
-            check_finite(images, "images")
-        elif images.dtype != torch.uint8:
-            raise TensorsimError(f"images: got dtype {images.dtype}, expected uint8 or floating point")
+        check_images(images)
         scaled = images.to(self.leaf.dtype) / (1.0 if images.is_floating_point() else 255.0)
         boxes = scaled.new_zeros(len(images), self.max_detections, 4)
         scores = scaled.new_zeros(len(images), self.max_detections)

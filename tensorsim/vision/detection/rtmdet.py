@@ -6,15 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import (
-    TensorsimError,
-    check_choice,
-    check_count,
-    check_not_empty,
-    check_rank,
-    check_size,
-    is_exporting,
-)
+from tensorsim.errors import TensorsimError, check_choice, check_count, check_images
 from tensorsim.geometry.boxes import (
     distances_to_boxes,
     letterbox,
@@ -155,20 +147,7 @@ class RTMDet(nn.Module):
     @torch.jit.export
     def preprocess(self, images: Tensor) -> Tensor:
         """Letterbox, normalise and reorder to BGR: (B, 3, H, W) -> (B, 3, input_size, input_size)."""
-        layout = "(B, 3, H, W)"
-        check_rank(images, 4, "images", layout)
-        check_size(images, 1, 3, "images", layout)
-        check_not_empty(images, "images")
-        if images.is_floating_point():
-            if not is_exporting():
-                low, high = images.detach().aminmax()
-                # Interpolation overshoots a little; images from 0 to 255 or normalised exceed this. NaN fails.
-                if not bool((low >= -0.5) & (high <= 1.5)):
-                    raise TensorsimError(
-                        f"images: got values from {float(low)} to {float(high)}, expected RGB in [0, 1]"
-                    )
-        elif images.dtype != torch.uint8:
-            raise TensorsimError(f"images: got dtype {images.dtype}, expected uint8 or floating point")
+        check_images(images)
         # Channels last, because the convolutions of the CPU run faster on it.
         x = self.normalise(letterbox(images, self.input_size))
         return x.contiguous(memory_format=torch.channels_last)

@@ -57,7 +57,11 @@ class TestAcfDetector(StageTester):
             ((torch.zeros(3, 160, 80),), r"expected \(B, 3, H, W\)"),
             ((torch.zeros(0, 3, 160, 80),), "got an empty tensor"),
             ((torch.zeros(1, 3, 160, 80, dtype=torch.int32),), "expected uint8 or floating point"),
-            ((torch.full((1, 3, 160, 80), float("nan")),), "NaN or infinite"),
+            ((torch.full((1, 3, 160, 80), float("nan")),), r"expected RGB in \[0, 1\]"),
+            (
+                (torch.full((1, 3, 160, 80), 255.0),),
+                r"values from 255\.0 to 255\.0, expected RGB in \[0, 1\]",
+            ),
         ]
 
 
