@@ -9,7 +9,8 @@ from typing import Any, Literal, get_args, get_type_hints
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.panel import PANEL
 from tensorsim.commands.simulate import Simulate
-from tensorsim.errors import TensorsimError
+from tensorsim.enhance.choice import DENOISERS
+from tensorsim.errors import TensorsimError, check_choice
 
 #: Options beside those of the panel, by group.
 _MORE = {
@@ -79,12 +80,14 @@ class Control:
         """The value of the option that was given; None where the control was left empty.
 
         Raises:
-            TensorsimError: numbers that are none.
+            TensorsimError: numbers that are none, or no choice.
         """
         if self.kind == "switch":
             return bool(given)
         if given is None or (isinstance(given, str) and not given.strip()):
             return None
+        if self.kind == "choice":
+            check_choice(given, tuple(filter(None, self.choices)), self.label)
         if self.kind not in _EXPECTED:
             return str(given).strip()
         try:
@@ -102,11 +105,27 @@ class Control:
             ) from None
 
 
+#: The command line takes files of weights as well; who opens the app may not read files of its machine.
+_DENOISER = Control(
+    "denoiser",
+    "PROCESSING",
+    "Denoiser",
+    "What cleans the shown maps; ksvd takes minutes. Default: none.",
+    "choice",
+    ("", *DENOISERS),
+    None,
+)
+
+
 def controls() -> list[Control]:
     """The controls in the order of their groups."""
     helps, hints = _field_docstrings(Simulate), get_type_hints(Simulate)
     defaults = {field.name: field.default for field in fields(Simulate)}
-    named = [(p.option, p.group, p.name + (f" ({p.unit})" if p.unit else "")) for p in PANEL]
+    named = [
+        (p.option, p.group, p.name + (f" ({p.unit})" if p.unit else ""))
+        for p in PANEL
+        if p.option != "denoiser"
+    ]
     for group, options in _MORE.items():
         named += [(option, group, option.replace("_", " ").capitalize()) for option in options]
     made = []
@@ -115,7 +134,7 @@ def controls() -> list[Control]:
         count = _count(hints[option])
         default = None if defaults[option] is MISSING else defaults[option]
         made.append(Control(option, group, label, helps[option], kind, choices, default, count))
-    return sorted(made, key=lambda control: GROUPS.index(control.group))
+    return sorted([*made, _DENOISER], key=lambda control: GROUPS.index(control.group))
 
 
 def options_of(values: dict[str, Any]) -> dict[str, Any]:

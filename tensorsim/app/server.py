@@ -10,12 +10,16 @@ from typing import Any
 from tensorsim.app.runs import Runs
 from tensorsim.errors import TensorsimError
 
+#: Hosts that only this machine reaches.
+LOCAL = ("127.0.0.1", "localhost")
+
 
 @contextmanager
-def application(largest_mb: float, longest_s: float) -> Iterator[Any]:
+def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]:
     """The ASGI application; its uploads and results are removed with it.
 
     Args:
+        host: address that it is opened at. Where that is this machine, requests under other names are refused.
         largest_mb: size of the largest upload in megabytes.
         longest_s: longest film in seconds.
 
@@ -29,6 +33,7 @@ def application(largest_mb: float, longest_s: float) -> Iterator[Any]:
         try:
             import gradio as gr
             from fastapi import FastAPI, HTTPException
+            from fastapi.middleware.trustedhost import TrustedHostMiddleware
             from fastapi.responses import FileResponse
         except ImportError as error:
             raise TensorsimError(
@@ -40,6 +45,9 @@ def application(largest_mb: float, longest_s: float) -> Iterator[Any]:
         root.mkdir()
         runs = Runs(root)
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+        if host in LOCAL:
+            # A page of the network whose name is led to this machine could read what the app answers.
+            server.add_middleware(TrustedHostMiddleware, allowed_hosts=LOCAL)
 
         @server.get("/runs/{token}/{name}")
         def result(token: str, name: str) -> FileResponse:
@@ -48,10 +56,13 @@ def application(largest_mb: float, longest_s: float) -> Iterator[Any]:
                 raise HTTPException(404)
             return FileResponse(path)
 
+        page = build(runs, longest_s)
+        # Else Gradio, when it is mounted, takes any path of this machine for a file that was uploaded.
+        page.has_launched = True
         theme = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["monospace"])
         yield gr.mount_gradio_app(
             server,
-            build(runs, longest_s),
+            page,
             path="/",
             server_name="127.0.0.1",
             max_file_size=round(largest_mb * 2**20),

@@ -31,7 +31,7 @@ class App:
                 raise TensorsimError(f"--{name}: got {value}, expected a positive number")
         from tensorsim.app.server import application
 
-        with application(self.largest_mb, self.longest_s) as app:
+        with application(self.host, self.largest_mb, self.longest_s) as app:
             import uvicorn
 
             print(f"tensorsim: http://{self.host}:{self.port}/ (Ctrl-C ends)", file=sys.stderr)

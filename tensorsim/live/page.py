@@ -57,7 +57,10 @@ def serving(port: int) -> Iterator[LivePage]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            if self.path == "/":
+            # A page of the network whose name is led to this machine could look through the camera.
+            if self.headers.get("Host", "").split(":")[0] not in ("127.0.0.1", "localhost"):
+                self.send_error(403)
+            elif self.path == "/":
                 self._answer("text/html; charset=utf-8", _PAGE)
             elif self.path == "/live.mjpg":
                 self._stream()

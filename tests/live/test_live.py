@@ -474,6 +474,9 @@ def test_the_page_streams_pictures_to_this_machine_only() -> None:
         assert b"/live.mjpg" in urllib.request.urlopen(f"{address}/", timeout=5).read()
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(f"{address}/../etc/passwd", timeout=5)
+        elsewhere = urllib.request.Request(address, headers={"Host": "elsewhere.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(elsewhere, timeout=5)
         threading.Timer(0.1, page.show, [np.full((20, 30, 3), 200, np.uint8)]).start()
         stream = urllib.request.urlopen(f"{address}/live.mjpg", timeout=5)
         assert stream.readline() == b"--frame\r\n"
