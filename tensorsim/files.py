@@ -8,7 +8,7 @@ import pickletools
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: The file that identifies the run that a results folder is from.
 SUMMARY = "summary.json"
+#: What a run has in its folder until it ends: a lock, and files that are not complete.
+LOCK, SCRATCH = ".tensorsim.lock", ".tensorsim.scratch"
 #: Entries of the memo of a pickle; Human3.6M and the largest published networks have some thousands.
 MAX_MEMO = 1_000_000
 
@@ -148,10 +150,10 @@ def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]
 
     Other files in ``out`` stay, except those that its ``summary.json`` lists under ``files``: they are from an earlier
     run. ``summary.json`` is removed first and written last, so that a folder that has one holds the files of one run,
-    even after a crash.
+    even after a crash. The scratch folder is in ``out``, and so on the same file system wherever that is.
 
     Args:
-        out: a folder, made if it is not there.
+        out: a folder, made if it is not there, and removed again if the block fails.
         source: what the files are made from.
 
     Raises:
@@ -161,7 +163,7 @@ def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]
     """
     with locked(out):
         _keep(source, out, _listed(out))
-        scratch = out.parent / f".{out.name}.scratch"
+        scratch = out / SCRATCH
         shutil.rmtree(scratch, ignore_errors=True)  # of a run that was killed; the lock is ours
         try:
             new, old = scratch / "new", scratch / "old"
@@ -194,8 +196,6 @@ def _exchange(out: Path, new: Path, old: Path) -> None:
     for name in names:
         if (out / name).is_dir():
             raise TensorsimError(f"{out / name}: got a folder, expected a file or nothing there")
-    made = not out.exists()
-    out.mkdir(exist_ok=True)
     moves = [
         (out / name, old / name)
         for name in (SUMMARY, *sorted({*names, *_listed(out)} - {SUMMARY}))
@@ -210,8 +210,6 @@ def _exchange(out: Path, new: Path, old: Path) -> None:
     except BaseException:
         for source, target in reversed(done):
             os.replace(target, source)
-        if made:
-            out.rmdir()
         raise
 
 
@@ -226,15 +224,31 @@ def _listed(out: Path) -> list[str]:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Lock a folder for this process, made or not; the lock is released when the process ends, also by a crash."""
+    """Lock a folder for this process; the lock is released when the process ends, also by a crash.
+
+    The folder is made if it is not there, and removed again if nothing came into it.
+    """
+    made = not out.exists()
     with writing(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
+    try:
+        with _only_one(out):
+            yield
+    finally:
+        if made:
+            with suppress(OSError):  # it is not empty
+                out.rmdir()
+
+
+@contextmanager
+def _only_one(out: Path) -> Iterator[None]:
+    """Hold the lock of a folder that is there."""
     try:
         import fcntl
     except ImportError:  # not on Windows
         yield
         return
-    path = out.parent / f".{out.name}.lock"
+    path = out / LOCK
     with writing(out):
         file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
     try:

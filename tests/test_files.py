@@ -1,5 +1,6 @@
 """Files and folders appear whole, with ordinary rights, or not at all."""
 
+import errno
 import json
 import math
 import os
@@ -135,10 +136,32 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
         scratch = folder.parent
         shutil.copytree(scratch, tmp_path / "copy")
     shutil.rmtree(out)
+    out.mkdir()
     (tmp_path / "copy").rename(scratch)
     write_run(out, "next", "a")
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     assert set(files_in(out)) == {"a", "summary.json"}
+
+
+def test_only_the_folder_itself_has_to_take_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be a link to another file system, or in a folder in which nothing can be made."""
+    elsewhere, out = tmp_path / "elsewhere", tmp_path / "out"
+    elsewhere.mkdir()
+    out.symlink_to(elsewhere)
+    replace = os.replace
+
+    def within_one_system(source: Path, target: Path) -> None:
+        if {elsewhere in Path(path).resolve().parents for path in (source, target)} != {True}:
+            raise OSError(errno.EXDEV, "Invalid cross-device link")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", within_one_system)
+    for name in ("first", "second"):
+        with complete_or_nothing(out) as folder:
+            assert {path.name for path in tmp_path.iterdir()} == {"elsewhere", "out"}
+            (folder / name).touch()
+            write_json(folder / "summary.json", {"files": [name, "summary.json"]})
+        assert set(files_in(elsewhere)) == {name, "summary.json"}
 
 
 def test_a_second_run_into_a_folder_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.files import NotWrittenError, locked, reading, write_json
+from tensorsim.files import LOCK, NotWrittenError, locked, reading, write_json
 
 #: The folder of finished shards' rows, in it the file that is written first: the recipe and the listing of the clips.
 ROWS, BEGUN = ".rows", "begun.json"
@@ -206,7 +206,7 @@ def _begun(out: Path, recipe: DatasetRecipe) -> str | None:
     """
     path = out / ROWS / BEGUN
     if not path.is_file():
-        if any(file.is_file() and file.suffix != ".tmp" for file in out.rglob("*")):
+        if any(file.is_file() and file.suffix != ".tmp" and file.name != LOCK for file in out.rglob("*")):
             raise TensorsimError(f"{out}: got a folder with other files, expected a new or an empty one")
         return None
     with reading(path, "the beginning of a data set"):
