@@ -31,6 +31,15 @@ def check_folder(path: Path, option: str = "--out") -> None:
         raise TensorsimError(f"{option}: {path} is a file, expected a folder")
 
 
+def check_name(path: Path, name: str) -> None:
+    """Refuse a path that is not UTF-8: OpenCV ends the process at it."""
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        shown = os.fspath(path).encode(errors="backslashreplace").decode()
+        raise TensorsimError(f"{name}: got {shown}, expected a name in UTF-8") from None
+
+
 class NotWrittenError(TensorsimError):
     """A file, or a folder of results, that could not be written: the disk is full, or the folder is not writable.
 

@@ -1,6 +1,7 @@
 """Pictures show the numbers: axes, units, colours, and people where they are."""
 
 import itertools
+import os
 from pathlib import Path
 
 import matplotlib.colors
@@ -171,6 +172,7 @@ def test_caption_names_film_radar_and_label() -> None:
     radar = ts.RadarConfig.free_space()
     line = plot.caption(radar, "S8 Walking", "films/clip.mp4")
     assert line == "clip.mp4 | 77 GHz, sweep 4 GHz, PRF 8192 Hz | S8 Walking"
+    assert plot.caption(radar, film=os.fsdecode(b"caf\xe9.npz")).startswith("caf?.npz | ")
     assert plot.caption(radar) == "77 GHz, sweep 4 GHz, PRF 8192 Hz"
 
 

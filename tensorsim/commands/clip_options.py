@@ -12,6 +12,7 @@ import tyro
 from tensorsim.array_files import array_formats
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import RadarOptions, warn_of_label
+from tensorsim.files import check_name
 
 if TYPE_CHECKING:
     import torch
@@ -56,6 +57,7 @@ class ClipOptions(RadarOptions):
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
         super().check(out)
+        check_name(out, "--out")
         array_formats(self.save)
 
     def _begun(self) -> "SimulationConfig":

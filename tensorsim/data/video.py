@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tensorsim.data.frame_times import FilmClock, nearest_frames, unevenness_s, usual_fps
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
+from tensorsim.files import check_name
 from tensorsim.limits import RANGES, check_range
 from tensorsim.threads import ahead
 
@@ -330,6 +331,7 @@ def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: i
 
 def _check_is_film(path: Path) -> None:
     """Refuse a path that is not a file, and a file that does not begin like a film."""
+    check_name(path, "path")
     if not path.exists():
         raise TensorsimError(f"{path}: no such file, expected a video")
     if not path.is_file():

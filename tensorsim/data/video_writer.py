@@ -11,7 +11,7 @@ import numpy as np
 
 from tensorsim.data.video import opening, properties, silent_log
 from tensorsim.errors import TensorsimError, check_positive
-from tensorsim.files import NotWrittenError, writing
+from tensorsim.files import NotWrittenError, check_name, writing
 
 
 class VideoWriter:
@@ -36,6 +36,7 @@ class VideoWriter:
     def __init__(self, path: str | os.PathLike[str], fps: float) -> None:
         check_positive(fps, "fps")
         self.path, self.fps, self.count = Path(path), fps, 0
+        check_name(self.path, "path")
         if not self.path.parent.is_dir():
             raise TensorsimError(
                 f"{self.path}: no such folder {self.path.parent}, expected one to write into"

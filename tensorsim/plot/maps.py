@@ -102,7 +102,8 @@ def person_peaks(simulator: RadarSimulator) -> dict[str, float]:
 
 def caption(radar: RadarConfig, label: str | None = None, film: str | os.PathLike[str] | None = None) -> str:
     """One line below the title of a picture: the film, the radar, and the label it was given, as far as known."""
-    parts = [] if film is None else [Path(film).name]
+    # Names need not be UTF-8; matplotlib draws nothing else.
+    parts = [] if film is None else [Path(film).name.encode(errors="replace").decode()]
     parts.append(
         f"{radar.carrier_hz / 1e9:.4g} GHz, sweep {radar.bandwidth_hz / 1e9:.3g} GHz, PRF {radar.prf_hz:.5g} Hz"
     )

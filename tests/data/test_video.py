@@ -240,6 +240,25 @@ def test_a_single_picture_is_no_film(name: str, tmp_path: Path) -> None:
         VideoReader(tmp_path / name)
 
 
+def test_refuses_names_that_are_not_utf_8(clip: Path) -> None:
+    """In a process of its own, which OpenCV would end."""
+    code = """
+import os, shutil, sys
+from tensorsim.data.video import VideoReader
+from tensorsim.data.video_writer import VideoWriter
+from tensorsim.errors import TensorsimError
+name = os.fsdecode(os.fsencode(sys.argv[1]) + b"\\xe9.mp4")
+shutil.copy(sys.argv[1], name)
+for opened in (lambda: VideoReader(name), lambda: VideoWriter(name, 24.0)):
+    try:
+        opened()
+    except TensorsimError as error:
+        print(ascii(str(error)))
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(clip)], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [f"'path: got {clip}\\\\udce9.mp4, expected a name in UTF-8'"] * 2
+
+
 def test_refuses_what_is_no_film(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no such file"):
         VideoReader(tmp_path / "missing.mp4")
