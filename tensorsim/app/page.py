@@ -3,6 +3,7 @@
 import html
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import gradio as gr
 
 from tensorsim.app.form import GROUPS, Control, controls, for_demo, options_of
 from tensorsim.app.runs import ARCHIVE, Run, Runs
-from tensorsim.commands.demo import Demo
+from tensorsim.commands.demo import LONGEST_S, Demo
 from tensorsim.commands.simulate import Simulate
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
@@ -38,7 +39,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
 
     Args:
         runs: where simulations run.
-        longest_s: longest film in seconds.
+        longest_s: of films, motion capture and key points in seconds.
     """
     # Long, for it declares the page from top to bottom, in the order in which it is read.
     made = controls()
@@ -53,7 +54,10 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                     _activities(), value="walking", label="Or an activity of a generated person"
                 )
                 duration = gr.Number(
-                    4.0, label="Length of the generated film (s)", minimum=0.5, maximum=longest_s
+                    4.0,
+                    label="Length of the generated film (s)",
+                    minimum=0.5,
+                    maximum=min(longest_s, LONGEST_S),
                 )
                 scene = gr.Radio(_SCENES, value="free-space", label="Scene")
                 radar = gr.Dropdown(["", *PRESETS], value="", label="Radar preset")
@@ -169,8 +173,10 @@ def _command(
         given |= {"out": folder, "quiet": True, "save": "mat"}
         given["multipath"] = {"on": True, "off": False}.get(given.get("multipath", ""))
         if film is None:
-            return Demo(activity=activity, duration=_length(duration, longest_s), **for_demo(given))
-        _check_length(Path(film), longest_s, given)
+            return Demo(
+                activity=activity, duration=_length(duration, min(longest_s, LONGEST_S)), **for_demo(given)
+            )
+        check_length(Path(film), longest_s, given)
         return Simulate(source=Path(film), **given)
 
     return command
@@ -189,22 +195,47 @@ def _length(given: str, longest_s: float) -> float:
     return seconds
 
 
-def _check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
-    """Refuse a film that would take too long, unless a part of it is chosen."""
-    from tensorsim.data.video import VideoReader
-    from tensorsim.sources import kind_of
-
-    if kind_of(film) != "video":
-        return
-    reader = VideoReader(film, fps=given.get("fps"), start_s=given.get("start"), end_s=given.get("end"))
-    seconds, end_s = reader.duration_s, given.get("end")
-    if seconds is None and end_s is not None and end_s - (given.get("start") or 0.0) <= longest_s:
-        return
+def check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
+    """Refuse what would take too long, unless a part of it is chosen."""
+    seconds, fps = _part(film, given)
+    if seconds is not None and given.get("fps") is not None:
+        # Frames take their time: a higher rate than their own makes them no fewer.
+        with suppress(TensorsimError):  # the file states no rate
+            own_fps = _part(film, {"clip": given.get("clip")})[1]
+            seconds *= max(1.0, fps / own_fps)
     if seconds is None or seconds > longest_s:
         length = "an unknown length" if seconds is None else f"{seconds:.1f} s"
         raise TensorsimError(
             f"{film.name}: got {length}, expected at most {longest_s:g} s; set Start and End in the group Camera"
         )
+
+
+def _part(film: Path, given: dict[str, Any]) -> tuple[float | None, float]:
+    """Seconds of the part of a file that is chosen, None if unknown, and its frames per second."""
+    from tensorsim.data.blazepose import load_keypoints
+    from tensorsim.data.motion_files import load_motion
+    from tensorsim.data.video import VideoReader
+    from tensorsim.sources import Cut, kind_of
+
+    kind, fps, cut = kind_of(film), given.get("fps"), Cut(given.get("start"), given.get("end"))
+    if kind == "video":
+        reader = VideoReader(film, fps=fps, start_s=cut.start_s, end_s=cut.end_s)
+        seconds = reader.duration_s
+        if seconds is None and cut.end_s is not None:
+            seconds = cut.end_s - (cut.start_s or 0.0)
+        return seconds, reader.fps
+    if kind == "motion":
+        motion = load_motion(film, given.get("clip"), fps)
+        count, fps = motion.valid.shape[1], motion.fps
+    elif fps is None:
+        raise TensorsimError(
+            f"{film.name}: got key points without a frame rate, expected Fps in the group Camera"
+        )
+    else:
+        size = given.get("image_size")
+        count = load_keypoints(film, None if size is None else size[::-1]).valid.shape[0]
+    kept = cut.frames(count, fps, film)
+    return (kept.stop - kept.start) / fps, fps
 
 
 def _followed(run: Run) -> Iterator[dict[str, Any]]:

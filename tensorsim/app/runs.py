@@ -7,8 +7,8 @@ import sys
 import traceback
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
@@ -90,7 +90,7 @@ class Runs:
 
     def _work(self, run: Run, command_for: Callable[[Path], Any]) -> None:
         try:
-            with self.one_at_a_time, watched(run):
+            with self._turn_of(run), watched(run):
                 run.advanced("starting", 0, None)
                 command_for(run.folder).run()
                 _add_configuration(run.folder)
@@ -102,6 +102,16 @@ class Runs:
             run.error = f"the simulation failed ({type(error).__name__}); the terminal has the details"
         finally:
             run.finished.set()
+
+    @contextmanager
+    def _turn_of(self, run: Run) -> Iterator[None]:
+        """Wait for the run before this one, unless this one is cancelled."""
+        while not self.one_at_a_time.acquire(timeout=0.2):
+            run.advanced("waiting", 0, None)
+        try:
+            yield
+        finally:
+            self.one_at_a_time.release()
 
     def _without_paths(self, message: str) -> str:
         """A message that names files, but not the temporary folders that they are in."""

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from tensorsim.types import Pose, RadarMaps
 
 FILM_FPS = 30.0
+#: Longest film in seconds.
+LONGEST_S = 60.0
 #: The true motion is worked out this many times per frame of the film.
 MOMENTS_PER_FRAME = 8
 HEIGHT, WIDTH = 360, 640
@@ -58,8 +60,10 @@ class Demo(NetworkOptions, ClipOptions):
 
         self.check(self.out)
         activity = activity_index(self.activity)
-        if not 0.5 <= self.duration <= 60:
-            raise TensorsimError(f"--duration: got {self.duration}, expected seconds from 0.5 to 60")
+        if not 0.5 <= self.duration <= LONGEST_S:
+            raise TensorsimError(
+                f"--duration: got {self.duration}, expected seconds from 0.5 to {LONGEST_S:g}"
+            )
         detector, pose_network = default_networks(self.detector, self.pose)
         config = self._film_configuration(detector, pose_network)
 

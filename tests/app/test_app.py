@@ -96,6 +96,35 @@ def test_values_of_controls_become_options() -> None:
         for_demo({"initial_distance": (4.0,)})
 
 
+def test_what_takes_too_long_is_refused_whatever_its_kind(tmp_path: Path) -> None:
+    pytest.importorskip("gradio")
+    from tensorsim.app.page import _command, check_length
+
+    film, motion, keypoints = (tmp_path / name for name in ("film.mp4", "motion.npz", "people.json"))
+    write_video(film, [np.zeros((48, 64, 3), np.uint8)] * 60, 10.0)
+    joints = np.random.default_rng(0).random((60, 14, 3)) + np.array([0, 3, 0])
+    np.savez(motion, joints_m=joints, fps=10.0)
+    person = {"category_id": 1, "score": 1.0, "keypoints": [20.0, 30.0, 1.0] * 17}
+    keypoints.write_text(json.dumps([person | {"image_id": number} for number in range(60)]))
+    own: dict[str, Any] = {}
+    for path in (film, motion):
+        for given in (own, {"fps": 1000.0}, {"fps": 5.0, "end": 6.0}, {"start": 0.5}):
+            with pytest.raises(TensorsimError, match=f"{path.name}: got .* s, expected at most 5 s"):
+                check_length(path, 5.0, given)
+        check_length(path, 5.0, {"end": 4.0})
+        check_length(path, 6.0, {"fps": 20.0})
+    with pytest.raises(TensorsimError, match=r"people.json: got 6.0 s, expected at most 5 s"):
+        check_length(keypoints, 5.0, {"fps": 10.0})
+    check_length(keypoints, 5.0, {"fps": 20.0})
+    with pytest.raises(
+        TensorsimError, match=r"people\.json: got key points without a frame rate, expected Fps"
+    ):
+        check_length(keypoints, 5.0, {})
+    settings = {"scene": "free-space", "radar": None, "paper": False}
+    with pytest.raises(TensorsimError, match=r"got 100 s, expected 0\.5 to 60 s"):
+        _command(None, "walking", "100", settings, 120.0)(tmp_path)
+
+
 class Work:
     """Stands in for a command: counts, draws and writes."""
 
@@ -145,6 +174,19 @@ def test_a_run_can_be_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
     assert ended(run).error == "cancelled"
     assert run.done < 10_000
     assert run.files() == []
+
+
+def test_a_run_that_waits_can_be_cancelled(tmp_path: Path) -> None:
+    runs = Runs(tmp_path)
+    first = runs.start(lambda folder: Work(folder, steps=10_000))
+    while first.done < 2:
+        time.sleep(0.005)
+    second = runs.start(Work)
+    runs.cancel(second.token)
+    assert ended(second).error == "cancelled"
+    assert not first.finished.is_set()
+    runs.cancel(first.token)
+    ended(first)
 
 
 def test_failures_are_one_sentence_without_folders(
