@@ -1,5 +1,6 @@
 """``tensorsim app``: the simulation in a browser."""
 
+import socket
 import sys
 from dataclasses import dataclass
 
@@ -31,11 +32,24 @@ class App:
                 raise TensorsimError(f"--{name}: got {value}, expected a positive number")
         from tensorsim.app.server import application
 
-        with application(self.host, self.largest_mb, self.longest_s) as app:
+        with (
+            _listening(self.host, self.port) as bound,
+            application(self.host, self.largest_mb, self.longest_s) as app,
+        ):
             import uvicorn
 
             print(f"tensorsim: http://{self.host}:{self.port}/ (Ctrl-C ends)", file=sys.stderr)
-            server = uvicorn.Server(uvicorn.Config(app, self.host, self.port, log_level="warning"))
-            server.run()
-            if not server.started:
-                raise TensorsimError(f"--port: {self.port} cannot be used, expected a free one")
+            uvicorn.Server(uvicorn.Config(app, log_level="warning")).run([bound])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """A socket at this address; Uvicorn, left to open it, would end the process."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        reason = (error.strerror or str(error)).split(" (")[0]  # without the address again
+        raise TensorsimError(
+            f"--host, --port: {host}, {port} cannot be used ({reason}), expected an address of this machine "
+            "and a free port"
+        ) from None

@@ -21,6 +21,7 @@ from scipy.io import loadmat
 
 from tensorsim.app.form import GROUPS, controls, for_demo, options_of
 from tensorsim.app.runs import KEPT, Run, Runs
+from tensorsim.commands.app import App
 from tensorsim.commands.panel import PANEL
 from tensorsim.commands.simulate import Simulate
 from tensorsim.data.video_writer import write_video
@@ -207,6 +208,21 @@ def test_old_runs_are_removed(tmp_path: Path) -> None:
     made = [ended(runs.start(Work)) for _ in range(KEPT + 2)]
     assert len(runs.known) == KEPT
     assert [run.folder.is_dir() for run in made[:3]] == [False, False, True]
+
+
+def test_an_address_that_cannot_be_used_is_said_before_anything_is_loaded(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(
+            TensorsimError,
+            match=rf"--host, --port: 127.0.0.1, {port} cannot be used \(Address already in use\)",
+        ):
+            App(port=port).run()
+    with pytest.raises(TensorsimError, match=r"--host, --port: no.such.host, 7860 cannot be used \("):
+        App(host="no.such.host").run()
+    assert capsys.readouterr().err == ""
 
 
 @pytest.fixture
