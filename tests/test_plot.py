@@ -215,7 +215,7 @@ def test_tick_labels_do_not_overlap() -> None:
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
-@pytest.mark.parametrize("last_m", [7.0, 12.0, 28.0])
+@pytest.mark.parametrize("last_m", [7.0, 12.0, 28.0, 200.0])
 def test_labels_of_the_skeletons_have_room(last_m: float) -> None:
     joints = np.zeros((1, 20, 14, 3))
     joints[0] = np.linspace([-1.0, 3.0, 1.0], [1.0, last_m, 1.0], 20)[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,7 +76,8 @@ def skeleton_figure(
     axes.set_box_aspect(high - low)
     # All axes have one scale: the longest says how far apart labels have to be.
     longest = (high - low).max()
-    least = next(step for step in (0.5, 1.0, 2.0, 5.0, np.inf) if step >= longest / 16)
+    steps = (step * 10**power for power in count() for step in (0.5, 1.0, 2.0))
+    least = next(step for step in steps if step >= longest / 16)
     for scale, label, spacing in (
         (axes.xaxis, "x", 0.5 if high[0] - low[0] < 4.0 else 1.0),
         (axes.yaxis, "y (range)", 1.0),
