@@ -101,11 +101,14 @@ class Pictures:
     subtitle: str | None = None
     peaks: dict[str, float] | None = None
 
+    def peak(self, name: str) -> float | None:
+        """The magnitude of 0 dB of this map; None: its own peak."""
+        return None if self.peaks is None else self.peaks[name]
+
     def options(self, name: str) -> dict[str, Any]:
         """Arguments of :func:`tensorsim.plot.map_figure` for this map."""
-        peak = None if self.peaks is None else self.peaks[name]
         note = None if self.peaks is None else "no person in the scene"
-        return {"style": self.style, "subtitle": self.subtitle, "peak": peak, "note": note}
+        return {"style": self.style, "subtitle": self.subtitle, "peak": self.peak(name), "note": note}
 
 
 def draw_maps(

@@ -12,6 +12,7 @@ from tensorsim.plot.maps import (
     confusion_figure,
     decibels,
     doppler_span,
+    drawn_ridges,
     map_figure,
     person_peaks,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "draw_floor",
     "draw_lines",
     "draw_people",
+    "drawn_ridges",
     "floor_lines",
     "map_figure",
     "person_peaks",

@@ -183,8 +183,8 @@ def map_figure(
             extent=extent,
         )
         if lines is not None and style.ridges:
-            shown = decibels(levels, style.dynamic_range_db, peak) > -style.dynamic_range_db
-            _draw_ridges(axes, time_s, clear_ridges(lines, axis, shown, _LEAST_HEIGHT * (high - low)))
+            drawn = drawn_ridges(lines, axis, levels, high - low, style.dynamic_range_db, peak)
+            _draw_ridges(axes, time_s, drawn)
         if note is not None:
             _write_note(axes, note)
         axes.set_ylim(low, high)
@@ -236,6 +236,26 @@ def _add_speed_axis(axes: Axes, speed_per_axis: float) -> None:
     low, high = axes.get_ylim()
     right.set_ylim(low * speed_per_axis, high * speed_per_axis)
     right.set_ylabel("radial speed in m/s")
+
+
+def drawn_ridges(
+    ridges: np.ndarray,
+    axis: np.ndarray,
+    magnitude: np.ndarray,
+    height: float,
+    dynamic_range_db: float,
+    peak: float | None = None,
+) -> np.ndarray:
+    """Ridges without the points that would cover the map (F, K) in a picture of it.
+
+    Args:
+        ridges, axis: see :func:`clear_ridges`.
+        magnitude: of the map.
+        height: of the part of the axis that is in the picture.
+        dynamic_range_db, peak: of its colours, see :func:`decibels`.
+    """
+    shown = decibels(magnitude, dynamic_range_db, peak) > -dynamic_range_db
+    return clear_ridges(ridges, axis, shown, _LEAST_HEIGHT * height)
 
 
 def clear_ridges(ridges: np.ndarray, axis: np.ndarray, shown: np.ndarray, least_height: float) -> np.ndarray:

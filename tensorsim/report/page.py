@@ -19,7 +19,7 @@ from tensorsim.types import Pose, RadarMaps
 if TYPE_CHECKING:
     from tensorsim.results import Axes, Pictures
 
-#: Maps are stored with this many dB below the peak; the page can show fewer.
+#: Maps are stored with this many dB below the peak, or as many as are to be shown; the page can show fewer.
 STORED_DB = 80.0
 _MOST_COLUMNS, _MOST_ROWS = 1200, 400
 _COLOURMAPS = ("turbo", "viridis", "jet", "parula", "gray")
@@ -132,10 +132,17 @@ def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = 
     """The Doppler-time map with its ridges, and both range-time maps."""
     from tensorsim.results import strong_ridges
 
-    span = plot.doppler_span(maps.doppler_time.numpy(), axes.doppler_hz)
+    magnitude, range_db = maps.doppler_time.numpy(), pictures.style.dynamic_range_db
+    span = plot.doppler_span(magnitude, axes.doppler_hz, range_db)
     rows = np.abs(axes.doppler_hz) <= span
-    shown = plot.decibels(maps.doppler_time.numpy(), plot.DYNAMIC_RANGE_DB) > -plot.DYNAMIC_RANGE_DB
-    ridges = plot.clear_ridges(strong_ridges(maps, axes), axes.doppler_hz, shown, 0.06 * span)
+    ridges = plot.drawn_ridges(
+        strong_ridges(maps, axes),
+        axes.doppler_hz,
+        magnitude,
+        axes.doppler_hz[rows].size * float(np.diff(axes.doppler_hz).mean()),
+        range_db,
+        pictures.peak("doppler_time"),
+    )
     step_s = float(np.diff(axes.time_s).mean()) if len(axes.time_s) > 1 else 0.1
     doppler = {
         **_content("doppler_time", maps, axes.doppler_hz, rows, pictures),
@@ -170,20 +177,21 @@ def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = 
 def _content(
     name: str, maps: RadarMaps, axis: np.ndarray, rows: np.ndarray, pictures: "Pictures"
 ) -> dict[str, Any]:
-    """A map as a grey PNG, top row first: 255 is the peak, 0 is :data:`STORED_DB` below it."""
+    """A map as a grey PNG, top row first: 255 is the peak, 0 is what is stored below it."""
     import cv2
 
     magnitude = getattr(maps, name).numpy()[rows]
-    peak = None if pictures.peaks is None else pictures.peaks[name]
+    peak = pictures.peak(name)
     peak = float(magnitude.max(initial=0.0)) if peak is None else peak
-    level = plot.decibels(_fewer(_fewer(magnitude, _MOST_COLUMNS).T, _MOST_ROWS).T, STORED_DB, peak)
-    grey = ((np.minimum(level, 0.0) / STORED_DB + 1) * 255).round().astype(np.uint8)
+    stored_db = max(STORED_DB, pictures.style.dynamic_range_db)
+    level = plot.decibels(_fewer(_fewer(magnitude, _MOST_COLUMNS).T, _MOST_ROWS).T, stored_db, peak)
+    grey = ((np.minimum(level, 0.0) / stored_db + 1) * 255).round().astype(np.uint8)
     data = bytes(cv2.imencode(".png", grey[::-1])[1])
     step = float(axis[1] - axis[0])
     return {
         "name": name,
         "png": base64.b64encode(data).decode(),
-        "stored_db": STORED_DB,
+        "stored_db": stored_db,
         "low": float(axis[rows][0]) - step / 2,
         "high": float(axis[rows][-1]) + step / 2,
         "reference": "the peak" if pictures.peaks is None else "the echo of a person",

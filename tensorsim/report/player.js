@@ -119,7 +119,8 @@ async function start() {
 
   for (const name of Object.keys(content.colourmaps)) element("colours").add(new Option(name, name));
   element("colours").value = content.style.colormap;
-  element("range").value = content.style.dynamic_range_db;
+  const range = content.style.dynamic_range_db;
+  Object.assign(element("range"), { min: Math.min(10, range), max: content.maps[0].stored_db, value: range });
   element("ridges").checked = content.style.ridges;
   element("time").max = content.duration_s;
 

@@ -12,11 +12,11 @@ import torch
 
 import tensorsim as ts
 from tensorsim.data.video import VideoReader
-from tensorsim.plot import RIDGE_COLOURS, decibels
+from tensorsim.plot import RIDGE_COLOURS, MapStyle, decibels
 from tensorsim.report import FilmStrip, write_report
 from tensorsim.report import film as film_module
-from tensorsim.report.page import STORED_DB, timeline_content
-from tensorsim.results import Axes, Pictures, axes_of
+from tensorsim.report.page import STORED_DB, map_contents, timeline_content
+from tensorsim.results import Axes, Pictures, axes_of, doppler_figure
 from tensorsim.summary import people_of
 from tensorsim.types import Pose, RadarMaps
 from tests.browser import chromium
@@ -61,10 +61,14 @@ def strip(folder: Path, frames: int = FRAMES) -> FilmStrip:
 
 
 def written(
-    folder: Path, run: tuple[Pose, RadarMaps, Axes, dict[str, Any]], film: FilmStrip
+    folder: Path,
+    run: tuple[Pose, RadarMaps, Axes, dict[str, Any]],
+    film: FilmStrip,
+    range_db: float = 50.0,
 ) -> dict[str, Any]:
     pose, maps, axes, summary = run
-    write_report(folder, summary, pose, FPS, maps, axes, film, Pictures(subtitle="a walk"))
+    pictures = Pictures(MapStyle(dynamic_range_db=range_db), subtitle="a walk")
+    write_report(folder, summary, pose, FPS, maps, axes, film, pictures)
     page = (folder / "report.html").read_text(encoding="utf-8")
     content: dict[str, Any] = json.loads(page.split('id="content">')[1].split("</script>")[0])
     return content
@@ -95,6 +99,31 @@ def test_content_equals_the_run(tmp_path: Path, run: tuple[Pose, RadarMaps, Axes
     assert content["ridge_colours"] == list(RIDGE_COLOURS), "those of the pictures"
     assert content["scene"]["wall"]["size_m"] == [5.0, 0.24, 2.5]
     assert content["summary"]["warnings"] == summary["warnings"]
+
+
+def test_all_that_the_pictures_show_is_stored(
+    tmp_path: Path, run: tuple[Pose, RadarMaps, Axes, dict[str, Any]]
+) -> None:
+    still = written(tmp_path, run, strip(tmp_path), 120.0)["maps"][2]
+    assert still["stored_db"] == 120.0
+    shown = picture(still["png"])[::-1] / 255 * 120 - 120
+    assert np.abs(shown - decibels(run[1].range_time.numpy(), 120.0)).max() < 0.5 * 120 / 255 + 1e-4
+
+
+def test_ridges_are_those_of_the_picture(run: tuple[Pose, RadarMaps, Axes, dict[str, Any]]) -> None:
+    """In an empty scene, whose maps refer to the echo of a person, there are none."""
+    _, maps, axes, _ = run
+    for times, some in ((1.0, True), (1e4, False)):
+        peaks = {
+            "doppler_time": times * float(maps.doppler_time.max()),
+            "range_time": 1.0,
+            "range_time_mti": 1.0,
+        }
+        pictures = Pictures(peaks=peaks)
+        picture = [line.get_ydata() for line in doppler_figure(maps, axes, pictures).axes[0].lines]
+        ridges = np.array(map_contents(maps, axes, pictures)[0]["ridges"], dtype=float)
+        assert np.allclose(ridges, picture, atol=0.1, equal_nan=True)
+        assert np.isfinite(ridges).any() == some
 
 
 def test_windows_that_overlap_become_stretches_that_do_not() -> None:
@@ -138,7 +167,7 @@ def test_a_browser_plays_it(
 ) -> None:
     if beside:
         monkeypatch.setattr(film_module, "MOST_FRAMES", 10)
-    written(tmp_path, run, strip(tmp_path))
+    written(tmp_path, run, strip(tmp_path), 120.0)
     with chromium() as browser:
         page = browser.new_page(viewport={"width": 420, "height": 900})
         errors: list[str] = []
@@ -152,6 +181,7 @@ def test_a_browser_plays_it(
         assert page.inner_text("#warnings li").startswith("</script>")
         assert page.evaluate("document.documentElement.scrollWidth") <= 420, "wider than a telephone"
 
+        assert page.input_value("#range") == "120"
         assert page.evaluate(FAR_RADAR) == [[-1, 0, 0], [5.2, 2, 2.5]], "the radar is in view"
         dark = page.evaluate("document.querySelector('#maps canvas').toDataURL()")
         page.select_option("#colours", "gray")
