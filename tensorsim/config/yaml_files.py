@@ -23,5 +23,6 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise TensorsimError(f"{path}: not valid YAML or JSON: {error}") from None
     if not isinstance(document, dict):
-        raise TensorsimError(f"{path}: got {document!r}, expected keys with values")
+        kind = "nothing" if document is None else type(document).__name__
+        raise TensorsimError(f"{path}: got {kind}, expected keys with values")
     return dict(document)
