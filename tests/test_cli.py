@@ -160,6 +160,33 @@ def test_the_camera_is_estimated_unless_it_is_known(walk: Path, tmp_path: Path, 
         assert config.pose.calibrate is False
 
 
+def _pose_of(*options: str) -> ts.config.PoseConfig:
+    """How people are found with these options of ``simulate``."""
+    return cli.parse(["simulate", "clip.mp4", "--out", "out", *options]).configuration().pose
+
+
+def test_options_that_tell_the_camera_count_beside_a_configuration(tmp_path: Path) -> None:
+    film, told, focal = (str(tmp_path / name) for name in ("film.yaml", "told.yaml", "focal.yaml"))
+    ts.SimulationConfig().replace(pose__calibrate=True).to_yaml(Path(film))
+    ts.SimulationConfig().replace(pose__initial_distance_m=(3.0,)).to_yaml(Path(told))
+    ts.SimulationConfig().replace(pose__camera__focal_px=500.0).to_yaml(Path(focal))
+    assert _pose_of("--config", film).calibrate
+    for options in (["--camera-fov", "40"], ["--initial-distance", "6"], ["--position", "paper"]):
+        assert not _pose_of("--config", film, *options).calibrate
+    for file in (told, focal):
+        pose = _pose_of("--config", file, "--camera-fov", "40")
+        assert (pose.initial_distance_m, pose.camera.focal_px) == (None, None), "these would overrule it"
+        assert pose.camera.horizontal_fov_rad == pytest.approx(math.radians(40))
+
+
+def test_the_distances_of_the_panel_calibrate_no_camera() -> None:
+    assert _pose_of("--paper").initial_distance_m == (4.0, 0.5)
+    pose = _pose_of("--paper", "--position", "camera")
+    assert (pose.initial_distance_m, pose.calibrate) == (None, True)
+    pose = _pose_of("--paper", "--position", "camera", "--initial-distance", "3")
+    assert (pose.initial_distance_m, pose.calibrate) == ((3.0,), False)
+
+
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A film of one person who walks away and one who comes."""

@@ -159,22 +159,30 @@ class Simulate(NetworkOptions, ClipOptions):
 
     def configuration(self) -> "SimulationConfig":
         """The configuration with the options that say how people are found."""
+        from tensorsim.config.people import PANEL_DISTANCES_M
+
         config = super().configuration()
         camera_fov = None if self.camera_fov is None else math.radians(self.camera_fov)
+        if (self.position or config.pose.position) == "camera":
+            # Nobody measured the panel's distances, from which the paper's positions start.
+            starts = config.pose.position == "paper" and config.pose.initial_distance_m == PANEL_DISTANCES_M
+            if camera_fov is not None or starts:  # known distances would calibrate the focal length
+                config = config.replace(pose__initial_distance_m=None)
+        if camera_fov is not None:
+            config = config.replace(pose__camera__focal_px=None, pose__camera__horizontal_fov_rad=camera_fov)
         for field, value in (
             ("pose__person_height_m", self.person_height),
             ("pose__initial_distance_m", self.initial_distance),
-            ("pose__camera__horizontal_fov_rad", camera_fov),
             ("pose__position", self.position),
             ("pose__lifter", self.lifter if self.library is None or self.lifter is not None else "nearest"),
             ("pose__library", None if self.library is None else str(self.library)),
         ):
             if value is not None:
                 config = config.replace(**{field: value})
-        known = self.camera_fov is not None or self.initial_distance is not None or self.config is not None
-        if not self.calibrate:
+        told = camera_fov is not None or self.initial_distance is not None
+        if told or config.pose.position == "paper" or not self.calibrate:
             config = config.replace(pose__calibrate=False)
-        elif not known and config.pose.position == "camera":
+        elif self.config is None:
             config = config.replace(pose__calibrate=True)
         return config if self.flip_test else config.replace(pose__flip_test=False)
 
