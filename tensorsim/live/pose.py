@@ -113,6 +113,12 @@ class CausalPose(nn.Module):
             there: (P,) bool, the people with key points; the others are predicted.
             height, width: of the picture.
         """
+        if not bool(there.any()):
+            # Lifting and placing take longer than a frame lasts, and nothing of it would count.
+            size = self._predicted(state.size, self.size_density)
+            lows = torch.cat([state.lows[:, 1:], torch.full_like(state.lows[:, :1], torch.nan)], dim=-1)
+            seen = torch.zeros_like(state.hidden, dtype=torch.bool)
+            return self._after(state, state.shown, seen, there, there, scores, size, lows)
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
         reliable = (body_scores >= self.keypoint_threshold) & there[:, None]
         body_scores = body_scores * reliable
@@ -209,11 +215,15 @@ class CausalPose(nn.Module):
         first: Tensor,
     ) -> KalmanState:
         """Prediction by a frame and update; where ``first``, the filter begins with this measurement."""
-        q = torch.full([1], density, dtype=torch.float64)
-        predicted = constant_velocity_predict(state, q, 1 / self.fps)
+        predicted = self._predicted(state, density)
         begun = _unknown(measured.double(), noise, speed)
         prior = KalmanState(*(torch.where(first, a, b) for a, b in zip(begun, predicted, strict=True)))
         return kalman_update(prior, measured.double(), noise, valid.double())
+
+    def _predicted(self, state: KalmanState, density: float) -> KalmanState:
+        """The state a frame later."""
+        q = torch.full([1], density, dtype=torch.float64)
+        return constant_velocity_predict(state, q, 1 / self.fps)
 
 
 def _unknown(place: Tensor, noise: float | Tensor, speed: float) -> KalmanState:

@@ -181,6 +181,31 @@ def test_who_was_hidden_is_placed_anew() -> None:
     assert torch.allclose(again, anew, atol=0.01)
 
 
+def test_nobody_is_lifted_in_a_frame_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes longer than a frame lasts; the state is that of lifting key points that nobody believes."""
+    stage = simulator().poses[0]
+    states = [stage.begin(2)]
+    for t in range(12):
+        keypoints = torch.tensor(STANDING) * 120.0 + torch.tensor([[[140.0 + t, 30.0]], [[200.0 - t, 30.0]]])
+        scores, there = torch.full((2, 17), 0.9), torch.tensor([True, True])
+        states.append(stage(states[-1], keypoints, scores, INSIDE.expand(2, 4), there, 240, 320))
+    blank = torch.zeros(2, 17, 2), torch.zeros(2, 17), INSIDE.expand(2, 4)
+
+    def missed(first: bool) -> list[Tensor]:
+        """The fields of the states after frames in which the second person, and maybe the first, is missing."""
+        state, fields = states[-1], []
+        for _ in range(6):
+            state = stage(state, *blank, torch.tensor([first, False]), 240, 320)
+            fields += [*state.size, *state.joints, *state[2:]]
+        return [field[1] for field in fields]
+
+    lifted = missed(True)
+    monkeypatch.setattr(stage, "lifter", None)
+    monkeypatch.setattr(stage, "metric_pose", None)
+    for ours, theirs in zip(missed(False), lifted, strict=True):
+        assert torch.equal(ours.nan_to_num(-1.0), theirs.nan_to_num(-1.0))
+
+
 def test_poses_are_those_of_the_causal_stages_on_the_whole_film() -> None:
     """The same stages, each on all frames at once: lifter, forward filter of the size, metric pose, floor, filter."""
     stage = simulator().poses[0]
