@@ -16,6 +16,8 @@ from tensorsim.errors import TensorsimError, check_positive
 
 #: Frames that wait for the consumer; older ones are dropped.
 WAITING = 2
+#: Frames by which a camera may be ahead of its rate, as frames that were late come at once.
+AHEAD = 2
 _STREAMS = ("rtsp://", "rtsps://", "rtmp://", "http://", "https://", "udp://", "tcp://")
 
 
@@ -50,7 +52,7 @@ class Camera:
 
     Attributes:
         fps: frames per second.
-        dropped: frames that are missing before the last one that was given.
+        dropped: frames that came before the last one that was given, and were not given.
 
     Raises:
         TensorsimError: a source that cannot be opened, or ``every_frame`` of one that does not wait.
@@ -122,7 +124,7 @@ class Camera:
         """Put frames with their numbers into the queue as they come; the work of a thread."""
         start = time.monotonic()
         try:
-            for index, frame in self._film() if self.is_file else self._live():
+            for index, frame in self._film() if self.is_file else self._live(state):
                 if self.is_file:
                     time.sleep(max(0.0, start + index / self.fps - time.monotonic()))
                 with arrived:
@@ -148,8 +150,11 @@ class Camera:
                 yield index, frame
             first = index + 1
 
-    def _live(self) -> Iterator[tuple[int, Tensor | None]]:
-        """Frames numbered by the time at which they came, from the first one on; None once there are no more."""
+    def _live(self, state: "_State") -> Iterator[tuple[int, Tensor | None]]:
+        """Frames numbered by the time at which they came, from the first one on; None once there are no more.
+
+        Those that come faster than the constant rate are dropped: time would run slower than the people.
+        """
         import cv2
 
         start, last = 0.0, -1
@@ -162,7 +167,11 @@ class Camera:
                 now = time.monotonic()
                 if last < 0:
                     start = now  # a camera may take a second to start
-                last = max(last + 1, round((now - start) * self.fps))
+                clock = round((now - start) * self.fps)
+                if clock < last + 1 - AHEAD:
+                    state.dropped += 1
+                    continue
+                last = max(last + 1, clock)
                 yield last, torch.from_numpy(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
         finally:
             self.capture.release()

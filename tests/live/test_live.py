@@ -482,6 +482,41 @@ def test_time_starts_with_the_first_frame_of_a_camera(monkeypatch: pytest.Monkey
         next(frames)
 
 
+class SteadyCapture:
+    """A camera that gives so many frames per second, with jitter, for eight seconds of a clock of its own."""
+
+    def __init__(self, fps: float) -> None:
+        self.fps, self.count, self.now, self.jitter = fps, 0, 0.0, np.random.default_rng(0)
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self.now = 5.0 + self.count / self.fps + self.jitter.uniform(0, 1.5 / self.fps)
+        self.count += 1
+        return (True, np.zeros((4, 4, 3), np.uint8)) if self.now < 13.0 else (False, None)
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("fps", [20.0, 25.0, 30.0])
+def test_time_is_that_of_the_clock_whatever_a_camera_announces(
+    monkeypatch: pytest.MonkeyPatch, fps: float
+) -> None:
+    capture, state = SteadyCapture(fps), live_camera._State()
+    monkeypatch.setattr(live_camera, "_opened", lambda *_: (capture, 25.0))
+    monkeypatch.setattr(live_camera, "time", capture)
+    indices = []
+    for index, frame in Camera("0")._live(state):
+        if frame is not None:
+            indices.append(index)
+            assert index / 25.0 == pytest.approx(capture.now - 5.0, abs=4 / 25.0)
+    assert (np.diff(indices) >= 1).all()
+    assert len(indices) + state.dropped == capture.count - 1
+    assert state.dropped == pytest.approx(max(0.0, 8 * (fps - 25)), abs=4)
+
+
 def test_cameras_that_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="no such file"):
         Camera(str(tmp_path / "no.mp4"))
