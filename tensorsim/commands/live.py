@@ -12,6 +12,7 @@ from tensorsim.commands.arguments import Option
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, load_recognizer, number_of_people
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.files import check_folder
 from tensorsim.limits import check_range
 
 if TYPE_CHECKING:
@@ -46,7 +47,8 @@ class Live(NetworkOptions, RadarOptions):
     def run(self) -> None:
         """Do it."""
         self._check()
-        config = self.configuration()
+        # The summary of a run says to estimate the camera, for which live does not have the film.
+        config = self.configuration().replace(pose__calibrate=False)
         if self.person_height is not None:
             config = config.replace(pose__person_height_m=self.person_height)
         config = config if self.flip_test else config.replace(pose__flip_test=False)
@@ -89,7 +91,7 @@ class Live(NetworkOptions, RadarOptions):
         from tensorsim.live.view import LiveView
 
         view = LiveView(live, plot.MapStyle(self.colormap, self.dynamic_range))
-        stopped: KeyboardInterrupt | TensorsimError | None = None
+        stopped: KeyboardInterrupt | SystemExit | TensorsimError | None = None
         with ExitStack() as stack:
             page = None if self.port is None else stack.enter_context(serving(self.port))
             if page is not None:
@@ -112,7 +114,7 @@ class Live(NetworkOptions, RadarOptions):
                     self._say(new, camera)
                     if self.seconds is not None and new.time_s >= self.seconds:
                         break
-            except (KeyboardInterrupt, TensorsimError) as error:
+            except (KeyboardInterrupt, SystemExit, TensorsimError) as error:  # SIGTERM is a SystemExit
                 if film is None or film.count == 0:
                     raise
                 stopped = error  # raised once the film is complete
@@ -133,7 +135,9 @@ class Live(NetworkOptions, RadarOptions):
 
     def _check(self) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
-        super().check(Path(self.record or ".").parent)
+        super().check(Path())
+        if self.record is not None:
+            check_folder(self.record.parent, "--record")
         for value in self.person_height or ():
             check_range(value, "body height", "--person-height")
         if self.fps is not None:

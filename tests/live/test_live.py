@@ -1,6 +1,7 @@
 """Live equals the causal stages on the whole film, with a bounded delay and memory; drops are counted."""
 
 import itertools
+import json
 import math
 import threading
 import time
@@ -556,7 +557,9 @@ def _every_third(camera: Camera) -> Iterator[Grabbed]:
             yield Grabbed(frame, 2)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), TensorsimError("the camera gave no more frames")])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), SystemExit(143), TensorsimError("the camera gave no more frames")]
+)
 def test_the_recorded_film_outlives_an_interrupt(
     clip: Path,
     tmp_path: Path,
@@ -579,9 +582,11 @@ def test_the_recorded_film_outlives_an_interrupt(
         cli.main(arguments)
         assert "0.3 s, " in capsys.readouterr().out
     else:
-        with pytest.raises(SystemExit):
+        with pytest.raises(SystemExit) as stop:
             cli.main(arguments)
-        assert "the camera gave no more frames" in capsys.readouterr().err
+        ended = isinstance(error, SystemExit)  # by SIGTERM
+        assert stop.value.code == (143 if ended else 2)
+        assert ended or "the camera gave no more frames" in capsys.readouterr().err
     assert sum(chunk.shape[0] for chunk in VideoReader(path).chunks(16)) == 3
 
 
@@ -621,6 +626,24 @@ def test_command(
     with pytest.raises(SystemExit):
         cli.main([*arguments, "--sound"])
     assert "--sound (applied to tensorsim live)" in capsys.readouterr().err
+
+
+def test_the_summary_of_a_run_is_taken(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It says that the camera was estimated, which live cannot do."""
+    weights, summary = tmp_path / "w.onnx", tmp_path / "summary.json"
+    weights.write_text("")
+    summary.write_text(json.dumps({"config": CONFIG.replace(pose__calibrate=True).to_document()}))
+    monkeypatch.setattr(live_command, "load_networks", lambda *_: networks())
+    arguments = ["live", "--camera", str(clip), "--detector", str(weights), "--pose", str(weights)]
+    cli.main([*arguments, "--port", "None", "--seconds", "0.2", "--every-frame", "--config", str(summary)])
+    assert "0.3 s, " in capsys.readouterr().out
+
+
+def test_a_record_in_a_file_is_refused(clip: Path) -> None:
+    with pytest.raises(TensorsimError, match=r"--record: .*walk\.mp4 is a file, expected a folder"):
+        live_command.Live(str(clip), record=clip / "x.webm").run()
 
 
 def test_a_film_is_not_recorded_onto_itself(clip: Path) -> None:
