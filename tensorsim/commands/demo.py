@@ -1,11 +1,12 @@
 """``tensorsim demo``: a person whose motion is known is filmed, and the film's maps are compared with the true ones."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tensorsim.array_files import save_arrays
+from tensorsim.array_files import array_formats, save_arrays
 from tensorsim.commands.clip_options import ClipOptions, Run
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import (
@@ -70,6 +71,7 @@ class Demo(NetworkOptions, ClipOptions):
         import torch
 
         from tensorsim import results
+        from tensorsim.body.skeleton import mid_hips
         from tensorsim.config import ACTIVITIES, SmoothingConfig
         from tensorsim.data.video import KEPT_MB, VideoReader
         from tensorsim.data.video_writer import write_video
@@ -92,7 +94,14 @@ class Demo(NetworkOptions, ClipOptions):
             if not self.quiet:
                 print(f"rendering {frames} frames of {ACTIVITIES[activity]} ...", file=sys.stderr)
             truth, film, camera, height_m = film_person(activity, frames, config.seed)
-            config = config.replace(pose__person_height_m=(height_m,), pose__camera=camera)
+            start_m = float(mid_hips(truth.joints)[0, 0, 1])
+            # All of the camera is known, whatever a configuration says of that of another film.
+            config = config.replace(
+                pose__person_height_m=(height_m,),
+                pose__camera=camera,
+                pose__calibrate=False,
+                pose__initial_distance_m=(start_m,) if config.pose.position == "paper" else None,
+            )
             people = VideoToPose.from_config(config, *networks).to(device)
             with complete_or_nothing(self.out) as folder:
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
@@ -108,7 +117,7 @@ class Demo(NetworkOptions, ClipOptions):
                     name = f"demo: {ACTIVITIES[activity]}"
                     done = Run(config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device)
                     label = self.write_results(folder, done, true_maps)
-                write_pose_truth(folder, film, truth.valid)
+                write_pose_truth(folder, film, truth.valid, array_formats(self.save))
                 likeness, empty_likeness = likeness_to_truth(maps, true_maps)
                 about = {
                     "activity": ACTIVITIES[activity],
@@ -175,8 +184,8 @@ def film_person(activity: int, frames: int, seed: int) -> Filmed:
     return Filmed(truth, film, camera, float(truth.people.height_m[0]))
 
 
-def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor") -> None:
-    """Write ``pose_truth.npz``: what is true in each frame; ``valid`` (P, T) at the rate of the motion."""
+def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor", formats: Sequence[str]) -> None:
+    """Write ``pose_truth`` in these formats: what is true in each frame; ``valid`` (P, T) at the rate of the motion."""
     arrays: dict[str, Any] = {
         "joints_m": film.joints.numpy(),
         "keypoints_px": film.keypoints.numpy(),
@@ -185,7 +194,7 @@ def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor") -> No
         "valid": valid[:, ::MOMENTS_PER_FRAME].numpy(),
         "fps": FILM_FPS,
     }
-    save_arrays(folder / "pose_truth", arrays)
+    save_arrays(folder / "pose_truth", arrays, formats)
 
 
 def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":

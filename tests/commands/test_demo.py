@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.io import loadmat
 
 import tensorsim as ts
 from tensorsim.commands import demo
@@ -61,6 +62,24 @@ def test_writes_the_film_its_maps_and_the_truth(stand_ins: dict[str, str], tmp_p
     exact = ts.PoseToDoppler(radar)(motion.joints[None].float(), motion.valid[None], 240.0)
     expected = exact.doppler_time[0].numpy()
     assert truth["doppler_time"] == pytest.approx(expected, abs=0.02 * float(expected.max()))
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_the_camera_is_that_of_the_film_whatever_a_configuration_says(
+    stand_ins: dict[str, str], tmp_path: Path, paper: bool
+) -> None:
+    elsewhere = ts.SimulationConfig().replace(pose__calibrate=True, pose__initial_distance_m=(2.0,))
+    elsewhere.to_yaml(tmp_path / "run.yaml")
+    out = tmp_path / "demo"
+    options = {"scene": "through-wall", "quiet": True, "save": "mat", **stand_ins}
+    demo.Demo("kicking", out, 0.5, config=tmp_path / "run.yaml", paper=paper, **options).run()  # type: ignore[arg-type]
+    pose, truth = (
+        json.loads((out / "summary.json").read_text())["config"]["pose"],
+        loadmat(out / "pose_truth.mat"),
+    )
+    assert pose["calibrate"] is False
+    start_m = float(truth["joints_m"][0, 0, (8, 11), 1].mean())
+    assert pose["initial_distance_m"] == ([pytest.approx(start_m, abs=1e-6)] if paper else None)
 
 
 @pytest.mark.slow
