@@ -179,6 +179,30 @@ def test_options_that_tell_the_camera_count_beside_a_configuration(tmp_path: Pat
         assert pose.camera.horizontal_fov_rad == pytest.approx(math.radians(40))
 
 
+def test_switches_count_beside_a_configuration(tmp_path: Path) -> None:
+    names = ("leakage", "wall_echo", "sway", "vital_signs")
+    on = ts.SimulationConfig.through_wall().replace(**{f"scene__{name}": True for name in names})
+    on = on.replace(pose__initial_distance_m=(3.0,), pose__calibrate=False, pose__flip_test=False)
+    on.to_yaml(tmp_path / "on.yaml")
+    kept = ["simulate", "clip.mp4", "--out", "out", "--config", str(tmp_path / "on.yaml")]
+    assert cli.parse(kept).configuration() == on
+    off = [f"--no-{name.replace('_', '-')}" for name in names]
+    config = cli.parse([*kept, *off, "--calibrate", "--flip-test"]).configuration()
+    assert not any(getattr(config.scene, name) for name in names)
+    assert config.pose.flip_test
+    assert config.pose.calibrate
+    assert config.pose.initial_distance_m is None, "it would overrule the camera that is estimated"
+
+
+@pytest.mark.parametrize("told", [["--camera-fov", "40"], ["--initial-distance", "3"], ["--paper"]])
+def test_a_camera_that_is_told_is_not_estimated(
+    told: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["simulate", "clip.mp4", "--out", str(tmp_path / "out"), "--calibrate", *told])
+    assert "--calibrate: got it with " in capsys.readouterr().err
+
+
 def test_the_distances_of_the_panel_calibrate_no_camera() -> None:
     assert _pose_of("--paper").initial_distance_m == (4.0, 0.5)
     pose = _pose_of("--paper", "--position", "camera")

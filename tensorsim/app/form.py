@@ -41,6 +41,15 @@ _MORE = {
     "MOTION CAPTURE": ["clip", "heading"],
     "PICTURES": ["colormap", "dynamic_range", "hide_ridges", "figure_format", "full_rate", "sound"],
 }
+#: Switches as they stand at first; there is no configuration that could say otherwise.
+_SWITCHES = {
+    "sway": False,
+    "vital_signs": False,
+    "leakage": False,
+    "wall_echo": False,
+    "calibrate": True,
+    "flip_test": True,
+}
 #: Kinds of controls that take numbers, and what they expect.
 _EXPECTED = {
     "number": "numbers",
@@ -133,6 +142,8 @@ def controls() -> list[Control]:
         kind, choices = _kind(hints[option])
         count = _count(hints[option])
         default = None if defaults[option] is MISSING else defaults[option]
+        if option in _SWITCHES:
+            kind, choices, default = "switch", (), _SWITCHES[option]
         made.append(Control(option, group, label, helps[option], kind, choices, default, count))
     return sorted([*made, _DENOISER], key=lambda control: GROUPS.index(control.group))
 

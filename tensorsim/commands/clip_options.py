@@ -31,10 +31,10 @@ class ClipOptions(RadarOptions):
 
     people: Annotated[Option[str], tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
     """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
-    sway: bool = False
-    """People sway while they stand."""
-    vital_signs: bool = False
-    """People breathe and their hearts beat."""
+    sway: Option[bool] = None
+    """People sway while they stand. Default: off."""
+    vital_signs: Option[bool] = None
+    """People breathe and their hearts beat. Default: off."""
     motion: Option[Literal["smooth", "paper"]] = None
     """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay.
     Default: smooth."""

@@ -143,8 +143,6 @@ class Demo(NetworkOptions, ClipOptions):
         from tensorsim.registry import name_of
 
         config = at_display_rate(self.configuration(), self.full_rate)
-        if not self.flip_test:
-            config = config.replace(pose__flip_test=False)
         return config.replace(tracking__detector=name_of(detector), pose__network=name_of(pose_network))
 
 

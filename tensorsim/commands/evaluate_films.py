@@ -80,7 +80,8 @@ class EvaluateFilms(NetworkOptions):
         device = usable_device(self.device)
         people = PoseConfig() if self.lifter is None else PoseConfig(lifter=self.lifter)
         stage = VideoToPose(
-            *load_networks(*networks, self.flip_test, self.engine), lifter=pretrained_lifter(people)
+            *load_networks(*networks, self.flip_test is not False, self.engine),
+            lifter=pretrained_lifter(people),
         ).eval()
         stage.to(device)
         reader = FilmReader(stage, networks, self.out / "cache", self.stride, self.calibrate)

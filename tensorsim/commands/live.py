@@ -51,7 +51,6 @@ class Live(NetworkOptions, RadarOptions):
         config = self.configuration().replace(pose__calibrate=False)
         if self.person_height is not None:
             config = config.replace(pose__person_height_m=self.person_height)
-        config = config if self.flip_test else config.replace(pose__flip_test=False)
         networks = default_networks(
             self.detector or config.tracking.detector, self.pose or config.pose.network
         )

@@ -21,8 +21,8 @@ class NetworkOptions:
     pose: Option[str] = None
     """COCO-17 heat maps: HRNet as .pth, .safetensors or name, or any such network as .onnx. Default: $TENSORSIM_POSE,
     else the shipped one."""
-    flip_test: bool = True
-    """Show the pose network every person mirrored as well: better, at twice the cost."""
+    flip_test: Option[bool] = None
+    """Show the pose network every person mirrored as well: better, at twice the cost. Default: on."""
     engine: Engine = "onnxruntime"
     """What runs the networks on the processor. ONNX Runtime takes half the time of torch, with networks that it exports
     once to the user's cache. Faster and less exact: "openvino" (pip install openvino) has the pose network in bfloat16

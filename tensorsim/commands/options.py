@@ -34,10 +34,13 @@ FIELDS: dict[str, str] = {
     "classifier": "classifier",
     "seed": "seed",
     "people": "pose__people",
+    "flip_test": "pose__flip_test",
+    "leakage": "scene__leakage",
+    "wall_echo": "scene__wall_echo",
+    "sway": "scene__sway",
+    "vital_signs": "scene__vital_signs",
 }
 FIELDS |= PANEL_FIELDS | RECEIVER_FIELDS
-#: Options that switch on the part of the scene of the same name.
-SWITCHES = ("leakage", "wall_echo", "sway", "vital_signs")
 
 
 def check_seed(seed: int, option: str = "--seed") -> None:
@@ -71,10 +74,10 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     """Bounces inside the wall: complete to first order, or the paper's. Default: series."""
     multipath: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
     """Bounces inside the wall. Default: True behind a wall."""
-    leakage: bool = False
-    """Direct signal from transmitter to receiver."""
-    wall_echo: bool = False
-    """Static mirror reflection of the wall."""
+    leakage: Option[bool] = None
+    """Direct signal from transmitter to receiver. Default: off."""
+    wall_echo: Option[bool] = None
+    """Static mirror reflection of the wall. Default: off."""
     snr: Option[float] = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
     classifier: Option[str] = None
@@ -115,9 +118,6 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         """
         own = {field.name for field in dataclasses.fields(self)}
         config = self._begun()
-        for switch in SWITCHES:
-            if switch in own and getattr(self, switch):
-                config = config.replace(**{f"scene__{switch}": True})
         config = self.with_receiver(config)
         for option, field in FIELDS.items():
             value = getattr(self, option) if option in own else None

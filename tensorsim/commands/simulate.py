@@ -77,9 +77,9 @@ class Simulate(NetworkOptions, ClipOptions):
     camera_fov: Option[float] = None
     """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: estimated; with
     --no-calibrate, and where nothing in the film tells, 60 along the longer side of the picture."""
-    calibrate: bool = True
-    """Estimate tilt, roll, height and field of view of the camera from the people of the film, unless --camera-fov or
-    --initial-distance tells it. A --config says itself whether to."""
+    calibrate: Option[bool] = None
+    """Estimate tilt, roll, height and field of view of the camera from the people of the film. Default: on, unless
+    --camera-fov or --initial-distance tells it, or the position is the paper's; a --config says itself whether to."""
     position: Option[Literal["camera", "paper"]] = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
     lifter: Option[Literal["temporal", "nearest"]] = None
@@ -179,12 +179,15 @@ class Simulate(NetworkOptions, ClipOptions):
         ):
             if value is not None:
                 config = config.replace(**{field: value})
-        told = camera_fov is not None or self.initial_distance is not None
-        if told or config.pose.position == "paper" or not self.calibrate:
-            config = config.replace(pose__calibrate=False)
-        elif self.config is None:
-            config = config.replace(pose__calibrate=True)
-        return config if self.flip_test else config.replace(pose__flip_test=False)
+        paper, calibrate = config.pose.position == "paper", self.calibrate
+        if calibrate and paper:
+            raise TensorsimError("--calibrate: got it with the paper's position, expected that of a camera")
+        if calibrate:
+            config = config.replace(pose__initial_distance_m=None)
+        if calibrate is None:
+            told = camera_fov is not None or self.initial_distance is not None
+            calibrate = not (told or paper) and (self.config is None or config.pose.calibrate)
+        return config.replace(pose__calibrate=calibrate)
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
@@ -205,6 +208,11 @@ class Simulate(NetworkOptions, ClipOptions):
                 raise TensorsimError(f"{option}: got no numbers, expected at least one")
             for value in given if isinstance(given, tuple) else [given] * (given is not None):
                 check_range(value, quantity, option)
+        for option in ("camera_fov", "initial_distance"):
+            if self.calibrate and getattr(self, option) is not None:
+                raise TensorsimError(
+                    f"--calibrate: got it with --{option.replace('_', '-')}, expected one of them: both tell the camera"
+                )
         if self.position == "paper" and self.initial_distance is None and self.config is None:
             raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
 

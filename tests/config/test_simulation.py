@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 import tensorsim as ts
 from tensorsim import cli
-from tensorsim.commands.clip_options import ClipOptions
 from tensorsim.commands.options import FIELDS, RadarOptions
+from tensorsim.commands.simulate import Simulate
 from tensorsim.config.people import PANEL_WEIGHTS_KG
 from tensorsim.errors import TensorsimError
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
@@ -99,7 +99,7 @@ def test_every_parameter_of_the_panel_is_an_option() -> None:
     """Each option names a field that exists; the defaults of these fields are those of the panel."""
     config = ts.SimulationConfig.through_wall()
     for option, path in FIELDS.items():
-        assert any(field.name == option for field in dataclasses.fields(ClipOptions)), option
+        assert any(field.name == option for field in dataclasses.fields(Simulate)), option
         part: object = config
         for name in path.split("__"):
             assert hasattr(part, name), path
