@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,7 +17,7 @@ from tensorsim.exceptions import TensorsimError, TensorsimWarning, check_count
 from tensorsim.files import check_folder
 
 if TYPE_CHECKING:
-    from tensorsim.config import SimulationConfig
+    from tensorsim.config import SceneConfig, SimulationConfig
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.recognition import ActivityRecognizer
 
@@ -41,6 +42,28 @@ FIELDS: dict[str, str] = {
     "vital_signs": "scene__vital_signs",
 }
 FIELDS |= PANEL_FIELDS | RECEIVER_FIELDS
+
+
+def _has_wall(scene: "SceneConfig") -> bool:
+    return scene.wall is not None
+
+
+def _has_leakage(scene: "SceneConfig") -> bool:
+    return scene.leakage or "leakage" in (scene.paths or ())
+
+
+def _has_converters(scene: "SceneConfig") -> bool:
+    return scene.receiver.adc_bits is not None
+
+
+#: What an option changes: its name, and whether a scene has it. Without it the option would do nothing.
+_NEEDED: dict[str, tuple[str, Callable[["SceneConfig"], bool]]] = {
+    "multipath": ("a wall", _has_wall),
+    "wall_echo": ("a wall", _has_wall),
+    "wall_paths": ("a wall", _has_wall),
+    "isolation_db": ("--leakage", _has_leakage),
+    "adc_headroom_db": ("--adc-bits", _has_converters),
+}
 
 
 def check_seed(seed: int, option: str = "--seed") -> None:
@@ -114,7 +137,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         """The configuration of the run: that of ``--config``, with the other options in place of its fields.
 
         Raises:
-            TensorsimError: a file that cannot be read, or values out of range.
+            TensorsimError: a file that cannot be read, values out of range, or an option that would do nothing.
         """
         own = {field.name for field in dataclasses.fields(self)}
         config = self._begun()
@@ -126,6 +149,12 @@ class RadarOptions(PanelOptions, ReceiverOptions):
                     config = config.replace(**{field: value})
                 except TensorsimError as error:
                     raise TensorsimError(f"--{option.replace('_', '-')}: {error}") from None
+        for option, (part, is_there) in _NEEDED.items():
+            value = getattr(self, option)
+            if value is not None and value is not False and not is_there(config.scene):
+                raise TensorsimError(
+                    f"--{option.replace('_', '-')}: got it without {part}, expected it with {part} only"
+                )
         return config
 
     def _begun(self) -> "SimulationConfig":

@@ -134,6 +134,28 @@ def test_options_change_the_configuration_of_a_file(tmp_path: Path) -> None:
         RadarOptions(wall_permittivity=4.0).configuration()
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "beside"),
+    [
+        ("multipath", True, {"scene": "through-wall"}),
+        ("wall_echo", True, {"scene": "through-wall"}),
+        ("wall_paths", "paper", {"scene": "through-wall"}),
+        ("isolation_db", 0.0, {"leakage": True}),
+        ("adc_headroom_db", 0.0, {"adc_bits": 8}),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(
+    option: str, value: object, beside: dict[str, object], tmp_path: Path
+) -> None:
+    with pytest.raises(TensorsimError, match=f"--{option.replace('_', '-')}: got it without"):
+        RadarOptions(**{option: value}).configuration()  # type: ignore[arg-type]
+    config = RadarOptions(**{option: value}, **beside).configuration()  # type: ignore[arg-type]
+    # What a configuration says without effect is no option.
+    config = config.replace(scene__wall=None, scene__leakage=False, scene__receiver__adc_bits=None)
+    config.to_yaml(tmp_path / "run.yaml")
+    assert RadarOptions(config=tmp_path / "run.yaml").configuration() == config
+
+
 def test_a_summary_repeats_its_run_to_the_bit(tmp_path: Path) -> None:
     steps = np.linspace(0, 1, 45)[:, None, None]
     body = np.array([0, 4, 1]) + np.random.default_rng(0).normal(0, 0.3, (14, 3))
