@@ -6,8 +6,8 @@ from typing import Literal
 
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
-from tensorsim.commands.training import TrainOptions
-from tensorsim.exceptions import TensorsimError
+from tensorsim.commands.training import TrainOptions, check_size
+from tensorsim.exceptions import TensorsimError, check_positive
 
 #: Options that count for ``maps`` only.
 _OF_MAPS = ("scenes", "people", "snr", "films", "film_maps", "film_people", "maps_seed", "film_seed")
@@ -111,6 +111,7 @@ class TrainClassifier(TrainOptions):
         check_seed(self.film_seed, "--film-seed")
         if (self.films is None) != (self.film_maps is None):
             raise TensorsimError("--films, --film-maps: got one of them, expected both or none")
+        self._check_recipe()
         people = [self.people] if self.films is None else [self.people, self.film_people]
         trained = sum(not held_out(person) for count in people for person in range(count))
         clips = trained * len(ACTIVITIES) * len(self.scenes)
@@ -139,3 +140,20 @@ class TrainClassifier(TrainOptions):
             self.masks,
         )
         self.train(recipe, loop)
+
+    def _check_recipe(self) -> None:
+        """Refuse what the recipe would, before maps are made, which takes hours."""
+        from tensorsim.training.maps import MapSettings
+
+        check_size(self.size, MapSettings().size)
+        check_positive(self.learning_rate, "--learning-rate")
+        if not self.scenes:
+            raise TensorsimError("--scenes: got none, expected at least one")
+        low, high = self.snr
+        if not low <= high:
+            raise TensorsimError(f"--snr: got {low:g} {high:g}, expected the lower one first")
+        if not all(0 <= part <= 1 for part in self.masks):
+            raise TensorsimError(f"--masks: got {self.masks}, expected parts of a picture from 0 to 1")
+        for option, people in (("--people", self.people), ("--film-people", self.film_people)):
+            if people < 5:
+                raise TensorsimError(f"{option}: got {people}, expected at least 5, of whom one is held out")

@@ -6,8 +6,8 @@ from typing import Literal
 
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
-from tensorsim.commands.training import TrainOptions
-from tensorsim.exceptions import TensorsimError
+from tensorsim.commands.training import TrainOptions, check_size
+from tensorsim.exceptions import TensorsimError, check_positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +52,11 @@ class TrainEveryday(TrainOptions):
             raise TensorsimError(f"--share: got {self.share}, expected a number from 0 to 1")
         if self.share < 1 and self.init is None:
             raise TensorsimError("--share: got no --init, expected the weights to stay near")
-        self.loop(steps=1, batch=self.batch)  # refuses what cannot work before maps are made
-        build_everyday(self.maps, self.groups, EverydaySettings(seed=self.maps_seed), quiet=self.quiet)
+        settings = EverydaySettings(seed=self.maps_seed)
+        check_size(self.size, settings.size)
+        check_positive(self.learning_rate, "--learning-rate")
+        self.loop(steps=self.epochs, batch=self.batch)  # refuses what cannot work before maps are made
+        build_everyday(self.maps, self.groups, settings, quiet=self.quiet)
         recipe = EverydayRecipe(
             self.network,
             EverydayStore(self.maps, range(self.groups)),

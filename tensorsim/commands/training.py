@@ -92,6 +92,12 @@ def digest(weights: Path | None) -> str | None:
     return None if weights is None else sha256_of(locate(weights))
 
 
+def check_size(size: int | None, stored: int) -> None:
+    """Refuse a size of pictures that does not divide that of the stored ones."""
+    if size is not None and (size < 1 or stored % size):
+        raise TensorsimError(f"--size: got {size}, expected a divisor of {stored}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class PeopleOptions(TrainOptions):
     """How a network is trained on labelled and rendered people."""

@@ -42,9 +42,20 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def command(tmp_path: Path, **options: Any) -> TrainClassifier:
     return TrainClassifier(
-        maps=tmp_path / "maps", network="spgnet", scenes=("through-wall",), people=5, epochs=1, batch=24,
-        workers=0, device="cpu", quiet=True, out=tmp_path / "out", **options,
-    )  # fmt: skip
+        **{
+            "maps": tmp_path / "maps",
+            "network": "spgnet",
+            "scenes": ("through-wall",),
+            "people": 5,
+            "epochs": 1,
+            "batch": 24,
+            "workers": 0,
+            "device": "cpu",
+            "quiet": True,
+            "out": tmp_path / "out",
+        }
+        | options
+    )
 
 
 @pytest.mark.slow
@@ -70,6 +81,13 @@ def test_trains_on_true_motion_and_on_motion_as_films_show_it(
     [
         ({"films": Path("films")}, "got one of them, expected both or none"),
         ({"film_maps": Path("maps")}, "got one of them, expected both or none"),
+        ({"size": 30}, "--size: got 30, expected a divisor of 224"),
+        ({"snr": (50.0, 10.0)}, "--snr: got 50 10, expected the lower one first"),
+        ({"masks": (0.0, 2.0)}, "--masks: got"),
+        ({"scenes": ()}, "--scenes: got none"),
+        ({"people": 0}, "--people: got 0, expected at least 5"),
+        ({"film_people": 4}, "--film-people: got 4, expected at least 5"),
+        ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
     ],
 )
 def test_refuses_before_anything_is_made(options: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -79,8 +97,6 @@ def test_refuses_before_anything_is_made(options: dict[str, Any], message: str, 
 
 
 def test_refuses_a_batch_of_nothing_before_maps_are_made(tmp_path: Path) -> None:
-    mine = command(tmp_path)
-    object.__setattr__(mine, "batch", 0)
     with pytest.raises(TensorsimError, match="batch: got 0, expected an integer of at least 1"):
-        mine.run()
+        command(tmp_path, batch=0).run()
     assert not list(tmp_path.iterdir())

@@ -226,6 +226,9 @@ def test_the_command_trains_and_writes_a_classifier_that_the_recognizer_takes(tm
         ({"share": 0.5}, "--share: got no --init"),
         ({"share": 1.5}, "--share: got 1.5, expected a number from 0 to 1"),
         ({"maps_seed": -1}, "--maps-seed"),
+        ({"size": 7}, "--size: got 7, expected a divisor of 64"),
+        ({"epochs": 0}, "steps: got 0"),
+        ({"learning_rate": 0.0}, "--learning-rate: got 0.0"),
     ],
 )
 def test_the_command_refuses_before_anything_is_made(options, message, tmp_path):
