@@ -47,6 +47,8 @@ class EvaluateCamera:
                 "evaluate camera: got no tilt, height or field of view, expected at least one each"
             )
         check_count(self.walks, "walks")
+        if not 0 <= self.noise < float("inf"):
+            raise TensorsimError(f"--noise: got {self.noise:g}, expected at least 0 pixels")
 
         from tensorsim.evaluation import camera as cameras
 

@@ -3,6 +3,8 @@
 import pytest
 
 from tensorsim import cli
+from tensorsim.commands.evaluate_camera import EvaluateCamera
+from tensorsim.errors import TensorsimError
 
 
 def test_a_row_per_tilt_and_height(capsys: pytest.CaptureFixture[str]) -> None:
@@ -33,6 +35,12 @@ def test_a_row_per_tilt_and_height(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[5] == (
         "field of view within one standard deviation: 2 of 2 (68 % expected), within two: 2 (95 %)"
     )
+
+
+@pytest.mark.parametrize("noise", [-3.0, float("nan")])
+def test_noise_without_meaning_is_refused(noise: float) -> None:
+    with pytest.raises(TensorsimError, match=f"--noise: got {noise:g}, expected at least 0 pixels"):
+        EvaluateCamera(noise=noise).run()
 
 
 @pytest.mark.parametrize("options", ["--tilts", "--tilts 80 --heights 0.5 --fovs 40", "--walks 0"])
