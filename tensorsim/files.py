@@ -137,6 +137,17 @@ def sha256_of_arrays(*arrays: "npt.NDArray[Any]") -> str:
     return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
+def read_settings(folder: Path) -> Any:
+    """What a folder of results is made with, of its ``settings.json``.
+
+    Raises:
+        TensorsimError: no such file, or a damaged one.
+    """
+    path = folder / "settings.json"
+    with reading(path, "settings"):
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
 def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
     """Write what a folder of results is made with to its ``settings.json``, or compare it with what is there.
 
@@ -145,8 +156,7 @@ def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
     """
     path = folder / "settings.json"
     if path.is_file():
-        with reading(path, "settings"):
-            there = json.loads(path.read_text(encoding="utf-8"))
+        there = read_settings(folder)
         if there != settings:
             raise TensorsimError(f"{folder}: got maps of {there}, expected {settings}")
     else:

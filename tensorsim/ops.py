@@ -14,6 +14,11 @@ def unflatten_batch(x: Tensor, lead: list[int]) -> Tensor:
     return x.reshape(lead + list(x.shape[1:]))
 
 
+def times_as_fast(fps: float) -> int:
+    """How many times as fast as 30 frames per second this rate is, rounded: 1 up to 45, 2 up to 75."""
+    return max(int(fps / 30.0 + 0.5), 1)
+
+
 def of_person(values: Tensor, person: Tensor) -> Tensor:
     """Values (N,) by order of person, for people with these numbers (...): the last one serves all further people."""
     return values[person.clamp(max=values.shape[0] - 1)]

@@ -3,7 +3,7 @@
 import ast
 import inspect
 import textwrap
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, Literal, get_args, get_type_hints
 
 from tensorsim.commands.demo import Demo
@@ -41,14 +41,24 @@ _MORE = {
     "MOTION CAPTURE": ["clip", "heading"],
     "PICTURES": ["colormap", "dynamic_range", "hide_ridges", "figure_format", "full_rate", "sound"],
 }
-#: Switches as they stand at first; there is no configuration that could say otherwise.
-_SWITCHES = {
-    "sway": False,
-    "vital_signs": False,
-    "leakage": False,
-    "wall_echo": False,
-    "calibrate": True,
-    "flip_test": True,
+_OFF = {"kind": "switch", "choices": (), "default": False}
+_ON = {"kind": "switch", "choices": (), "default": True}
+#: What controls have that the command does not say of their options.
+_OTHERWISE: dict[str, dict[str, Any]] = {
+    # There is no configuration that a switch could leave as it is.
+    "sway": _OFF,
+    "vital_signs": _OFF,
+    "leakage": _OFF,
+    "wall_echo": _OFF,
+    "calibrate": _ON,
+    "flip_test": _ON,
+    # The command takes files of weights as well; who opens the app may not read files of its machine.
+    "denoiser": {
+        "label": "Denoiser",
+        "help": "What cleans the shown maps; ksvd takes minutes. Default: none.",
+        "kind": "choice",
+        "choices": ("", *DENOISERS),
+    },
 }
 #: Kinds of controls that take numbers, and what they expect.
 _EXPECTED = {
@@ -114,27 +124,11 @@ class Control:
             ) from None
 
 
-#: The command line takes files of weights as well; who opens the app may not read files of its machine.
-_DENOISER = Control(
-    "denoiser",
-    "PROCESSING",
-    "Denoiser",
-    "What cleans the shown maps; ksvd takes minutes. Default: none.",
-    "choice",
-    ("", *DENOISERS),
-    None,
-)
-
-
 def controls() -> list[Control]:
     """The controls in the order of their groups."""
     helps, hints = _field_docstrings(Simulate), get_type_hints(Simulate)
     defaults = {field.name: field.default for field in fields(Simulate)}
-    named = [
-        (p.option, p.group, p.name + (f" ({p.unit})" if p.unit else ""))
-        for p in PANEL
-        if p.option != "denoiser"
-    ]
+    named = [(p.option, p.group, p.name + (f" ({p.unit})" if p.unit else "")) for p in PANEL]
     for group, options in _MORE.items():
         named += [(option, group, option.replace("_", " ").capitalize()) for option in options]
     made = []
@@ -142,10 +136,9 @@ def controls() -> list[Control]:
         kind, choices = _kind(hints[option])
         count = _count(hints[option])
         default = None if defaults[option] is MISSING else defaults[option]
-        if option in _SWITCHES:
-            kind, choices, default = "switch", (), _SWITCHES[option]
-        made.append(Control(option, group, label, helps[option], kind, choices, default, count))
-    return sorted([*made, _DENOISER], key=lambda control: GROUPS.index(control.group))
+        control = Control(option, group, label, helps[option], kind, choices, default, count)
+        made.append(replace(control, **_OTHERWISE.get(option, {})))
+    return sorted(made, key=lambda control: GROUPS.index(control.group))
 
 
 def options_of(values: dict[str, Any]) -> dict[str, Any]:

@@ -139,9 +139,8 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         Raises:
             TensorsimError: a file that cannot be read, values out of range, or an option that would do nothing.
         """
+        config = self.with_receiver(self._begun())
         own = {field.name for field in dataclasses.fields(self)}
-        config = self._begun()
-        config = self.with_receiver(config)
         for option, field in FIELDS.items():
             value = getattr(self, option) if option in own else None
             if value is not None:

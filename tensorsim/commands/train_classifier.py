@@ -143,17 +143,14 @@ class TrainClassifier(TrainOptions):
 
     def _check_recipe(self) -> None:
         """Refuse what the recipe would, before maps are made, which takes hours."""
+        from tensorsim.training.classifier import check_drawn
         from tensorsim.training.maps import MapSettings
 
         check_size(self.size, MapSettings().size)
         check_positive(self.learning_rate, "--learning-rate")
         if not self.scenes:
             raise TensorsimError("--scenes: got none, expected at least one")
-        low, high = self.snr
-        if not low <= high:
-            raise TensorsimError(f"--snr: got {low:g} {high:g}, expected the lower one first")
-        if not all(0 <= part <= 1 for part in self.masks):
-            raise TensorsimError(f"--masks: got {self.masks}, expected parts of a picture from 0 to 1")
+        check_drawn(self.snr, self.masks, "--snr", "--masks")
         for option, people in (("--people", self.people), ("--film-people", self.film_people)):
             if people < 5:
                 raise TensorsimError(f"{option}: got {people}, expected at least 5, of whom one is held out")

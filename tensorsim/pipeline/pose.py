@@ -19,6 +19,7 @@ from tensorsim.errors import (
     check_size,
     is_autocast,
 )
+from tensorsim.ops import times_as_fast
 from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_instance, check_part
 from tensorsim.types import Detections, Pose, Tracks
@@ -266,7 +267,7 @@ class VideoToPose(nn.Module):
 
     def interval_at(self, fps: float) -> int:
         """The number n of every n-th frame in which the detector runs, at this frame rate."""
-        return self.detection_interval * max(int(fps / 30.0 + 0.5), 1)
+        return self.detection_interval * times_as_fast(fps)
 
     def observed_frames(self, present: Tensor, fps: float) -> Tensor:
         """(B, T) bool: frames in which the detector runs, every n-th and the last of each clip."""

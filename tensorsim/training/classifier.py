@@ -40,6 +40,24 @@ def held_out(person: int) -> bool:
     return person % 5 == 4
 
 
+def check_drawn(
+    snr_db: tuple[float, float],
+    masks: tuple[float, float],
+    snr_name: str = "snr_db",
+    masks_name: str = "masks",
+) -> None:
+    """Refuse a range of ratios that does not ascend, and masks outside of 0 to 1.
+
+    Raises:
+        TensorsimError: it calls them by these names.
+    """
+    low, high = snr_db
+    if not low <= high:
+        raise TensorsimError(f"{snr_name}: got {low:g} {high:g}, expected the lower one first")
+    if not all(0 <= part <= 1 for part in masks):
+        raise TensorsimError(f"{masks_name}: got {masks}, expected parts of a picture from 0 to 1")
+
+
 def clips_of(
     store: MapStore, scenes: Sequence[str], people: int | None, validation: bool | None
 ) -> list[Clip]:
@@ -142,10 +160,7 @@ class ClassifierRecipe(Recipe):
         masks: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         check_choice(network, NETWORKS, "network")
-        if not snr_db[0] <= snr_db[1]:
-            raise TensorsimError(f"snr_db: got {snr_db}, expected the lower one first")
-        if not all(0 <= part <= 1 for part in masks):
-            raise TensorsimError(f"masks: got {masks}, expected parts of a picture from 0 to 1")
+        check_drawn(snr_db, masks)
         self.snr_db, self.seed, self.masks = snr_db, seed, masks
         stores = [(store, people)] if filmed is None else [(store, people), (filmed, filmed_people)]
         self.training = [(s, clip) for s, n in stores for clip in clips_of(s, scenes, n, validation=False)]

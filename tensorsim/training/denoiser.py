@@ -6,7 +6,6 @@ There the noise has the same strength at all ratios: over the peak of the map it
 the error of the noisiest maps is all that counts, and a network trained on that spoils the others.
 """
 
-import json
 import math
 import warnings
 from pathlib import Path
@@ -20,7 +19,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES
 from tensorsim.enhance.dncnn import DnCNN, map_floor
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.files import complete_file, keep_settings, reading
+from tensorsim.files import complete_file, keep_settings, read_settings
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scatterers import JointScatterers
@@ -174,10 +173,7 @@ class DenoiserRecipe(Recipe):
             for part in (parts[False], parts[True])
         )
         self.seed = seed
-        described = folder / "settings.json"
-        with reading(described, "settings of patches"):
-            made = json.loads(described.read_text(encoding="utf-8"))
-        settings = {"depth": net.depth, "seed": seed, "files": len(files), "maps": made}
+        settings = {"depth": net.depth, "seed": seed, "files": len(files), "maps": read_settings(folder)}
         super().__init__(net, settings, {"network": "DnCNN", "depth": str(net.depth), "scale": "floor"})
 
     def sample(self, index: int) -> dict[str, Any]:

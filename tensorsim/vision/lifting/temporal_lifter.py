@@ -27,7 +27,7 @@ from tensorsim.errors import (
     check_shape,
 )
 from tensorsim.geometry.camera import Pinhole, project
-from tensorsim.ops import of_person
+from tensorsim.ops import of_person, times_as_fast
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.sight import (
     RADIUS,
@@ -162,12 +162,12 @@ class TemporalLifter(nn.Module):
         dtype = self.network.leave.weight.dtype
         # The window of the network is a number of frames, of films of up to 45 frames per second: it sees a faster one
         # as several, each of about 30.
-        films = max(int(fps / 30.0 + 0.5), 1)
+        films = times_as_fast(fps)
         tracks, fps = films * people, fps / films
-        k = _interleaved(keypoints.reshape(people, frames, 34).to(dtype), films).unflatten(-1, [17, 2])
+        k = _interleaved(keypoints.reshape(people, frames, 17, 2).to(dtype), films)
         s = _interleaved(scores.reshape(people, frames, 17).to(dtype), films)
         b = _interleaved(boxes.reshape(people, frames, 4).to(dtype), films)
-        v = _interleaved(valid.reshape(people, frames, 1), films)[..., 0]
+        v = _interleaved(valid.reshape(people, frames), films)
         height_of_each = self._height_of_each(keypoints).to(dtype).repeat_interleave(films)
         joints: list[Tensor] = []
         spreads: list[Tensor] = []
@@ -341,9 +341,9 @@ class TemporalLifter(nn.Module):
 
 
 def _interleaved(x: Tensor, films: int) -> Tensor:
-    """Every n-th frame of (S, T, D), from each of the first n on, as tracks of their own: (S n, ceil(T / n), D)."""
-    lacking = -x.shape[1] % films
-    padded = torch.cat([x, x.new_zeros(x.shape[0], lacking, x.shape[2])], dim=1)
+    """Every n-th frame of (S, T, ...), from each of the first n on, as tracks of their own: (S n, ceil(T / n), ...)."""
+    lacking = x.new_zeros([x.shape[0], -x.shape[1] % films] + list(x.shape[2:]))  # noqa: RUF005
+    padded = torch.cat([x, lacking], dim=1)
     return padded.unflatten(1, [-1, films]).transpose(1, 2).flatten(0, 1)
 
 
