@@ -4,6 +4,7 @@ import math
 import os
 import wave
 from collections.abc import Callable
+from fractions import Fraction
 from typing import NamedTuple
 
 import torch
@@ -94,13 +95,23 @@ def doppler_sound(signal: Tensor, prf_hz: float, scale: float | None = None, rat
     resample, phase_vocoder = _torchaudio()
     length = max(1, round(signal.shape[0] * rate_hz / prf_hz))
     channels = _stretched(_by_direction(signal), prf_hz, scale, phase_vocoder)
-    # The rate is rounded to 0.01 Hz, so that the ratio of the two rates is one of small integers.
-    given = round(100 * prf_hz * scale)
-    common = math.gcd(given, 100 * rate_hz)
-    waveform = resample(channels, given // common, 100 * rate_hz // common)[:, :length]
+    given, wanted = _rates(prf_hz * scale / rate_hz)
+    waveform = resample(channels, given, wanted)[:, :length]
     waveform = torch.nn.functional.pad(waveform, (0, length - waveform.shape[1]))
     peak = waveform.abs().max()
     return Sound(waveform.float() * (0.9 / peak if peak > 0 else 0.0), rate_hz, scale)
+
+
+def _rates(ratio: float) -> tuple[int, int]:
+    """Two small whole numbers of this ratio, which it is changed to by less than 0.1 %.
+
+    The memory of torchaudio's filter grows with their product: the usual ratio of a PRF such as 5165.02 Hz to the rate
+    of the sound would take terabytes. A change of pitch and time by 0.1 % is not heard.
+    """
+    below_one = min(ratio, 1 / ratio)
+    nearest = Fraction(below_one).limit_denominator(math.ceil(1000 + 1 / below_one))
+    small, large = nearest.as_integer_ratio()
+    return (small, large) if ratio <= 1 else (large, small)
 
 
 def _by_direction(signal: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import tensorsim as ts
-from tensorsim.data.sound import Sound, doppler_sound, slow_time_signal, write_sound
+from tensorsim.data.sound import Sound, _rates, doppler_sound, slow_time_signal, write_sound
 
 
 def peak_hz(channel: Tensor, rate_hz: int) -> float:
@@ -58,6 +58,22 @@ def test_stretching_keeps_time_and_scales_pitch() -> None:
     assert float(loud.min()) == pytest.approx(1.2, abs=0.1)
     assert float(loud.max()) == pytest.approx(1.55, abs=0.1)
     assert peak_hz(sound.waveform[0], sound.rate_hz) == pytest.approx(300.0, abs=3.0)
+
+
+@pytest.mark.parametrize("prf_hz", [2000.9, 5165.02, 7812.53])
+def test_rates_that_are_not_round_are_resampled(prf_hz: float) -> None:
+    """The exact ratio of 5165.02 Hz (radhar-iwr1443) to 16 kHz needs a filter of 800 GB."""
+    time_s = torch.arange(round(2 * prf_hz)) / prf_hz
+    sound = doppler_sound(torch.exp(-2j * torch.pi * 400.0 * time_s), prf_hz)
+    assert sound.waveform.shape[1] == pytest.approx(32_000, abs=4)
+    assert peak_hz(sound.waveform[1], sound.rate_hz) == pytest.approx(400.0, rel=1e-3)
+
+
+def test_rates_are_small_and_near() -> None:
+    for ratio in (*np.geomspace(1e-5, 1e5, 2001), 5165.02 / 16000, 1 / 3):
+        given, wanted = _rates(float(ratio))
+        assert given / wanted == pytest.approx(ratio, rel=1e-3)
+        assert given * wanted <= 2000 * max(1000.0, 1 / ratio, ratio)
 
 
 def test_wav_holds_both_channels(tmp_path: Path) -> None:
