@@ -119,6 +119,20 @@ def _columns(path: Path, rows: list[dict[str, Any]], names: Iterable[str]) -> No
         )
 
 
+def _text(row: dict[str, Any], column: str) -> str:
+    """What a row says in a column that may be missing, "" where it says nothing; 0 is something."""
+    value = row.get(column)
+    return "" if value is None else str(value)
+
+
+def _needed(row: dict[str, Any], column: str, where: str) -> str:
+    """What a row says in a column in which it has to say something."""
+    text = _text(row, column)
+    if not text.strip():
+        raise TensorsimError(f"{where}: got no {column}, expected one")
+    return text
+
+
 def _seconds(value: Any, where: str) -> float | None:
     """A number of seconds, None where there is none."""
     if value is None or str(value).strip() == "":
@@ -138,7 +152,7 @@ def table(source: SourceConfig) -> list[Clip]:
     Paths are relative to the table. Without a person, everybody is somebody else, by file.
 
     Raises:
-        TensorsimError: no such table, or columns that are missing.
+        TensorsimError: no such table, columns that are missing, or a row without path or label.
     """
     path = Path(source.path or "")
     rows = read_table(path)
@@ -147,11 +161,11 @@ def table(source: SourceConfig) -> list[Clip]:
     for number, row in enumerate(rows):
         where = f"{path}: row {number + 1}"
         start, end = _seconds(row.get("start"), where), _seconds(row.get("end"), where)
-        name = str(row["path"])
+        name, label = _needed(row, "path", where), _needed(row, "label", where)
         clips.append(
             Clip(
-                f"{name}#{number}", str(row["label"]), str(row.get("person") or name), name,
-                str(row.get("split") or ""), str(path.parent / name), str(row.get("key") or ""), start, end,
+                f"{name}#{number}", label, _text(row, "person") or name, name,
+                _text(row, "split"), str(path.parent / name), _text(row, "key"), start, end,
             )
         )  # fmt: skip
     return _some(clips, path, "rows")
@@ -188,7 +202,7 @@ def kinetics(source: SourceConfig) -> list[Clip]:
     Video Dataset", 2017.
 
     Raises:
-        TensorsimError: no such folder or table, or columns that are missing.
+        TensorsimError: no such folder or table, columns that are missing, or a row without id or label.
     """
     folder, path = _folder(source), Path(source.table or "")
     rows = read_table(path)
@@ -199,12 +213,12 @@ def kinetics(source: SourceConfig) -> list[Clip]:
     for number, row in enumerate(rows):
         where = f"{path}: row {number + 1}"
         start, end = _seconds(row["time_start"], where), _seconds(row["time_end"], where)
-        name = str(row["youtube_id"])
+        name, label = _needed(row, "youtube_id", where), _needed(row, "label", where)
         short = f"{name}_{int(start or 0):06d}_{int(end or 0):06d}"
         film = films.get(short) or films.get(name) or folder / f"{short}.mp4"
         times = (None, None) if film.stem == short else (start, end)
-        part = parts.get(str(row.get("split") or ""), "")
-        clips.append(Clip(short, str(row["label"]), name, name, part, str(film), "", *times))
+        part = parts.get(_text(row, "split"), "")
+        clips.append(Clip(short, label, name, name, part, str(film), "", *times))
     return _some(clips, path, "rows")
 
 
@@ -215,16 +229,17 @@ def charades(source: SourceConfig) -> list[Clip]:
     et al., "Hollywood in Homes", ECCV 2016.
 
     Raises:
-        TensorsimError: no such folder or table, columns that are missing, or actions of another form.
+        TensorsimError: no such folder or table, columns that are missing, a row without id, or actions of another form.
     """
     folder, path = _folder(source), Path(source.table or "")
     rows = read_table(path)
     _columns(path, rows, ("id", "subject", "actions"))
     films = _films(folder)
     clips = []
-    for row in rows:
-        name = str(row["id"])
-        for number, action in enumerate(filter(None, str(row["actions"] or "").split(";"))):
+    for line, row in enumerate(rows):
+        name = _needed(row, "id", f"{path}: row {line + 1}")
+        person = _text(row, "subject") or name
+        for number, action in enumerate(filter(None, _text(row, "actions").split(";"))):
             words = action.split()
             if len(words) != 3 or not re.fullmatch(r"c\d{3}", words[0]):
                 raise TensorsimError(
@@ -232,9 +247,7 @@ def charades(source: SourceConfig) -> list[Clip]:
                 )
             start, end = (_seconds(word, f"{path}: {name}") for word in words[1:])
             film = str(films.get(name, folder / f"{name}.mp4"))
-            clips.append(
-                Clip(f"{name}#{number}", words[0], str(row["subject"]), name, "", film, "", start, end)
-            )
+            clips.append(Clip(f"{name}#{number}", words[0], person, name, "", film, "", start, end))
     return _some(clips, path, "rows with actions")
 
 
@@ -244,17 +257,19 @@ def movi(source: SourceConfig) -> list[Clip]:
     With a ``table`` of the columns file and label: AMASS ``.npz`` files with joints, and their labels.
 
     Raises:
-        TensorsimError: no such folder, no such files, or columns that are missing.
+        TensorsimError: no such folder, no such files, columns that are missing, or a row without file or label.
     """
     folder = _folder(source)
     clips = []
     if source.table is not None:
         rows = read_table(Path(source.table))
         _columns(Path(source.table), rows, ("file", "label"))
-        for row in rows:
-            name = str(row["file"])
-            person = str(row.get("person") or _subject(name))
-            clips.append(Clip(name, str(row["label"]), person, name, path=str(folder / name)))
+        for number, row in enumerate(rows):
+            where = f"{source.table}: row {number + 1}"
+            name, label = _needed(row, "file", where), _needed(row, "label", where)
+            clips.append(
+                Clip(name, label, _text(row, "person") or _subject(name), name, path=str(folder / name))
+            )
         return _some(clips, source.table, "rows")
     for file in sorted(folder.rglob("*_amass_Subject_*.mat")):
         where = file.relative_to(folder).as_posix()

@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,6 +229,51 @@ def test_tables_of_both_kinds(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("file,label\na,b\n")
     with pytest.raises(TensorsimError, match="got the columns file, label, expected path as well"):
         listing.table(SourceConfig("table", str(tmp_path / "t.csv")))
+
+
+def test_person_and_key_may_be_zero(tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows: list[dict[str, object]] = [
+        {"path": name, "file": name, "label": 0, "person": person, "key": 0}
+        for name, person in (("a.npz", 0), ("b.npz", 0), ("c.npz", 1), ("d.npz", None))
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "t.parquet")
+    write_csv(tmp_path / "t.csv", rows)
+    for name in ("t.parquet", "t.csv"):
+        clips = listing.table(SourceConfig("table", str(tmp_path / name)))
+        assert [(c.person, c.key, c.label) for c in clips] == [
+            ("0", "0", "0"),
+            ("0", "0", "0"),
+            ("1", "0", "0"),
+            ("d.npz", "0", "0"),
+        ]
+        of_movi = listing.movi(SourceConfig("movi", str(tmp_path), str(tmp_path / name)))
+        assert [c.person for c in of_movi] == ["0", "0", "1", "d.npz"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "header", "row", "missing"),
+    [
+        ("table", "path,label", "a.npz", "label"),
+        ("table", "path,label", "a.npz,", "label"),
+        ("table", "path,label", " ,walk", "path"),
+        ("movi", "file,label", "a.npz,", "label"),
+        ("movi", "file,label", ",walk", "file"),
+        ("kinetics", "label,youtube_id,time_start,time_end", ",abc,0,10", "label"),
+        ("kinetics", "label,youtube_id,time_start,time_end", "squat,,0,10", "youtube_id"),
+        ("charades", "id,subject,actions", ",HR43,c092 1 2", "id"),
+    ],
+)
+def test_rows_without_a_file_or_label_are_refused(
+    kind: Any, header: str, row: str, missing: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(f"{header}\n{row}\n")
+    source = SourceConfig(kind, *([str(path)] if kind == "table" else [str(tmp_path), str(path)]))
+    with pytest.raises(TensorsimError, match=rf"t\.csv: row 1: got no {missing}, expected one"):
+        getattr(listing, kind)(source)
 
 
 @pytest.mark.parametrize("start", ["nan", "inf", "-0.5", "soon"])
