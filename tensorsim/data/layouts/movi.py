@@ -52,9 +52,10 @@ def read_movi(path: Path, key: str) -> Motion:
         TensorsimError: another file, or no such motion.
     """
     moves = _moves(path)
+    if not (key.isdecimal() and int(key) < len(moves)):
+        got = f"motion {key}" if key else "no key"
+        raise TensorsimError(f"{path}: got {got}, expected the number of a motion, 0 to {len(moves) - 1}")
     number = int(key)
-    if not 0 <= number < len(moves):
-        raise TensorsimError(f"{path}: got motion {key}, expected 0 to {len(moves) - 1}")
     with reading(path, "motions of MoVi"):
         positions = torch.from_numpy(np.asarray(moves[number]["jointsLocation_amass"], np.float64))
         if positions.dim() != 3 or positions.shape[1] < 22 or positions.shape[2] != 3:

@@ -206,8 +206,9 @@ def test_movi(tmp_path: Path) -> None:
     motion = read_movi(path, "1")
     assert motion.fps == 120.0
     assert np.abs(motion.joints[0, :, 2:].numpy() - WALK[:, 2:] - 1).max() < 1e-5
-    with pytest.raises(TensorsimError, match="got motion 2, expected 0 to 1"):
-        read_movi(path, "2")
+    for key, got in (("2", "motion 2"), ("-1", "motion -1"), ("walking", "motion walking"), ("", "no key")):
+        with pytest.raises(TensorsimError, match=f"got {got}, expected the number of a motion, 0 to 1"):
+            read_movi(path, key)
     path.write_bytes(path.read_bytes()[:300])
     assert [c.label for c in listing.movi(SourceConfig("movi", str(tmp_path)))] == ["unreadable"]
 
