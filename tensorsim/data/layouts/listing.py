@@ -198,7 +198,8 @@ def kinetics(source: SourceConfig) -> list[Clip]:
     """Kinetics: a CSV with label, youtube_id, time_start, time_end and split beside a folder of films.
 
     Films are called ``ID_START_END`` (six digits each) if they are cut already, or ``ID``, of which the times are a
-    part; in the folder or in a folder of it. The person is the id. Source: W. Kay et al., "The Kinetics Human Action
+    part; in the folder or in a folder of it. Clips are the same whichever of both is there, or neither. The person is
+    the id. Source: W. Kay et al., "The Kinetics Human Action
     Video Dataset", 2017.
 
     Raises:
@@ -216,9 +217,8 @@ def kinetics(source: SourceConfig) -> list[Clip]:
         name, label = _needed(row, "youtube_id", where), _needed(row, "label", where)
         short = f"{name}_{int(start or 0):06d}_{int(end or 0):06d}"
         film = films.get(short) or films.get(name) or folder / f"{short}.mp4"
-        times = (None, None) if film.stem == short else (start, end)
         part = parts.get(_text(row, "split"), "")
-        clips.append(Clip(short, label, name, name, part, str(film), "", *times))
+        clips.append(Clip(short, label, name, name, part, str(film), "", start, end))
     return _some(clips, path, "rows")
 
 

@@ -19,7 +19,7 @@ class Clip:
         part: of the data set, if the source fixes it; else "".
         path: of its file, if it has one.
         key: of the motion within the file.
-        start_s, end_s: the part of the file.
+        start_s, end_s: the part of the file; a file that has the name of the clip holds this part alone.
     """
 
     name: str

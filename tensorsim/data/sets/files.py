@@ -94,12 +94,12 @@ class FileClips:
 
 
 def cut(motion: Motion, clip: Clip) -> Motion:
-    """The part of a motion between the times of a clip.
+    """The part of a motion between the times of a clip; a file that is named as the clip holds this part alone.
 
     Raises:
         TensorsimError: fewer than two frames are left.
     """
-    if clip.start_s is None and clip.end_s is None:
+    if (clip.start_s is None and clip.end_s is None) or Path(clip.path).stem == clip.name:
         return motion
     count = motion.valid.shape[1]
     first = 0 if clip.start_s is None else round(clip.start_s * motion.fps)

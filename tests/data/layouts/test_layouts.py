@@ -16,6 +16,7 @@ from tensorsim.data.layouts.ntu import KINECT_JOINTS, ntu_name, read_ntu
 from tensorsim.data.npz import SMPL_JOINTS
 from tensorsim.data.sets.clips import Clip
 from tensorsim.data.sets.files import FileClips, cut
+from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import SourceConfig
 from tensorsim.data.sets.variations import VariationConfig, draw
 from tensorsim.data.skeletons import Motion
@@ -130,7 +131,13 @@ def test_kinetics(tmp_path: Path) -> None:
         "abc",
         "train",
         str(films / "jogging" / "abc_000010_000020.mp4"),
+        "",
+        10.0,
+        20.0,
     )
+    motion = Motion(torch.zeros(1, 150, 14, 3), torch.ones(1, 150).bool(), 10.0)
+    assert cut(motion, cut_already).joints.shape[1] == 150
+    assert cut(motion, whole).joints.shape[1] == 100
     assert (whole.path, whole.start_s, whole.end_s, whole.part) == (
         str(films / "xyz.webm"),
         3.0,
@@ -138,6 +145,17 @@ def test_kinetics(tmp_path: Path) -> None:
         "validation",
     )
     assert not Path(gone.path).exists()
+
+
+@pytest.mark.parametrize("later", ["abc.mp4", "abc_000003_000013.mp4"])
+def test_films_of_kinetics_that_come_later_do_not_change_its_clips(later: str, tmp_path: Path) -> None:
+    write_csv(tmp_path / "k.csv", [{"label": "squat", "youtube_id": "abc", "time_start": 3, "time_end": 13}])
+    source = SourceConfig("kinetics", str(tmp_path), str(tmp_path / "k.csv"))
+    before = Plan(small_recipe(sources=(source,))).listing
+    (tmp_path / later).touch()
+    after = Plan(small_recipe(sources=(source,)))
+    assert after.listing == before
+    assert after.clip(0)[1].path == str(tmp_path / later)
 
 
 def test_films_are_looked_for_once_however_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
