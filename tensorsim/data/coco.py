@@ -47,14 +47,14 @@ def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     out between others are such frames. That holds for three or more ids that are numbers, or names that differ in their
     last number alone, if half of the steps between them or more are at most three frames, a frame being the largest
     step of which all are multiples, and if they span 100 000 frames at most; else they are pictures with numbers that
-    count nothing, and frames are those that are listed. People are told apart by ``track_id`` where there is one, else
-    by where they were last seen, in the order in which they come; whoever is more than two body sizes from there is
-    somebody new. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of each; scores a
-    little above 1 count as 1.
+    count nothing, and frames are those that are listed. People are told apart by ``track_id`` where there is one (null
+    is none), else by where they were last seen, in the order in which they come; whoever is more than two body sizes
+    from there is somebody new. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of
+    each; scores a little above 1 count as 1.
 
     Raises:
         TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, scores
-            above 2, a ``track_id`` for some people only.
+            above 2, a ``track_id`` for some people only, or one twice in a frame.
     """
     path = Path(path)
     return coco_of(path, json_files(path))
@@ -107,7 +107,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
     everybody = [person for frame in people.values() for person in frame]
     if not everybody:
         raise TensorsimError(f"{path}: got no keypoints, expected COCO annotations or results")
-    tracked = sum("track_id" in person for person in everybody)
+    tracked = sum(person.get("track_id") is not None for person in everybody)
     if 0 < tracked < len(everybody):
         raise TensorsimError(
             f"{path}: got a track_id for {tracked} of {len(everybody)} people, expected one for all or for none"
@@ -124,6 +124,10 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
         for t, frame in enumerate(frames):
             for p, person in enumerate(frame):
                 place = tracks.index(person["track_id"]) if tracked else p
+                if valid[t, place]:
+                    raise TensorsimError(
+                        f"{path}: got track_id {person['track_id']!r} twice in frame {t}, expected it once"
+                    )
                 data[t, place] = torch.tensor(person["keypoints"], dtype=torch.float32).view(17, 3)
                 valid[t, place] = True
     check_finite(data, str(path))

@@ -375,6 +375,19 @@ def test_coco_annotations_with_tracks_and_empty_frames(tmp_path: Path) -> None:
     assert people.scores[2, 0].tolist() == [0.0] * 17
 
 
+def test_a_track_id_of_null_is_none_and_one_is_once_in_a_frame(tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    people = [entry(x, image_id=i, track_id=None) for i in (1, 2) for x in (1, 100)]
+    path.write_text(json.dumps(people))
+    assert load_coco_keypoints(path).valid.tolist() == [[True, True], [True, True]]
+    people = [entry(x, image_id=i, track_id=7) for i, x in ((1, 1), (2, 1), (2, 100))]
+    path.write_text(json.dumps(people))
+    with pytest.raises(
+        TensorsimError, match=r"results\.json: got track_id 7 twice in frame 1, expected it once"
+    ):
+        load_coco_keypoints(path)
+
+
 def test_coco_folder_of_frames(tmp_path: Path) -> None:
     for i in range(3):
         (tmp_path / f"{i:04d}.json").write_text(json.dumps([] if i == 1 else [entry(i)]))
@@ -395,6 +408,7 @@ def test_coco_folder_of_frames(tmp_path: Path) -> None:
         json.dumps([{"keypoints": ["a"] * 51}]),
         json.dumps([entry(1, image_id=1), entry(1) | {"image_id": "b"}]),
         json.dumps([entry(1, image_id=1, track_id=4), entry(1, image_id=1), entry(2, image_id=1)]),
+        json.dumps([entry(1, image_id=1, track_id=4), entry(2, image_id=2, track_id=None)]),
         '{"annotations": []}',
         '{"annotations": null}',
         '{"images": [{"file_name": "a.jpg"}], "annotations": []}',
