@@ -3,9 +3,10 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from contextvars import copy_context
-from threading import Event
+from functools import wraps
+from threading import Event, Lock
 from typing import Any, TypeVar
 
 import torch
@@ -14,6 +15,34 @@ from tensorsim.device import one_thread
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+def shared(
+    settings: Callable[[], AbstractContextManager[None]],
+) -> Callable[[], AbstractContextManager[None]]:
+    """Settings of the whole process for blocks in several threads, from when the first begins to when the last ends.
+
+    If each thread put back what it had found, one could find what another had set, and leave that for ever.
+    """
+    lock, held, inside = Lock(), ExitStack(), 0
+
+    @wraps(settings)
+    @contextmanager
+    def block() -> Iterator[None]:
+        nonlocal inside
+        with lock:
+            if inside == 0:
+                held.enter_context(settings())
+            inside += 1
+        try:
+            yield
+        finally:
+            with lock:
+                inside -= 1
+                if inside == 0:
+                    held.close()
+
+    return block
 
 
 def ahead(items: Generator[Item, None, None], count: int = 2) -> Iterator[Item]:

@@ -2,12 +2,38 @@
 
 import threading
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 
 import pytest
 import torch
 
-from tensorsim.threads import ahead, beside, spread
+from tensorsim.threads import ahead, beside, shared, spread
+
+
+def test_settings_hold_from_the_first_to_the_last_block() -> None:
+    set_to = ["usual"]
+
+    @shared
+    @contextmanager
+    def settings() -> Iterator[None]:
+        before, set_to[0] = set_to[0], "of the block"
+        try:
+            yield
+        finally:
+            set_to[0] = before
+
+    for _ in range(2):
+        first, second = settings(), settings()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)  # the one that began first ends first
+        assert set_to == ["of the block"]
+        second.__exit__(None, None, None)
+        assert set_to == ["usual"]
+    with pytest.raises(ValueError, match="broken"), settings():
+        raise ValueError("broken")
+    assert set_to == ["usual"]
 
 
 class Counted:

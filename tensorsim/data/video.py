@@ -16,7 +16,7 @@ from tensorsim.data.frame_times import FilmClock, nearest_frames, unevenness_s, 
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.files import check_name
 from tensorsim.limits import RANGES, check_range
-from tensorsim.threads import ahead
+from tensorsim.threads import ahead, shared
 
 #: Memory for the frames of a film that is passed over several times: enough for 12 s of 720p at 30 frames per second.
 KEPT_MB = 1000.0
@@ -373,6 +373,7 @@ def _first_from(capture: Any, clock: FilmClock, start_s: float) -> tuple[int, fl
     return index, None
 
 
+@shared
 @contextmanager
 def silent_log() -> Iterator[None]:
     """Let OpenCV log nothing."""
@@ -386,6 +387,7 @@ def silent_log() -> Iterator[None]:
         logging.setLogLevel(level)
 
 
+@shared
 @contextmanager
 def opening() -> Iterator[None]:
     """Open films without OpenCV's and FFmpeg's log on stderr, and without FFmpeg's protocols but files."""

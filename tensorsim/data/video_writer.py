@@ -12,6 +12,7 @@ import numpy as np
 from tensorsim.data.video import opening, properties, silent_log
 from tensorsim.errors import TensorsimError, check_positive
 from tensorsim.files import NotWrittenError, check_name, writing
+from tensorsim.threads import shared
 
 
 class VideoWriter:
@@ -119,6 +120,7 @@ def _open_writer(writer: Any, path: Path, fps: float, size: tuple[int, int]) -> 
         )
 
 
+@shared
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
     """Drop what libraries print to the standard error of the process."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from tensorsim.data.video import VideoReader
+from tensorsim.data.video import VideoReader, silent_log
 from tensorsim.errors import TensorsimError, check_positive
 
 #: Frames that wait for the consumer; older ones are dropped.
@@ -180,14 +180,9 @@ class Camera:
 def _opened(source: str, fps: float | None) -> tuple[Any, float]:
     """The capture of a camera or stream, and its frames per second."""
     import cv2
-    from cv2.utils import logging
 
-    level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
-    try:
+    with silent_log():
         capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
-    finally:
-        logging.setLogLevel(level)
     if not capture.isOpened():
         raise TensorsimError(
             f"--camera: {source} cannot be opened, expected a camera's number, a stream or a film"

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tensorsim.data import read_video, video
-from tensorsim.data.video import VideoReader
+from tensorsim.data.video import VideoReader, opening
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError, TensorsimWarning, collected_warnings
 
@@ -419,6 +419,21 @@ def test_settings_of_opencv_come_back(clip: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv(name, "threads;1")
     VideoReader(clip)
     assert os.environ[name] == "threads;1"
+
+
+def test_settings_of_opencv_hold_in_every_thread_and_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+    monkeypatch.delenv(name, raising=False)
+    level = cv2.utils.logging.getLogLevel()
+    first, second = opening(), opening()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert os.environ[name] == "protocol_whitelist;file"
+    assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_SILENT
+    second.__exit__(None, None, None)
+    assert name not in os.environ
+    assert cv2.utils.logging.getLogLevel() == level
 
 
 def test_huge_frames_are_refused_when_the_film_is_opened(tmp_path: Path) -> None:
