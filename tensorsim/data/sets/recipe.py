@@ -106,7 +106,8 @@ class RadarView:
     """A radar and its place. Every radar sees the same motion.
 
     Attributes:
-        name: of its arrays in a sample.
+        name: of its arrays in a sample; variables of ``.mat`` files begin with it, or with ``radar_`` where it does not
+            begin with a letter.
         preset: a preset of ``tensorsim.radar.presets`` or a YAML file, with its wall and floor.
         x_m, y_m: place of the radar's origin on the floor.
         yaw_deg: direction that it looks to, counter-clockwise seen from above; 0 is +y.
@@ -190,8 +191,12 @@ def folder_name(label: str) -> str:
 
 
 def matlab_name(array: str) -> str:
-    """The variable of an array ``RADAR.OUTPUT`` in a ``.mat`` file: MATLAB's names have letters, digits and ``_``."""
-    return re.sub(r"\W", "_", array)[:31]
+    """The variable of an array ``RADAR.OUTPUT`` in a ``.mat`` file: English letters, digits and ``_``.
+
+    MATLAB's names begin with a letter: where the radar's does not, ``radar_`` comes before it.
+    """
+    name = re.sub(r"\W", "_", array, flags=re.ASCII)
+    return (name if re.match("[A-Za-z]", name) else f"radar_{name}")[:31]
 
 
 @dataclass(frozen=True)
@@ -246,8 +251,10 @@ class DatasetRecipe:
         if not self.sources or not self.radars:
             raise TensorsimError("DatasetRecipe: got no source or no radar, expected at least one of each")
         names = [view.name for view in self.radars]
-        if len(set(names)) < len(names):
-            raise TensorsimError(f"DatasetRecipe.radars: got the names {names}, expected different ones")
+        if len({name.casefold() for name in names}) < len(names):  # WebDataset reads them in small letters
+            raise TensorsimError(
+                f"DatasetRecipe.radars: got the names {names}, expected ones that differ not only in capitals"
+            )
         if self.scene != replace(self.scene, radar=SceneConfig().radar, wall=None):
             raise TensorsimError("DatasetRecipe.scene: got a radar or a wall, expected them in radars")
         usual = SceneConfig()
@@ -268,7 +275,8 @@ class DatasetRecipe:
             if len({matlab_name(array) for array in arrays}) < len(arrays):
                 raise TensorsimError(
                     f"DatasetRecipe.radars: got the names {names}, expected ones that differ in the first 31 "
-                    "characters of RADAR_OUTPUT: names in .mat files are not longer"
+                    "characters of RADAR_OUTPUT: names in .mat files are not longer, and have English letters, digits "
+                    "and '_' alone"
                 )
         if round(self.duration_s * self.motion_hz) < 2:
             raise TensorsimError(

@@ -4,6 +4,7 @@ import csv
 import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from tensorsim.data.sets.build import build_dataset, plan_of
 from tensorsim.data.sets.engines import Processes, RayCluster
 from tensorsim.data.sets.manifest import recipe_of, rows_of
 from tensorsim.data.sets.outputs import OutputConfig
+from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.samples import content_hash, make_sample
 from tensorsim.data.sets.shards import write_shard
@@ -108,6 +110,19 @@ def test_every_format_holds_the_same_arrays(storage: Any, tmp_path: Path) -> Non
     for sample in samples:
         arrays = {name: read(sample.row, name).astype(array.dtype) for name, array in sample.arrays.items()}
         assert content_hash(arrays, sample.row["class_index"]) == sample.row["sha256"]
+
+
+@pytest.mark.parametrize("name", ["_a", "-a", "24GHz", "é"])
+def test_every_name_of_a_radar_is_one_in_matlab(name: str, tmp_path: Path) -> None:
+    import scipy.io
+
+    recipe = small_recipe(storage=StorageConfig("mat"), radars=(RadarView(name, "through-wall"),))
+    sample = make_sample(Plan(recipe), 0, "train-000000")
+    (file,) = write_shard(tmp_path, recipe.storage, "train-000000", [sample])
+    read = StoredArrays(tmp_path, recipe)(sample.row, f"{name}.doppler_time")
+    assert (read == sample.arrays[f"{name}.doppler_time"]).all()
+    (variable,) = {n for n in scipy.io.loadmat(tmp_path / file) if n.endswith("time")}
+    assert re.fullmatch("[A-Za-z][A-Za-z0-9_]*", variable)
 
 
 def test_pictures_in_folders_of_classes(tmp_path: Path) -> None:

@@ -61,6 +61,8 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ("sources: [{people: 1, classes: [flying]}]", "activity: got 'flying'"),
         ("radars: [{preset: nothing}]", "got 'nothing', which is not a file"),
         ("radars: [{}, {}]", "got the names"),
+        ("radars: [{name: front}, {name: Front}]", "expected ones that differ not only in capitals"),
+        ("{radars: [{name: é}, {name: è}], storage: {format: mat}}", "English letters"),
         (
             f"{{radars: [{{name: {31 * 'a'}_1}}, {{name: {31 * 'a'}_2}}], storage: {{format: mat}}}}",
             "expected ones that differ in the first 31 characters",
