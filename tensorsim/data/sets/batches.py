@@ -74,7 +74,7 @@ def _shared_by(view: View) -> object:
 def _outputs(recipe: DatasetRecipe, views: Sequence[View], device: torch.device) -> list[dict[str, Stored]]:
     """All outputs of one radar for samples that can share a pass."""
     wanted = recipe.outputs
-    if wanted.needs_array or set(wanted.kinds) & set(SIGNALS) or views[0].config.scene.sampled_effects:
+    if not wanted.needs_pair or set(wanted.kinds) & set(SIGNALS) or views[0].config.scene.sampled_effects:
         return [alone(recipe, view) for view in views]
     stage = PoseToDoppler.from_config(_config_of_all(views)).to(device)
     joints = torch.stack([view.scene.joints for view in views]).to(device)

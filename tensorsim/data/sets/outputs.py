@@ -38,14 +38,15 @@ class OutputConfig:
         dtype: of maps: ``"uint8"``, 255 at the peak and 0 at ``range_db`` below it, or ``"float16"``, decibels.
         range_db: range of uint8 maps.
         size: (rows, columns) of maps, every cell the mean power of what it covers; None keeps them.
-        rate_hz: columns per second of maps at most, likewise; None keeps them. Doppler-time maps have no more than
-            Doppler frames: about 20 a second with the ``overlap`` of 0.5 that recipes have.
+        rate_hz: columns per second of maps at most, likewise; None keeps them; none beside ``size``. Doppler-time maps
+            have no more than Doppler frames: about 20 a second with the ``overlap`` of 0.5 that recipes have.
         picture_size, picture_speed_m_s, picture_range_db: of pictures.
         frames_per_s, beams, cube_size, points: of the outputs of an array: frames per second, directions in steps of
             equal sine, cells of range and Doppler of a cube, and points of a frame.
 
     Raises:
-        TensorsimError: unknown kinds, kinds that no one radar gives together, or numbers that are not positive.
+        TensorsimError: unknown kinds, kinds that no one radar gives together, a ``rate_hz`` beside a ``size``, or
+            numbers that are not positive.
     """
 
     kinds: tuple[str, ...] = ("doppler_time",)
@@ -68,7 +69,7 @@ class OutputConfig:
             raise TensorsimError(
                 f"OutputConfig.kinds: got {list(self.kinds)}, expected different ones of {', '.join(KINDS)}"
             )
-        if self.needs_array and set(self.kinds) & set(OF_PAIR):
+        if self.needs_array and self.needs_pair:
             raise TensorsimError(
                 f"OutputConfig.kinds: got {list(self.kinds)}, expected outputs of an array ({', '.join(OF_ARRAY)}) or "
                 "of one transmitter and receiver"
@@ -78,8 +79,13 @@ class OutputConfig:
             value = getattr(self, name)
             if value is not None and (len(value) != 2 or min(value) < 1):
                 raise TensorsimError(f"OutputConfig.{name}: got {list(value)}, expected rows and columns")
-        if self.size is not None and self.rate_hz is not None:
-            object.__setattr__(self, "rate_hz", None)  # the default; the size says it all
+        if self.size is not None:
+            if self.rate_hz not in (None, OutputConfig.rate_hz):
+                raise TensorsimError(
+                    f"OutputConfig.rate_hz: got {self.rate_hz} beside a size, which has the number of columns; "
+                    "expected none"
+                )
+            object.__setattr__(self, "rate_hz", None)
         require_positive(
             "OutputConfig",
             range_db=self.range_db,
@@ -94,6 +100,11 @@ class OutputConfig:
     def has_range(self) -> bool:
         """Whether an output has a range axis."""
         return bool(set(self.kinds) & {"range_time", "range_time_mti", *SIGNALS, *OF_ARRAY})
+
+    @property
+    def needs_pair(self) -> bool:
+        """Whether there are outputs of one transmitter and receiver."""
+        return bool(set(self.kinds) & set(OF_PAIR))
 
     @property
     def needs_array(self) -> bool:

@@ -54,7 +54,8 @@ class SourceConfig:
         table: CSV or Parquet file that the layouts ``kinetics``, ``charades`` and ``movi`` need beside the folder.
         classes: classes to use, in the order of their numbers; empty: all. For generated people these are activities.
         people: number of generated or rendered people.
-        fps: frames per second of key points, of motion files that do not tell it, and of rendered films (30).
+        fps: frames per second of key points, which never tell it, of motion files that do not, and of rendered films
+            (30).
         image_size: (height, width) of the pictures of key points, where the file does not tell it, and of rendered
             films (360, 640).
 
@@ -85,8 +86,9 @@ class SourceConfig:
                 raise TensorsimError(
                     f"SourceConfig.{name}: got one for the kind {self.kind!r}, expected none"
                 )
-        for name in ("path", "table", "people"):
+        for name in ("path", "table", "people", "fps"):
             needed = name in used and not (name == "table" and self.kind == "movi")
+            needed = needed and (name != "fps" or self.kind == "keypoints")
             if needed and getattr(self, name) is None:
                 raise TensorsimError(
                     f"SourceConfig.{name}: got none for the kind {self.kind!r}, expected one"
@@ -148,9 +150,10 @@ class SplitConfig:
 
     def __post_init__(self) -> None:
         require_choices(self, by=SplitBy)
-        if len(self.shares) != len(PARTS) or min(self.shares) < 0 or abs(sum(self.shares) - 1) > 1e-6:
+        shares = all(is_finite(share) and share >= 0 for share in self.shares)
+        if len(self.shares) != len(PARTS) or not shares or abs(sum(self.shares) - 1) > 1e-6:
             raise TensorsimError(
-                f"SplitConfig.shares: got {list(self.shares)}, expected three numbers that add up to 1"
+                f"SplitConfig.shares: got {list(self.shares)}, expected three numbers from 0 on that add up to 1"
             )
 
 
@@ -287,7 +290,8 @@ class DatasetRecipe:
 
     def _check_view(self, view: RadarView) -> None:
         radar = self.simulation(view).scene.radar
-        if radar.has_array != self.outputs.needs_array:
+        unfit = self.outputs.needs_pair if radar.has_array else self.outputs.needs_array
+        if unfit:
             raise TensorsimError(
                 f"DatasetRecipe.radars: {view.preset} is {'an' if radar.has_array else 'no'} array, the outputs "
                 f"{', '.join(self.outputs.kinds)} need {'one' if self.outputs.needs_array else 'one antenna pair'}"

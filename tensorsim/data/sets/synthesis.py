@@ -10,7 +10,7 @@ import torch
 from tensorsim.config import SimulationConfig
 from tensorsim.config.scene import Body
 from tensorsim.data.sets.array_outputs import array_outputs
-from tensorsim.data.sets.outputs import OF_PAIR, Stored, stored_joints
+from tensorsim.data.sets.outputs import Stored, stored_joints
 from tensorsim.data.sets.pair_outputs import of_samples, pair_outputs
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView
 from tensorsim.data.sets.scene import Scene, seen_from
@@ -121,7 +121,7 @@ def alone(recipe: DatasetRecipe, view: View) -> dict[str, Stored]:
         torch.manual_seed(view.noise_seed)
         if recipe.outputs.needs_array:
             found |= array_outputs(view.config, recipe.outputs, view.scene)
-        elif set(recipe.outputs.kinds) & set(OF_PAIR):
+        elif recipe.outputs.needs_pair:
             found |= pair_outputs(view.config, recipe.outputs, view.scene, recipe.duration_s)
     return found
 

@@ -95,6 +95,10 @@ class VariationConfig:
                     f"VariationConfig.{name}: got {list(value)}, expected two numbers that ascend within {least} to "
                     f"{most}"
                 )
+        if not (is_finite(self.spacing_m) and 0 <= self.spacing_m <= 1000):
+            raise TensorsimError(
+                f"VariationConfig.spacing_m: got {self.spacing_m!r}, expected metres from 0 to 1000"
+            )
         for name in ("mirror", "sway", "vital_signs", "real_receiver"):
             value = getattr(self, name)
             if not (is_finite(value) and 0 <= value <= 1):

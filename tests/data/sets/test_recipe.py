@@ -12,10 +12,11 @@ from tensorsim import cli
 from tensorsim.config import SceneConfig, SimulationConfig, Vector, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.data.sets.array_outputs import array_outputs
+from tensorsim.data.sets.batches import synthesize_batch
 from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.plan import Plan, shared_out
-from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, StorageConfig
+from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.scene import Scene, kept_inside, part_of, seen_from, varied
 from tensorsim.data.sets.synthesis import people_gate, synthesize, view_config
 from tensorsim.data.sets.variations import Variation, VariationConfig, draw
@@ -73,6 +74,10 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ("outputs: {kinds: [doppler]}", "OutputConfig.kinds: got"),
         ("outputs: {kinds: [point_cloud, ridges]}", "outputs of an array"),
         ("outputs: {size: [3]}", "OutputConfig.size"),
+        ("outputs: {size: [64, 64], rate_hz: 20.0}", "OutputConfig.rate_hz: got 20.0 beside a size"),
+        ("sources: [{kind: keypoints, path: a}]", "SourceConfig.fps: got none for the kind 'keypoints'"),
+        ("variations: {spacing_m: -1}", "VariationConfig.spacing_m: got -1"),
+        ("split: {shares: [1.5, -0.5, 0.0]}", "SplitConfig.shares: got"),
         ("storage: {format: png}", "for the format png, expected picture"),
         ("storage: {shard_samples: 0}", "shard_samples: got 0"),
         ("split: {shares: [0.5, 0.4]}", "expected three numbers"),
@@ -100,6 +105,13 @@ def test_what_is_refused_says_where(text: str, message: str, tmp_path: Path) -> 
         DatasetRecipe.from_yaml(tmp_path / "r.yaml")
     assert "\n" not in str(refused.value)
     assert str(tmp_path / "r.yaml") in str(refused.value)
+
+
+def test_nan_is_refused() -> None:
+    with pytest.raises(TensorsimError, match=r"SplitConfig.shares: got \[nan, 0.5, 0.5\]"):
+        SplitConfig(shares=(float("nan"), 0.5, 0.5))
+    with pytest.raises(TensorsimError, match=r"VariationConfig.spacing_m: got nan"):
+        VariationConfig(spacing_m=float("nan"))
 
 
 def test_draws_follow_from_the_seed_and_not_from_other_ranges() -> None:
@@ -371,6 +383,27 @@ def test_an_array_tells_range_direction_and_speed(mti: Mti) -> None:
     _, _, doppler, beam = np.unravel_index(cube.argmax(), cube.shape)
     assert doppler >= 16
     assert abs((beam + 0.5) / 8 - 1 - 1.8 / distance) < 0.15
+
+
+def test_joints_are_of_any_radar() -> None:
+    """Also of an array, alone and beside what it gives."""
+    recipe = small_recipe(
+        radars=(RadarView("array", "ti-awr1843-array"),), outputs=OutputConfig(kinds=("joints",))
+    )
+    plan = Plan(recipe)
+    variation = plan.variation(0, 0)
+    scene = plan.scene(0, "train", variation)
+    made = synthesize(recipe, scene, variation).arrays
+    (batch,) = synthesize_batch(recipe, [(scene, variation)], torch.device("cpu"))
+    assert set(made) == set(batch) == {"array.joints"}
+    assert (made["array.joints"] == scene.joints.numpy()).all()
+    assert (batch["array.joints"] == made["array.joints"]).all()
+
+
+def test_a_size_takes_the_place_of_the_usual_rate() -> None:
+    for rate_hz in (None, 32.0):  # the examples name the usual one
+        assert OutputConfig(size=(64, 64), rate_hz=rate_hz).rate_hz is None
+    assert replace(OutputConfig(), size=(64, 64)).rate_hz is None
 
 
 def test_walls_that_do_not_attenuate() -> None:
