@@ -56,7 +56,8 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
         "## Files",
         _LOAD[recipe.storage.format],
         "",
-        f"Outputs: {', '.join(recipe.outputs.kinds)}; maps are {_scale(recipe)}.",
+        *(f"- `{kind}`: {_described(recipe, kind)}." for kind in recipe.outputs.kinds),
+        "",
         "`manifest.parquet` and `manifest.csv` have a row per sample: class, part, person, film, all that was varied, "
         "seed and SHA-256 of the arrays; the Parquet file holds the recipe as well. "
         "`tensorsim dataset sample DIR ID` makes a sample again from its row.",
@@ -65,10 +66,34 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
     return "\n".join(lines)
 
 
-def _scale(recipe: DatasetRecipe) -> str:
-    if recipe.outputs.dtype == "uint8":
-        return f"uint8: 255 at the peak, 0 at {recipe.outputs.range_db:g} dB below it and less"
-    return "float16: decibels below the peak"
+def _described(recipe: DatasetRecipe, kind: str) -> str:
+    """Axes, unit and scale of an output."""
+    wanted = recipe.outputs
+
+    def in_bytes(range_db: float) -> str:
+        return f"uint8, 255 at the peak, 0 at {range_db:g} dB below it and less"
+
+    scale = in_bytes(wanted.range_db) if wanted.dtype == "uint8" else "float16, dB, 0 at the peak"
+    ranges = "range (`processing.range_gate_m`, the nearest first)"
+    doppler = "Doppler (from -PRF / 2 up, positive approaching)"
+    parts = "real and imaginary part over the largest magnitude, float16"
+    speed, frames = wanted.picture_speed_m_s, f"frames ({wanted.frames_per_s:g} per second)"
+    return {
+        "doppler_time": f"{doppler}, time; {scale}",
+        "range_time": f"{ranges}, time; {scale}",
+        "range_time_mti": f"{ranges}, time, of what moves; {scale}",
+        "ridges": "strongest lines of the Doppler-time map, time; Doppler in Hz, float32",
+        "picture": f"radial speed ({-speed:g} to {speed:g} m/s, positive approaching), time; "
+        f"{in_bytes(wanted.picture_range_db)}",
+        "profiles": f"pulses, {ranges}, parts; {parts}",
+        "if_signal": f"pulses, samples of the intermediate frequency, parts; {parts}",
+        "range_doppler_angle": f"{frames}, {ranges}, {doppler}, direction (equal steps of the sine of the azimuth from "
+        f"-1 to 1); {scale}",
+        "point_cloud": f"{frames}, points, (range in m, speed in m/s, sine of the azimuth, power in dB); float32, NaN "
+        "where there is no point",
+        "joints": f"people, moments ({recipe.motion_hz:g} per second), 14 joints, (x, y, z) as the radar sees them; m, "
+        "float32, NaN where nobody is",
+    }[kind]
 
 
 def _source(recipe: DatasetRecipe, number: int) -> str:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +21,10 @@ import pytest
 from tensorsim import cli
 from tensorsim.data.sets.again import sample_again
 from tensorsim.data.sets.build import build_dataset, plan_of
+from tensorsim.data.sets.card import card
 from tensorsim.data.sets.engines import Processes, RayCluster
 from tensorsim.data.sets.manifest import recipe_of, rows_of
-from tensorsim.data.sets.outputs import OutputConfig
+from tensorsim.data.sets.outputs import OF_ARRAY, OF_PAIR, OutputConfig
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.samples import content_hash, make_sample
@@ -78,6 +80,34 @@ def test_what_is_in_the_folder(built: Path, recipe: DatasetRecipe) -> None:
     summary = json.loads((built / "dataset.json").read_text())
     assert summary["labels"] == ["S8 Walking", "S5 Sitting Down"]
     assert "| S8 Walking | 1 | 1 | 0 |" in (built / "README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("kinds", "changes", "words"),
+    [
+        (("picture",), {}, ["0 at 40 dB below", "(-3.8 to 3.8 m/s"]),
+        (("doppler_time", "ridges"), {}, ["0 at 60 dB below", "in Hz"]),
+        (("range_time", "joints"), {"dtype": "float16"}, ["dB, 0 at the peak", "moments (60 per second)"]),
+        (OF_PAIR, {}, ["real and imaginary part"]),
+        (
+            (*OF_ARRAY, "joints"),
+            {},
+            ["frames (10 per second)", "range in m, speed in m/s, sine of the azimuth"],
+        ),
+    ],
+)
+def test_the_card_says_what_every_output_is(
+    kinds: tuple[str, ...], changes: dict[str, Any], words: list[str]
+) -> None:
+    preset = "ti-awr1843-array" if "point_cloud" in kinds else "through-wall"
+    storage = StorageConfig("png" if kinds == ("picture",) else "webdataset")
+    recipe = small_recipe(
+        radars=(RadarView("a", preset),), outputs=OutputConfig(kinds=kinds, **changes), storage=storage
+    )
+    text = card(Plan(recipe), Counter(), 0, 0)
+    assert all(f"\n- `{kind}`: " in text for kind in kinds)
+    assert all(word in text for word in words)
+    assert ("60 dB" in text) == (bool(set(kinds) - {"picture", "joints"}) and not changes)
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
