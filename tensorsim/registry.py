@@ -16,11 +16,11 @@ from tensorsim.model_files import manifest, models_dir
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """One file of weights.
+    """One file of weights, or of poses.
 
     Attributes:
         name: what ``from_pretrained`` takes.
-        network: class that loads it.
+        network: class that loads it; "" of poses.
         file: its file name.
         licence: terms of the weights.
         source: authors and training data.
@@ -175,21 +175,20 @@ PUBLISHED: tuple[ModelEntry, ...] = (
 
 
 def shipped() -> tuple[ModelEntry, ...]:
-    """Networks that come with the package, as ``manifest.json`` lists them."""
+    """Files that come with the package, as ``manifest.json`` lists them."""
     return tuple(
         ModelEntry(
             name=entry["name"],
-            network=entry["network"],
+            network=entry.get("network", ""),
             file=entry["file"],
             licence=entry["licence"],
             source=entry["source"],
-            metrics=entry["metrics"],
-            preprocessing=entry["preprocessing"],
+            metrics=entry.get("metrics", ""),
+            preprocessing=entry.get("preprocessing", ""),
             sha256=entry["sha256"],
             default=entry.get("default", False),
         )
         for entry in manifest()
-        if "network" in entry
     )
 
 

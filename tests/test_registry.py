@@ -15,6 +15,7 @@ import tensorsim
 from tensorsim import cli, registry
 from tensorsim.enhance import DnCNN
 from tensorsim.errors import TensorsimError
+from tensorsim.model_files import manifest
 from tensorsim.registry import PUBLISHED, ModelEntry
 from tensorsim.vision import HRNet, RTMDet
 from tensorsim.weights import save_weights
@@ -192,6 +193,9 @@ def test_shipped_entries_are_in_order(entry: ModelEntry) -> None:
     assert entry.path.with_suffix(".md").is_file(), "a weight has a card"
 
 
+#: Files of networks; another one holds poses.
+NETWORKS = tuple(entry for entry in registry.shipped() if entry.network)
+
 #: What each network of a shipped file is shown, by its class or the name of the file.
 SHOWN = {
     "RTMDet": (1, 3, 96, 128),
@@ -206,7 +210,7 @@ SHOWN = {
 }
 
 
-@pytest.mark.parametrize("entry", registry.shipped(), ids=lambda entry: entry.name)
+@pytest.mark.parametrize("entry", NETWORKS, ids=lambda entry: entry.name)
 def test_shipped_networks_load_run_and_script(entry: ModelEntry) -> None:
     rooms = (tensorsim.vision, tensorsim.enhance, tensorsim.recognition)
     (room,) = (room for room in rooms if hasattr(room, entry.network))
@@ -277,7 +281,10 @@ def test_commands(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["models", "list"])
     listed = capsys.readouterr().out
     assert all(entry.name in listed and entry.licence in listed for entry in registry.entries())
+    assert all(entry["name"] in listed for entry in manifest())
     cli.main(["models", "verify"])
+    verified = capsys.readouterr().out
+    assert all(f"ok    {entry['name']}: {entry['sha256']}" in verified for entry in manifest())
     with pytest.raises(SystemExit) as stop:
         cli.main(["models", "fetch", "rtmdet-m-persn"])
     assert stop.value.code == 2

@@ -17,9 +17,8 @@ class ListModels:
 
         for entry in registry.entries():
             there = "shipped" if entry.shipped else "fetched" if entry.path.is_file() else "online"
-            print(
-                f"{entry.name}\n    {entry.network}, {there}, {entry.licence}, {entry.assurance}; {entry.metrics}"
-            )
+            words = [entry.network or "poses", there, entry.licence, entry.assurance]
+            print(f"{entry.name}\n    {', '.join(words)}" + (f"; {entry.metrics}" if entry.metrics else ""))
             print(f"    {entry.source}; {entry.path if there != 'online' else entry.url}")
 
 
