@@ -26,7 +26,7 @@ class ModelEntry:
         source: authors and training data.
         metrics: accuracy as its authors state it, or a reference to the card.
         preprocessing: of the input, which the class does.
-        sha256: full digest, its first eight digits where only those are published, or "" where none is.
+        sha256: full digest, or its first eight digits where only those are published.
         url: address of the file; None for a shipped one.
         default: whether ``from_pretrained()`` without a name loads it.
     """
@@ -52,9 +52,7 @@ class ModelEntry:
         """How well a download is verified, in words."""
         if len(self.sha256) == 64:
             return "whole SHA-256"
-        if self.sha256:
-            return f"{len(self.sha256)} digits of SHA-256, which is weak"
-        return "no SHA-256 is published: unverified"
+        return f"{len(self.sha256)} digits of SHA-256, which is weak"
 
     @property
     def path(self) -> Path:
@@ -254,20 +252,18 @@ def name_of(path: Path) -> str:
     return next((entry.name for entry in shipped() if entry.path == path), str(path))
 
 
-def fetch(entry: ModelEntry, quiet: bool = False, unverified: bool = False) -> Path:
+def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
     """The file of an entry, downloaded if it is not there. An interrupted download goes on where it stopped.
 
-    The whole SHA-256 of the download is kept beside it, so that later changes are noticed also where only eight digits,
-    or none, are published.
+    The whole SHA-256 of the download is kept beside it, so that later changes are noticed also where only eight digits
+    are published.
 
     Args:
         entry: which file.
         quiet: no progress bar.
-        unverified: download also what has no published SHA-256.
 
     Raises:
-        TensorsimError: no connection, a file whose SHA-256 is another (it is removed), or no published SHA-256 without
-            ``unverified``.
+        TensorsimError: no connection, or a file whose SHA-256 is another (it is removed).
     """
     path = entry.path
     if entry.url is None:
@@ -275,11 +271,6 @@ def fetch(entry: ModelEntry, quiet: bool = False, unverified: bool = False) -> P
     if path.is_file():
         verify(entry)
         return path
-    if not entry.sha256 and not unverified:
-        raise TensorsimError(
-            f"{entry.name}: no SHA-256 of {entry.url} is published, so that a download cannot be verified; take it all "
-            f"the same with tensorsim models fetch --unverified {entry.name}"
-        )
     import gdown
     import requests
 

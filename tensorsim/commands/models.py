@@ -30,8 +30,6 @@ class FetchModels:
     """Names as `tensorsim models list` prints them."""
     quiet: bool = False
     """No progress bar."""
-    unverified: bool = False
-    """Download also files of which no SHA-256 is published."""
 
     def run(self) -> None:
         """Do it."""
@@ -41,7 +39,7 @@ class FetchModels:
             raise TensorsimError("models fetch: got no names, expected some of `tensorsim models list`")
         wanted = [registry.find(name) for name in self.names]
         for entry in wanted:
-            print(f"{entry.name}: {registry.fetch(entry, self.quiet, self.unverified)} ({entry.assurance})")
+            print(f"{entry.name}: {registry.fetch(entry, self.quiet)} ({entry.assurance})")
 
 
 @dataclass(frozen=True)
