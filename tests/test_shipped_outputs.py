@@ -80,7 +80,7 @@ EXPECTED: dict[str, tuple[list[float], float]] = {
 
 
 @pytest.mark.parametrize(
-    "entry", filter(lambda entry: entry.network, registry.shipped()), ids=lambda e: e.name
+    "entry", [entry for entry in registry.shipped() if entry.network], ids=lambda e: e.name
 )
 def test_outputs_are_those_of_the_file(entry: registry.ModelEntry) -> None:
     rooms = (ts.vision, ts.enhance, ts.recognition)
