@@ -11,6 +11,7 @@ import torch
 
 import tensorsim as ts
 from tensorsim import plot
+from tensorsim.evaluation.report import save_pictures
 from tensorsim.plot.overview import overview_figure, save_small
 
 
@@ -174,6 +175,17 @@ def test_caption_names_film_radar_and_label() -> None:
     assert line == "clip.mp4 | 77 GHz, sweep 4 GHz, PRF 8192 Hz | S8 Walking"
     assert plot.caption(radar, film=os.fsdecode(b"caf\xe9.npz")).startswith("caf?.npz | ")
     assert plot.caption(radar) == "77 GHz, sweep 4 GHz, PRF 8192 Hz"
+
+
+def test_names_with_dollar_signs_are_drawn_as_they_are(tmp_path: Path) -> None:
+    """Between two of them matplotlib reads mathematics, which ``a_$`` is not."""
+    name, axis = "a$b_$c.mp4", np.arange(5.0)
+    confusion = plot.confusion_figure(np.eye(2), [name, "b"], "counts")
+    maps = plot.map_figure(np.ones((5, 5)), axis, axis, "map", "range in m", subtitle=name)
+    skeleton = plot.skeleton_figure(np.zeros((0, 4, 14, 3)), np.zeros((0, 4), bool), 10.0, subtitle=name)
+    for figure in (confusion, maps, skeleton):
+        plot.save_figure(figure, tmp_path / "figure.png")
+    save_pictures(tmp_path / "maps.png", {name: [(name, np.ones((5, 5)))]}, axis)
 
 
 def test_skeleton_axes_hold_feet_below_the_floor_and_what_is_far_off_is_reported() -> None:

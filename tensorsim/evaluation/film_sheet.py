@@ -61,7 +61,7 @@ def contact_sheet(
         axes = figure.add_subplot(grid[_ROWS, place * width : (place + 1) * width])
         _draw_map(axes, verdict, maps, map_axes)
     _draw_places(figure.add_subplot(grid[_ROWS, len(scenes) * width :]), pose, reader.fps)
-    figure.suptitle(f"{film.file}: {' or '.join(film.accept)}{_said_of(camera)}")
+    figure.suptitle(f"{film.file}: {' or '.join(film.accept)}{_said_of(camera)}", parse_math=False)
     return figure
 
 
@@ -133,7 +133,8 @@ def _draw_map(
     said = "no map" if verdict.label is None else f"{verdict.label} {verdict.probability:.2f}"
     axes.set_title(f"{verdict.scene}: {said}", fontsize=10, color="tab:green" if verdict.right else "tab:red")
     if maps is None or map_axes is None:
-        axes.text(0.5, 0.5, fill(verdict.error or "", 60), ha="center", va="center", fontsize=8)
+        said = fill(verdict.error or "", 60)  # it may name the film
+        axes.text(0.5, 0.5, said, ha="center", va="center", fontsize=8, parse_math=False)
         axes.set_axis_off()
         return
     speed = map_axes.doppler_hz * map_axes.speed_per_hz

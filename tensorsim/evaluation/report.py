@@ -186,6 +186,6 @@ def save_pictures(
             )  # fmt: skip
             axes.set_ylim(max(speed[0], -5), min(speed[-1], 5))
             axes.set_xticks([])
-            axes.set_title(f"{row}: {name}", fontsize=7)
+            axes.set_title(f"{row}: {name}", fontsize=7, parse_math=False)
     figure.supylabel("radial speed in m/s, positive = approaching", fontsize=8)
     save_figure(figure, path)

@@ -202,7 +202,7 @@ def map_figure(
             facecolor="darkgray",
         )
     if subtitle is not None:
-        figure.suptitle(subtitle, fontsize="small", color="dimgray")
+        figure.suptitle(subtitle, fontsize="small", color="dimgray", parse_math=False)
     if speed_per_axis is not None:
         _add_speed_axis(row[-1], speed_per_axis)
     label = "dB below the peak" if peak is None else "dB below the echo of a person"
@@ -303,8 +303,8 @@ def confusion_figure(counts: np.ndarray, names: list[str], title: str) -> Figure
         if count:
             colour = "white" if share[row, column] > 0.5 else "black"
             axes.text(column, row, str(count), ha="center", va="center", color=colour, fontsize=8)
-    axes.set_xticks(range(len(names)), names)
-    axes.set_yticks(range(len(names)), names)
+    axes.set_xticks(range(len(names)), names, parse_math=False)
+    axes.set_yticks(range(len(names)), names, parse_math=False)
     axes.set_xlabel("predicted")
     axes.set_ylabel("true")
     axes.set_title(title)

@@ -100,7 +100,7 @@ def skeleton_figure(
     if low[2] < -0.02:
         remarks.append(f"the lowest joint is {-low[2]:.2f} m below the floor")
     if remarks:
-        figure.supxlabel("\n".join(remarks), fontsize="small", color="dimgray")
+        figure.supxlabel("\n".join(remarks), fontsize="small", color="dimgray", parse_math=False)
     return figure
 
 

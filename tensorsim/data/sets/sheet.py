@@ -6,7 +6,6 @@ import numpy as np
 
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.stored import StoredArrays
-from tensorsim.files import complete_file
 
 #: Samples of a class, classes that are shown, and outputs that are pictures, the best first.
 _SAMPLES, _CLASSES = 6, 24
@@ -35,7 +34,7 @@ def draw_sheet(out: Path, recipe: DatasetRecipe) -> bool:
         axes.set_yticks([])
         axes.set_frame_on(False)
     for label, line in zip(labels, grid, strict=True):
-        line[0].set_ylabel(label, fontsize=8)
+        line[0].set_ylabel(label, fontsize=8, parse_math=False)
         for row, axes in zip(chosen[label], line, strict=False):
             axes.imshow(
                 read(row, name).astype(np.float32),
@@ -44,10 +43,7 @@ def draw_sheet(out: Path, recipe: DatasetRecipe) -> bool:
                 cmap="turbo",
                 interpolation="none",
             )
-            axes.set_title(f"{row['id']} {row['person']}", fontsize=6)
-    figure.suptitle(f"{recipe.name}: {name}", fontsize=9)
-    with complete_file(out / "contact_sheet.png") as scratch:
-        picture = scratch.with_suffix(".png")
-        save_figure(figure, picture)
-        picture.replace(scratch)
+            axes.set_title(f"{row['id']} {row['person']}", fontsize=6, parse_math=False)
+    figure.suptitle(f"{recipe.name}: {name}", fontsize=9, parse_math=False)
+    save_figure(figure, out / "contact_sheet.png")
     return True

@@ -5,6 +5,7 @@ import gc
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.samples import content_hash, make_sample
 from tensorsim.data.sets.shards import write_shard
+from tensorsim.data.sets.sheet import draw_sheet
 from tensorsim.data.sets.stored import StoredArrays
 from tensorsim.data.sets.variations import VariationConfig
 from tensorsim.errors import TensorsimError
@@ -153,6 +155,28 @@ def test_every_name_of_a_radar_is_one_in_matlab(name: str, tmp_path: Path) -> No
     assert (read == sample.arrays[f"{name}.doppler_time"]).all()
     (variable,) = {n for n in scipy.io.loadmat(tmp_path / file) if n.endswith("time")}
     assert re.fullmatch("[A-Za-z][A-Za-z0-9_]*", variable)
+
+
+def test_the_contact_sheet_takes_any_name_and_leaves_what_the_next_build_finds(
+    built: Path, recipe: DatasetRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from matplotlib.figure import Figure
+
+    def named(out: Path) -> Iterator[dict[str, Any]]:
+        return (row | {"label": "a$b_$c", "person": "a$b_$c"} for row in rows_of(out))
+
+    def seen(figure: Figure, path: Path, **options: Any) -> None:
+        save(figure, path, **options)
+        assert path.name == f".contact_sheet.png.{os.getpid()}.tmp"
+        assert path.read_bytes().startswith(b"\x89PNG")
+
+    shutil.copytree(built, tmp_path / "set")
+    (tmp_path / "set" / "contact_sheet.png").unlink()
+    save = Figure.savefig
+    monkeypatch.setattr("tensorsim.data.sets.manifest.rows_of", named)
+    monkeypatch.setattr(Figure, "savefig", seen)
+    assert draw_sheet(tmp_path / "set", replace(recipe, name="a$b_$c"))
+    assert (tmp_path / "set" / "contact_sheet.png").is_file()
 
 
 def test_pictures_in_folders_of_classes(tmp_path: Path) -> None:
