@@ -18,9 +18,22 @@ class TensorsimWarning(UserWarning):
 
 
 def check_positive(value: float, name: str) -> None:
-    """Refuse a number that is not finite and above zero."""
+    """Refuse anything but a number that is finite and above zero."""
+    if not isinstance(value, float):  # whole numbers, those of NumPy; TorchScript leaves this out
+        value = _number(value, name)
     if not (value > 0.0 and value < float("inf")):
         raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
+
+
+def _number(value: Any, name: str) -> Any:
+    """The value if it can be compared as one number; texts, nothing, truth values and several numbers are refused."""
+    try:
+        if str(getattr(value, "dtype", type(value).__name__)).endswith("bool"):
+            raise TypeError
+        bool(value > 0.0)
+    except (TypeError, ValueError, RuntimeError):
+        raise TensorsimError(f"{name}: got {value!r}, expected a positive finite number") from None
+    return value
 
 
 def check_count(value: object, name: str, least: int = 1, most: float = math.inf) -> int:
@@ -34,7 +47,7 @@ def check_count(value: object, name: str, least: int = 1, most: float = math.inf
 
 def check_choice(value: object, choices: Collection[str], name: str) -> None:
     """Refuse anything but one of these names."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise TensorsimError(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
 
 

@@ -12,7 +12,14 @@ from torch import Tensor
 
 import tensorsim as ts
 from tensorsim.body.skeleton import body_to_coco
-from tensorsim.errors import TensorsimError, check_count, check_finite, check_tensor
+from tensorsim.errors import (
+    TensorsimError,
+    check_choice,
+    check_count,
+    check_finite,
+    check_positive,
+    check_tensor,
+)
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
 
 RADAR = ts.RadarConfig.through_wall()
@@ -126,6 +133,26 @@ def test_counts_without_end_are_refused_at_once() -> None:
         with pytest.raises(TensorsimError, match="got"):
             make()
     assert time.process_time() - start < 1.0
+
+
+def test_positive_numbers_are_numbers() -> None:
+    for number in (3, 0.5, np.float32(2), np.int64(2), np.float64(2), np.array(2.0), torch.tensor(2.0)):
+        check_positive(number, "x")
+    for value in ("50", None, True, np.bool_(True), torch.tensor(True), [1.0], np.ones(2), 1j, torch.ones(2)):
+        with pytest.raises(TensorsimError, match=r"(?s)^x: got .*, expected a positive finite number$"):
+            check_positive(value, "x")  # type: ignore[arg-type]
+    for number in (0, -1.0, math.inf, math.nan, np.float32("nan"), torch.tensor(-1.0)):
+        with pytest.raises(TensorsimError, match=r"^x: got .*, expected a positive finite number$"):
+            check_positive(number, "x")
+    with pytest.raises(TensorsimError, match=r"^x: got '50', expected"):
+        check_positive("50", "x")  # type: ignore[arg-type]
+
+
+def test_choices_are_names() -> None:
+    check_choice("a", {"a": 1}, "x")
+    for value in ("c", None, 1, ["a"]):
+        with pytest.raises(TensorsimError, match=r"^x: got .*, expected one of a, b$"):
+            check_choice(value, {"a": 1, "b": 2}, "x")
 
 
 def test_counts_are_integers_and_become_pythons() -> None:
