@@ -12,8 +12,8 @@ from tensorsim.data.sets.variations import Variation
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
 
-#: Motions that a source keeps in memory.
-_KEPT = 256
+#: Memory for the motions that a source keeps; a minute of one person at 120 frames per second takes 2.4 MB.
+_KEPT_MB = 200.0
 #: How the clips of each kind of source are listed.
 LISTS: dict[str, Callable[[SourceConfig], list[Clip]]] = {
     "films": listing.folder_of_films,
@@ -83,9 +83,10 @@ class FileClips:
         """The people of a clip's file; the last ones are kept, since files with many motions take long to read."""
         key = (clip.path, clip.key)
         if key not in self._motions:
-            if len(self._motions) >= _KEPT:
-                self._motions.pop(next(iter(self._motions)))
             self._motions[key] = self.finder.motion(*key)
+            used = sum(motion.joints.nbytes for motion in self._motions.values())
+            while used > _KEPT_MB * 1e6 and len(self._motions) > 1:
+                used -= self._motions.pop(next(iter(self._motions))).joints.nbytes
         return self._motions[key]
 
     def prepare(self, clip: Clip) -> None:

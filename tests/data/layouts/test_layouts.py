@@ -319,6 +319,24 @@ def test_captured_motion_in_folders_of_classes(tmp_path: Path) -> None:
     assert not clips.finds_people
 
 
+def test_motions_are_kept_within_their_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "walk").mkdir()
+    for name, seconds in (("a", 1), ("b", 1), ("c", 1), ("d", 9)):
+        np.savez(tmp_path / "walk" / f"{name}.npz", joints_m=np.tile(WALK, (seconds, 1, 1)), fps=30.0)
+    recipe = small_recipe(sources=(SourceConfig("motion", str(tmp_path)),))
+    clips = FileClips(recipe, recipe.sources[0], 0)
+    read: list[str] = []
+    find = clips.finder.motion
+    monkeypatch.setattr(
+        clips.finder, "motion", lambda path, key: read.append(Path(path).stem) or find(path, key)
+    )
+    one = find(clips.clip(0).path, "").joints.nbytes
+    monkeypatch.setattr("tensorsim.data.sets.files._KEPT_MB", 2.5 * one / 1e6)
+    for place in (0, 1, 0, 1, 2, 1, 2, 0, 3, 3, 2):
+        clips.scene(clips.clip(place), draw(VariationConfig(), 0))
+    assert "".join(read) == "abcadc"
+
+
 def test_keypoints_in_folders_of_classes(tmp_path: Path) -> None:
     from tests.film import STANDING
     from tests.test_sources import coco_json
