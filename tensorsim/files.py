@@ -113,7 +113,8 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A scratch path that is renamed to ``path`` when the block succeeds, and removed otherwise.
 
     The folder is created if needed. The scratch path is in the same folder and ends in ``.tmp``. The file gets the
-    permissions that new files usually have.
+    permissions that new files usually have, and is on the disk before it has its name: also after a power failure it is
+    complete, or not there.
 
     Raises:
         NotWrittenError: the disk is full, or the folder is not writable.
@@ -127,6 +128,8 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             rights = scratch.stat().st_mode
             yield scratch
             os.chmod(scratch, rights)  # safetensors makes files readable by their owner only
+            with scratch.open("r+b") as file:
+                os.fsync(file.fileno())
             os.replace(scratch, path)
         finally:
             scratch.unlink(missing_ok=True)

@@ -34,6 +34,27 @@ def test_a_file_appears_at_the_end_in_a_folder_that_is_made(tmp_path: Path) -> N
     assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
 
 
+def test_a_file_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, calls = tmp_path / "a.txt", []
+    fsync, replace = os.fsync, os.replace
+
+    def synced(number: int) -> None:
+        calls.append((os.fstat(number).st_size, path.exists()))
+        fsync(number)
+
+    def replaced(source: Path, target: Path) -> None:
+        calls.append((source.stat().st_size, path.exists()))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    write_text(path, "whole")
+    assert calls == [(5, False), (5, False)]
+    assert path.read_text() == "whole"
+
+
 def test_a_block_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
