@@ -107,7 +107,7 @@ def place(motion: Motion, range_m: float | None = None, heading_rad: float = 0.0
         x_m: x of these hips, used with ``range_m``.
 
     Returns:
-        The motion with its lowest joint at ankle height over z = 0.
+        The motion with its lowest joint at ankle height over z = 0; joints of absent people are zeros.
 
     Raises:
         TensorsimError: a first person without a valid frame; joints or a place that are not finite.

@@ -11,6 +11,7 @@ from tensorsim.data.motion_files import place
 from tensorsim.data.sets.variations import Variation, VariationConfig
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
+from tensorsim.motion.absence import continued
 from tensorsim.motion.resample import PoseResampler
 
 
@@ -54,7 +55,7 @@ def varied(motion: Motion, variation: Variation) -> Motion:
 def part_of(motion: Motion, duration_s: float, rate_hz: float, start: float) -> Scene:
     """``duration_s`` of a motion at ``rate_hz``, from a share ``start`` of what there is to choose from.
 
-    A shorter one is there for as long as it lasts.
+    A shorter one is there for as long as it lasts. Frames in which somebody is absent do not matter.
 
     Raises:
         TensorsimError: fewer than two frames.
@@ -63,7 +64,7 @@ def part_of(motion: Motion, duration_s: float, rate_hz: float, start: float) -> 
     if frames < 2:
         raise TensorsimError(f"motion: got {frames} frame, expected at least 2")
     count = round(duration_s * rate_hz)
-    resampled = PoseResampler(rate_hz)(motion.joints.double(), motion.fps)
+    resampled = PoseResampler(rate_hz)(continued(motion.joints, motion.valid), motion.fps)
     there = resampled.shape[1]
     nearest = (torch.arange(there) * (motion.fps / rate_hz)).round().long().clamp(max=frames - 1)
     valid = motion.valid[:, nearest]

@@ -15,6 +15,7 @@ from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.batches import synthesize_batch
 from tensorsim.data.sets.build import build_dataset
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
+from tensorsim.data.sets.people import finite_everywhere
 from tensorsim.data.sets.plan import Plan, shared_out
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.scene import Scene, kept_inside, part_of, seen_from, varied
@@ -229,6 +230,25 @@ def test_a_short_motion_ends_with_nobody_and_a_long_one_is_cut() -> None:
     first, last = part_of(walk(), 1.0, 60.0, 0.0), part_of(walk(), 1.0, 60.0, 1.0)
     assert bool(first.valid.all())
     assert not torch.allclose(first.joints, last.joints)
+
+
+def test_whoever_leaves_or_comes_keeps_the_speed_until_then() -> None:
+    """Absent frames, at the origin in placed motion, must not bend the curve beside them."""
+    recipe = small_recipe(outputs=OutputConfig(dtype="float16", rate_hz=None))
+    drawn = replace(draw(recipe.variations, 1), snr_db=None, speed=1.0, distance_m=3.0, height_m=None)
+    recipe = replace(recipe, scene=SceneConfig(snr_db=None))
+    motion = walk()
+    valid = motion.valid.clone()
+    valid[:, :12], valid[:, 48:] = False, False
+    absent = Motion(finite_everywhere(motion._replace(valid=valid), "walk").joints, valid, 30.0)
+    whole, seen = (part_of(varied(one, drawn), 2.0, 60.0, 0.0) for one in (motion, absent))
+    whole = whole._replace(joints=whole.joints + (seen.joints - whole.joints)[:, 60:61, :1], valid=seen.valid)
+    assert int(seen.valid.sum()) == pytest.approx(72, abs=2)
+    assert (seen.joints - whole.joints)[seen.valid].abs().max() < 0.02
+    maps = [synthesize(recipe, scene, drawn).arrays["front.doppler_time"] for scene in (seen, whole)]
+    power, expected = (10 ** (found.astype(float) / 10) for found in maps)
+    assert np.abs(power - expected).sum() / expected.sum() < 0.02
+    assert (power.sum(0) < 1.2 * expected.sum(0) + 1e-3).all()
 
 
 def test_people_are_kept_inside_by_the_least_move() -> None:
