@@ -93,12 +93,12 @@ class SourceConfig:
                 raise TensorsimError(
                     f"SourceConfig.{name}: got none for the kind {self.kind!r}, expected one"
                 )
-        if len(set(self.classes)) < len(self.classes):
-            raise TensorsimError(f"SourceConfig.classes: got {list(self.classes)}, expected each class once")
         if self.people is not None:
             require_counts(self, "people")
             names = tuple(ACTIVITIES[activity_index(name)] for name in self.classes) or ACTIVITIES
             object.__setattr__(self, "classes", names)
+        if len(set(self.classes)) < len(self.classes):
+            raise TensorsimError(f"SourceConfig.classes: got {list(self.classes)}, expected each class once")
         if self.fps is not None:
             require_positive("SourceConfig", fps=self.fps)
 

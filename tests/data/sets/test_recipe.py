@@ -61,6 +61,10 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ),
         ("sources: [{kind: films, path: a, people: 3}]", "SourceConfig.people: got one for the kind 'films'"),
         ("sources: [{people: 1, classes: [flying]}]", "activity: got 'flying'"),
+        (
+            "sources: [{people: 1, classes: [walking, Walking]}]",
+            r"got \['S8 Walking', 'S8 Walking'\], expected each class once",
+        ),
         ("radars: [{preset: nothing}]", "got 'nothing', which is not a file"),
         ("radars: [{}, {}]", "got the names"),
         ("radars: [{name: front}, {name: Front}]", "expected ones that differ not only in capitals"),
