@@ -171,8 +171,8 @@ class Plan:
         for word in filter(None, variation.companions.split(",")):
             seed = int(word)
             other_source, other = self._companion(there.person, part, seed)
-            # They share the scene, so its place and direction; body, mirror image and speed are their own.
-            own = replace(draw(self.recipe.variations, seed), distance_m=variation.distance_m)
+            # They start beside the first and go the same way; body, mirror image and speed are their own.
+            own = replace(draw(self.recipe.variations, seed), heading_deg=variation.heading_deg)
             scenes.append(other_source.scene(other, other_source.adapted(other, own)))
         together = beside_each_other(scenes, self.recipe.variations.spacing_m)
         return kept_inside(together, self.recipe.variations)

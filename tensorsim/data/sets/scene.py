@@ -4,9 +4,10 @@ import math
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from tensorsim.body.skeleton import body_height, mirror
+from tensorsim.body.skeleton import body_height, mid_hips, mirror
 from tensorsim.data.motion_files import place
 from tensorsim.data.sets.variations import Variation, VariationConfig
 from tensorsim.data.skeletons import Motion
@@ -78,13 +79,25 @@ def part_of(motion: Motion, duration_s: float, rate_hz: float, start: float) -> 
 
 
 def beside_each_other(scenes: list[Scene], spacing_m: float) -> Scene:
-    """Several scenes of one length in one: the first stays, the others are moved to its right and left in turn."""
+    """Several scenes of one length in one: the first stays, the others start to its right and left in turn.
+
+    Args:
+        scenes: each with its people; the first of them counts.
+        spacing_m: distance in x of neighbours at the start.
+    """
     joints, valid = [], []
     for k, scene in enumerate(scenes):
         side = (1 if k % 2 else -1) * ((k + 1) // 2) * spacing_m
-        joints.append(scene.joints + scene.joints.new_tensor([side, 0.0, 0.0]))
+        beside = _start(scenes[0]) - _start(scene) + scene.joints.new_tensor([side, 0.0, 0.0])
+        joints.append(scene.joints + beside)
         valid.append(scene.valid)
     return Scene(torch.cat(joints), torch.cat(valid), scenes[0].fps)
+
+
+def _start(scene: Scene) -> Tensor:
+    """Where the hips (3,) of the first person are above when that person is first there, with z 0."""
+    first = int(scene.valid[0].int().argmax())
+    return F.pad(mid_hips(scene.joints[0, first])[:2], (0, 1))
 
 
 def kept_inside(scene: Scene, config: VariationConfig) -> Scene:

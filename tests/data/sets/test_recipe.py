@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tensorsim import cli
+from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import SceneConfig, SimulationConfig, Vector, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.data.sets.array_outputs import array_outputs
@@ -165,6 +166,23 @@ def test_nobody_is_in_two_parts_not_even_as_a_companion() -> None:
     assert len(seen) == 45
     assert all(len(parts) == 1 for parts in part_of_person.values())
     assert [shard.stop - shard.first for shard in plan.shards][:3] == [2, 2, 2]
+
+
+def test_people_of_a_scene_walk_beside_one_another() -> None:
+    recipe = small_recipe(
+        duration_s=3.0,
+        sources=(SourceConfig(classes=("walking",), people=6),),
+        split=SplitConfig(shares=(1.0, 0.0, 0.0)),
+        variations=VariationConfig(people=(3, 3)),
+    )
+    plan = Plan(recipe)
+    for clip in range(6):
+        scene = plan.scene(clip, "train", plan.variation(clip, 0))
+        hips = mid_hips(scene.joints)[..., :2]
+        start = hips[:, 0] - hips[:1, 0]
+        assert torch.allclose(start, torch.tensor([[0.0, 0.0], [0.8, 0.0], [-0.8, 0.0]]), atol=1e-5)
+        apart = [(hips[i] - hips[j]).norm(dim=-1).min() for i, j in ((0, 1), (0, 2), (1, 2))]
+        assert min(apart) > 0.5  # they passed through one another
 
 
 def test_maps_in_bytes_and_half_floats() -> None:
