@@ -23,7 +23,7 @@ class VariationConfig:
         count: samples made of every clip.
         height_m: body height.
         distance_m: y of the hips of the first person at the start.
-        side_m: x of the hips of the first person at the start.
+        side_m: x of the hips of the first person at the start; of generated people, of the middle of their path.
         keep_m: nearest and farthest y of anybody; people are moved along y by the least amount to stay inside.
         heading_deg: turn of the whole motion about the vertical. Generated people face the radar at 0.
         mirror: probability that left and right are exchanged.

@@ -185,6 +185,16 @@ def test_people_of_a_scene_walk_beside_one_another() -> None:
         assert min(apart) > 0.5  # they passed through one another
 
 
+@pytest.mark.parametrize("side", [-1.2, 0.4])
+def test_generated_people_are_beside_the_axis_as_the_manifest_says(side: float) -> None:
+    plan = Plan(small_recipe(variations=VariationConfig(side_m=(side, side))))
+    for clip in range(4):
+        drawn = plan.variation(clip, 0)
+        x = mid_hips(plan.scene(clip, "train", drawn).joints)[..., 0]
+        assert drawn.side_m == side
+        assert float(x.min() + x.max()) / 2 == pytest.approx(side, abs=0.1)
+
+
 def test_maps_in_bytes_and_half_floats() -> None:
     magnitude = torch.rand(20, 30) + 1e-3
     stored = stored_map(magnitude, OutputConfig(rate_hz=None), 1.0)
