@@ -60,8 +60,8 @@ class Processes:
             try:
                 while waiting or running:
                     while waiting and len(running) < 2 * self.workers:
-                        job = waiting.pop()
-                        running[pool.submit(work, job)] = job
+                        running[pool.submit(work, waiting[-1])] = waiting[-1]
+                        waiting.pop()  # only now: a pool that broke meanwhile refuses jobs
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
                         count = future.result()
                         del running[future]
@@ -91,11 +91,13 @@ def _one_thread() -> None:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
-    """Do not wait for jobs that nobody asks for any more."""
+    """End the workers, also in the midst of jobs that nobody asks for any more; then none of them writes any more."""
     processes = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
         process.terminate()
+    for process in processes:
+        process.join()
 
 
 class RayCluster:

@@ -12,6 +12,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +22,7 @@ import numpy as np
 import pytest
 
 from tensorsim import cli
+from tensorsim.data.sets import engines
 from tensorsim.data.sets.again import sample_again
 from tensorsim.data.sets.build import build_dataset, plan_of
 from tensorsim.data.sets.card import card
@@ -432,6 +435,44 @@ def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
     assert sum(Processes(2).run(die_once, jobs)) == 3
     with pytest.raises(TensorsimError, match="got 3 processes that died in a row"):
         list(Processes(1).run(die, ["x"]))
+
+
+def test_a_pool_that_breaks_while_jobs_are_given_out_loses_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = []
+
+    class Worker:
+        def terminate(self) -> None:
+            ended.append("terminated")
+
+        def join(self) -> None:
+            ended.append("joined")
+
+    class Pool:
+        """Breaks at its second job, the first time."""
+
+        pools = 0
+
+        def __init__(self, *_: Any) -> None:
+            self._processes = {1: Worker()}
+            Pool.pools += 1
+            self.jobs = 0
+
+        def submit(self, work: Any, job: Any) -> Future[int]:
+            self.jobs += 1
+            if Pool.pools == 1 and self.jobs == 2:
+                raise BrokenProcessPool
+            future: Future[int] = Future()
+            future.set_result(work(job))
+            return future
+
+        def shutdown(self, wait: bool, cancel_futures: bool) -> None:
+            ended.append("shut down")
+
+    monkeypatch.setattr(engines, "ProcessPoolExecutor", Pool)
+    done: list[int] = []
+    assert sum(Processes(2).run(lambda job: done.append(job) or 1, range(5))) == 5
+    assert set(done) == {0, 1, 2, 3, 4}
+    assert ended == 2 * ["shut down", "terminated", "joined"]
 
 
 @pytest.mark.slow
