@@ -14,7 +14,7 @@ class Clip:
     Attributes:
         name: tells it apart from all others of its source; it does not depend on where the files are.
         label: name of its class.
-        person: who is in it.
+        person: who is in it; where nobody says so, the file, as somebody else than in any other file.
         origin: the film or file, or the generator.
         part: of the data set, if the source fixes it; else "".
         path: of its file, if it has one.

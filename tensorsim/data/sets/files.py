@@ -1,6 +1,7 @@
 """Files of people as a source of labelled clips: films, key points, captured motion, and the layouts of public sets."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from tensorsim.data.layouts import listing
@@ -53,7 +54,7 @@ class FileClips:
                 f"sources: got the class {missing[0]!r} for {source.path}, expected some of {', '.join(there[:50])}"
             )
         self.labels = source.classes or tuple(there)
-        self.clips = [clip for clip in found if clip.label in self.labels]
+        self.clips = [_told_apart(clip, source, number) for clip in found if clip.label in self.labels]
         self.finder = PeopleFinder(source, None if cache is None else Path(cache))
         self.finds_people = any(is_film(Path(clip.path)) for clip in self.clips)
         self._motions: dict[tuple[str, str], Motion] = {}
@@ -92,6 +93,11 @@ class FileClips:
     def prepare(self, clip: Clip) -> None:
         """Find the people of the clip's file."""
         self.finder.motion(clip.path, clip.key)
+
+
+def _told_apart(clip: Clip, source: SourceConfig, number: int) -> Clip:
+    """A person known by the file alone is somebody else than in a file of the same name of another source."""
+    return replace(clip, person=f"{source.kind}{number}/{clip.person}") if clip.person == clip.origin else clip
 
 
 def cut(motion: Motion, clip: Clip) -> Motion:

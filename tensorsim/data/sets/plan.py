@@ -87,9 +87,13 @@ class Plan:
 
     def clip(self, index: int) -> tuple[ClipSource, Clip]:
         """A clip and its source."""
+        number, place = self._place(index)
+        return self.sources[number], self.sources[number].clip(place)
+
+    def _place(self, index: int) -> tuple[int, int]:
+        """The number of the source of a clip, and that of the clip in it."""
         number = int(np.searchsorted(self.starts, index, side="right")) - 1
-        source = self.sources[number]
-        return source, source.clip(index - int(self.starts[number]))
+        return number, index - int(self.starts[number])
 
     @cached_property
     def listing(self) -> str:
@@ -115,8 +119,8 @@ class Plan:
         groups: dict[str, int] = {}
         of_clip = np.empty(self.clips, np.int64)
         for index in range(self.clips):
-            number = int(np.searchsorted(self.starts, index, side="right")) - 1
-            source, place = self.sources[number], index - int(self.starts[number])
+            number, place = self._place(index)
+            source = self.sources[number]
             group = source.person(place) if by_person else source.clip(place).origin
             of_clip[index] = groups.setdefault(group, len(groups))
         return shared_out(list(groups), self.recipe.split.shares, self.recipe.seed)[of_clip]
@@ -157,7 +161,7 @@ class Plan:
     def variation(self, clip: int, number: int) -> Variation:
         """What is drawn for a variation of a clip."""
         source, there = self.clip(clip)
-        seed = seed_of(self.recipe.seed, there.name, number)
+        seed = seed_of(self.recipe.seed, self._place(clip)[0], there.name, number)
         return source.adapted(there, draw(self.recipe.variations, seed))
 
     def scene(self, clip: int, part: str, variation: Variation) -> Scene:

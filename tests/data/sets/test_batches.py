@@ -67,7 +67,7 @@ def test_a_batch_is_its_samples(changes: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("preset", ["through-wall", "free-space"])
 def test_profiles_of_a_batch_are_those_of_its_samples(preset: str) -> None:
-    recipe = small_recipe(radars=(RadarView("front", preset),))
+    recipe = small_recipe(seed=1, radars=(RadarView("front", preset),))  # nobody's feet alias
     views = [view_of(recipe, recipe.radars[0], *sample) for sample in samples(recipe)]
     assert len({view.config.processing.range_gate_m for view in views}) == 4
 
