@@ -44,8 +44,7 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
             for label in plan.labels
         ),
         "",
-        f"Split by {recipe.split.by}: nobody is in two parts." if recipe.split.by == "person" else
-        f"Split by {recipe.split.by}.",
+        _split(plan),
         "",
         "## People",
         *(_source(recipe, number) for number in range(len(recipe.sources))),
@@ -64,6 +63,23 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
         "",
     ]  # fmt: skip
     return "\n".join(lines)
+
+
+def _split(plan: Plan) -> str:
+    """What the parts have in common."""
+    by = plan.recipe.split.by
+    if by == "source":
+        return "Split by source: no film, file or generated person is in two parts."
+    if by == "table":
+        return "Split by table: parts are those of the sources."
+    unnamed = {source.kind for source, there in zip(plan.recipe.sources, plan.sources, strict=True)
+               if not there.names_people}  # fmt: skip
+    if not unnamed:
+        return "Split by person: nobody is in two parts."
+    return (
+        f"Split by person: nobody whom a source names is in two parts. Not every clip of {', '.join(sorted(unnamed))} "
+        "has a name; without one each file counts as another person, and who is in several may be in several parts."
+    )
 
 
 def _described(recipe: DatasetRecipe, kind: str) -> str:

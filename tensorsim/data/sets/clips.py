@@ -38,6 +38,8 @@ class ClipSource(Protocol):
 
     #: Names of the classes in their order.
     labels: tuple[str, ...]
+    #: Whether the source says of every clip who is in it; else each file counts as another person.
+    names_people: bool
     #: Whether networks have to find people in films, which :meth:`prepare` does.
     finds_people: bool
 

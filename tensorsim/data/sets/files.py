@@ -54,6 +54,7 @@ class FileClips:
                 f"sources: got the class {missing[0]!r} for {source.path}, expected some of {', '.join(there[:50])}"
             )
         self.labels = source.classes or tuple(there)
+        self.names_people = not any(clip.person == clip.origin for clip in found)
         self.clips = [_told_apart(clip, source, number) for clip in found if clip.label in self.labels]
         self.finder = PeopleFinder(source, None if cache is None else Path(cache))
         self.finds_people = any(is_film(Path(clip.path)) for clip in self.clips)

@@ -24,6 +24,7 @@ class GeneratedPeople:
         number: of the source in the recipe.
     """
 
+    names_people = True
     finds_people = False
 
     def __init__(self, recipe: DatasetRecipe, source: SourceConfig, number: int) -> None:

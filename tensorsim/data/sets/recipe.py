@@ -134,10 +134,12 @@ class RadarView:
 
 @dataclass(frozen=True)
 class SplitConfig:
-    """How samples are split into parts; everybody is in one part only.
+    """How samples are split into parts.
 
     Attributes:
-        by: ``"person"``; ``"source"``, the films, files or generated people; ``"table"``, the column ``split``.
+        by: ``"person"``: nobody is in two parts, as far as the source names people; where it does not, each file counts
+            as another person. ``"source"``: no film, file or generated person is in two parts. ``"table"``: as the
+            column ``split`` says.
         shares: of the people (or sources) in training, validation and test. A part with a share has at least one of
             them if there are enough.
 

@@ -34,6 +34,7 @@ class RenderedPeople:
         cache: folder for the people that were found; None finds them every time.
     """
 
+    names_people = True
     finds_people = True
 
     def __init__(

@@ -1,5 +1,6 @@
 """Recipes: what a file may say, what follows from it, and what is refused."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from tensorsim.config.processing import Mti
 from tensorsim.data.sets.array_outputs import array_outputs
 from tensorsim.data.sets.batches import synthesize_batch
 from tensorsim.data.sets.build import build_dataset
+from tensorsim.data.sets.card import card
 from tensorsim.data.sets.outputs import OutputConfig, in_decibels, resized, stored_map, stored_signal
 from tensorsim.data.sets.people import finite_everywhere
 from tensorsim.data.sets.plan import Plan, shared_out
@@ -491,6 +493,27 @@ def test_files_of_one_name_in_two_sources_are_different_people_and_samples(tmp_p
     assert (first.person, second.person) == ("motion0/walk/a.npz", "motion1/walk/a.npz")
     assert plan.variation(0, 0).seed != plan.variation(1, 0).seed
     assert [len(clips) for clips in plan.parts.values()] == [1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("people", "by", "expected"),
+    [
+        ("Ann,Ben", "person", "Split by person: nobody is in two parts."),
+        ("Ann,", "person", "Not every clip of table has a name; without one each file counts as another"),
+        ("Ann,", "source", "Split by source: no film, file or generated person is in two parts."),
+        ("Ann,", "table", "Split by table: parts are those of the sources."),
+    ],
+)
+def test_the_card_says_only_of_named_people_that_nobody_is_in_two_parts(
+    people: str, by: Any, expected: str, tmp_path: Path
+) -> None:
+    first, second = people.split(",")
+    table = f"path,label,person,split\na.npz,walk,{first},train\nb.npz,walk,{second},test\n"
+    (tmp_path / "t.csv").write_text(table)
+    sources = (SourceConfig(people=1), SourceConfig("table", str(tmp_path / "t.csv")))
+    text = card(Plan(small_recipe(sources=sources, split=SplitConfig(by))), Counter(), 0, 0)
+    assert expected in text
+    assert ("nobody is in two parts." in text) == (people == "Ann,Ben")
 
 
 def test_settings_of_walls_without_any_wall_are_named(tmp_path: Path) -> None:
