@@ -31,13 +31,17 @@ def check_folder(path: Path, option: str = "--out") -> None:
         raise TensorsimError(f"{option}: {path} is a file, expected a folder")
 
 
+def shown_name(name: str) -> str:
+    """A name of the file system as text: bytes that are not UTF-8, which no file in UTF-8 can hold, become ``\\udcff``."""
+    return name.encode(errors="backslashreplace").decode()
+
+
 def check_name(path: Path, name: str) -> None:
     """Refuse a path that is not UTF-8: OpenCV ends the process at it."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
-        shown = os.fspath(path).encode(errors="backslashreplace").decode()
-        raise TensorsimError(f"{name}: got {shown}, expected a name in UTF-8") from None
+        raise TensorsimError(f"{name}: got {shown_name(os.fspath(path))}, expected a name in UTF-8") from None
 
 
 class NotWrittenError(TensorsimError):

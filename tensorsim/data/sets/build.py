@@ -18,7 +18,7 @@ from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError, TensorsimWarning
-from tensorsim.files import LOCK, NotWrittenError, locked, reading, write_json
+from tensorsim.files import LOCK, NotWrittenError, locked, reading, shown_name, write_json
 
 #: The folder of finished shards' rows, in it the file that is written first: the recipe and the listing of the clips.
 ROWS, BEGUN = ".rows", "begun.json"
@@ -90,7 +90,8 @@ def build_shard(job: Job) -> int:
             if job.strict:
                 raise TensorsimError(str(error)) from error
             clip = plan.clip(plan.clip_of_sample(number)[1])[1]
-            failures.append({"clip": clip.name, "path": clip.path, "reason": " ".join(str(error).split())})
+            reason = shown_name(" ".join(str(error).split()))
+            failures.append({"clip": clip.name, "path": shown_name(clip.path), "reason": reason})
     out = Path(job.out)
     files = write_shard(out, plan.recipe.storage, shard.name, samples)
     rows = [sample.row for sample in samples]

@@ -12,6 +12,7 @@ from tensorsim.data.sets.scene import Scene, part_of, varied
 from tensorsim.data.sets.variations import Variation
 from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
+from tensorsim.files import shown_name
 
 #: Memory for the motions that a source keeps; a minute of one person at 120 frames per second takes 2.4 MB.
 _KEPT_MB = 200.0
@@ -46,7 +47,7 @@ class FileClips:
         self, recipe: DatasetRecipe, source: SourceConfig, number: int, cache: str | None = None
     ) -> None:
         self.recipe, self.source = recipe, source
-        found = LISTS[source.kind](source)
+        found = [_in_utf8(clip) for clip in LISTS[source.kind](source)]
         there = sorted({clip.label for clip in found})
         missing = [label for label in source.classes if label not in there]
         if missing:
@@ -94,6 +95,12 @@ class FileClips:
     def prepare(self, clip: Clip) -> None:
         """Find the people of the clip's file."""
         self.finder.motion(clip.path, clip.key)
+
+
+def _in_utf8(clip: Clip) -> Clip:
+    """What the data set says of a clip as text that its files can hold; only the path stays that of the file."""
+    names = {name: shown_name(getattr(clip, name)) for name in ("name", "label", "person", "origin")}
+    return replace(clip, **names)
 
 
 def _told_apart(clip: Clip, source: SourceConfig, number: int) -> Clip:

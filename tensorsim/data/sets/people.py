@@ -19,7 +19,7 @@ from tensorsim.data.sets.recipe import SourceConfig
 from tensorsim.data.skeletons import Motion
 from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError
-from tensorsim.files import complete_file, sha256_of, write_text
+from tensorsim.files import complete_file, sha256_of, shown_name, write_text
 from tensorsim.pipeline import VideoToPose
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
@@ -129,7 +129,7 @@ class PeopleFinder:
             try:
                 motion = find(file)
             except TensorsimError as error:
-                write_text(failed, str(error).removeprefix(f"{file}: "))
+                write_text(failed, shown_name(str(error).removeprefix(f"{file}: ")))
                 raise
             with complete_file(kept) as scratch, scratch.open("wb") as target:
                 np.savez(target, joints=motion.joints.numpy(), valid=motion.valid.numpy(), fps=motion.fps)

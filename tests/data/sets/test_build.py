@@ -283,6 +283,20 @@ def test_other_clips_than_at_the_start_are_refused(captured: DatasetRecipe, tmp_
         sample_again(out, sample)
 
 
+def test_names_that_are_not_utf8_are_written_as_text(captured: DatasetRecipe, tmp_path: Path) -> None:
+    for name in ("walk/b.npz", "run/c.npz"):
+        path = tmp_path / "motion" / name
+        path.rename(os.fsdecode(os.fsencode(path).replace(b".npz", b"\xe9.npz")))
+    assert build_dataset(captured, tmp_path / "set", quiet=True) == (4, 1, 4)
+    rows = list(rows_of(tmp_path / "set"))
+    assert {row["clip"] for row in rows} == {"walk/a.npz", r"walk/b\udce9.npz"}
+    with (tmp_path / "set" / "failures.csv").open(newline="", encoding="utf-8") as file:
+        (failure,) = csv.DictReader(file)
+    assert failure["clip"] == r"run/c\udce9.npz"
+    assert failure["path"] in failure["reason"]
+    assert all(sample_again(tmp_path / "set", row["id"]).row == row for row in rows)
+
+
 def test_the_manifest_says_how_long_anybody_is_there(captured: DatasetRecipe, tmp_path: Path) -> None:
     build_dataset(replace(captured, duration_s=3.0), tmp_path / "set", quiet=True)
     assert [row["present_s"] for row in rows_of(tmp_path / "set")] == pytest.approx([1.0] * 4, abs=0.05)
