@@ -32,7 +32,7 @@ def check_folder(path: Path, option: str = "--out") -> None:
 
 
 def shown_name(name: str) -> str:
-    """A name of the file system as text: bytes that are not UTF-8, which no file in UTF-8 can hold, become ``\\udcff``."""
+    """A name of the file system as text that a file in UTF-8 can hold: other bytes than UTF-8 become ``\\udcff``."""
     return name.encode(errors="backslashreplace").decode()
 
 

@@ -32,6 +32,19 @@ def map_denoiser(choice: str | None) -> nn.Module | None:
     return MapDenoiser.from_pretrained(None if choice == "dncnn" else choice)
 
 
+def weights_of_denoiser(choice: str | None) -> Path | None:
+    """The weight file of what :func:`map_denoiser` makes of a name; None for a method without weights.
+
+    Raises:
+        TensorsimError: neither a method nor a name of weights; a path is returned also if there is no such file.
+    """
+    from tensorsim.registry import locate
+
+    if choice is None or (choice in DENOISERS and choice != "dncnn"):
+        return None
+    return locate(None if choice == "dncnn" else choice, "DnCNN")
+
+
 def check_denoiser(choice: str | None) -> None:
     """Refuse, before any work, what :func:`map_denoiser` would not find; nothing is loaded.
 

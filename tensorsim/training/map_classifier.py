@@ -103,7 +103,7 @@ class MapRecipe(Recipe):
         self.weights = self.training.class_weights()
         self.learning_rate = learning_rate
         settings: dict[str, Any] = {
-            "data": self.training.recipe.digest, "network": network, "labels": list(self.labels), "size": self.size,
+            "data": self.training.digest, "network": network, "labels": list(self.labels), "size": self.size,
             "maps": list(self.training.names), "seed": seed,
             "learning_rate": learning_rate, "masks": list(masks),
         }  # fmt: skip

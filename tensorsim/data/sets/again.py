@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from tensorsim.data.sets.manifest import recipe_of, rows_of
+from tensorsim.data.sets.made_with import difference, made_with
+from tensorsim.data.sets.manifest import made_of, recipe_of, rows_of
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.samples import Sample, sample_of_row
 from tensorsim.errors import TensorsimError
@@ -14,14 +15,22 @@ def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample
     Films and captured motion are needed where the recipe names them.
 
     Raises:
-        TensorsimError: no such data set or sample, sources with other clips, or arrays that differ from those that were
-            stored: another version of tensorsim, torch or the films, or a processor of another kind.
+        TensorsimError: no such data set or sample, sources with other clips, a radar or weights that have changed, or
+            arrays that differ from those that were stored: another version of tensorsim, torch or the films, or a
+            processor of another kind.
     """
     row = next(rows_of(folder, id=sample), None)
     if row is None:
         last = max(row["id"] for row in rows_of(folder))
         raise TensorsimError(f"{folder}: got no sample {sample!r}, expected an id such as {last}")
-    plan = Plan(recipe_of(folder), str(folder / ".people" if cache is None else cache))
+    recipe, there = recipe_of(folder), made_of(folder)
+    here = made_with(recipe)
+    if there | {"version": ""} != here | {"version": ""}:
+        raise TensorsimError(
+            f"{folder}: got another radar or other weights than the data set was made with (first difference: "
+            f"{difference(there | {'version': here['version']}, here)}), expected the same"
+        )
+    plan = Plan(recipe, str(folder / ".people" if cache is None else cache))
     index, clip = row["clip_index"], row["clip"]
     if index >= plan.clips or plan.clip(index)[1].name != clip:
         raise TensorsimError(
@@ -31,6 +40,7 @@ def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample
     if made.row["sha256"] != row["sha256"]:
         raise TensorsimError(
             f"{folder}: got other arrays for {sample} than were stored, expected the same: is it another version of "
-            "tensorsim, torch or the films, or a processor of another kind?"
+            f"tensorsim ({there['version']} there, {here['version']} here), torch or the films, or a processor of "
+            "another kind?"
         )
     return made

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from tensorsim.config.documents import to_document
 from tensorsim.data.sets.engines import Engine, Serial
+from tensorsim.data.sets.made_with import difference, made_with
 from tensorsim.data.sets.manifest import finish, rows_of_shard
 from tensorsim.data.sets.plan import Plan, Shard
 from tensorsim.data.sets.recipe import DatasetRecipe
@@ -20,7 +20,8 @@ from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.files import LOCK, NotWrittenError, locked, reading, shown_name, write_json
 
-#: The folder of finished shards' rows, in it the file that is written first: the recipe and the listing of the clips.
+#: The folder of finished shards' rows, in it the file that is written first: the recipe, the listing of the clips,
+#: and what the radars and weights that the recipe names hold.
 ROWS, BEGUN = ".rows", "begun.json"
 #: The recipe for people to read, and the file that is written last.
 RECIPE, DONE = "recipe.yaml", "dataset.json"
@@ -132,9 +133,9 @@ def build_dataset(
         TensorsimWarning: settings of walls in the recipe, and no radar with a wall.
 
     Raises:
-        TensorsimError: another data set or other files in the folder, sources with other clips than when it was begun,
-            another run that is writing there, a source that is not there, every sample failed, or, if ``strict``, a
-            clip that fails.
+        TensorsimError: another data set or other files in the folder, sources with other clips, or radars, weights or a
+            version of the package other than when it was begun, another run that is writing there, a source that is
+            not there, every sample failed, or, if ``strict``, a clip that fails.
     """
     if recipe.without_effect:
         warnings.warn(
@@ -144,14 +145,16 @@ def build_dataset(
         )
     out = Path(out)
     with locked(out):
-        begun = _begun(out, recipe)
+        made = made_with(recipe)
+        begun = _begun(out, recipe, made)
         engine = Serial() if engine is None else engine
         people = out / ".people" if cache is None else cache
         document, kept = json.dumps(recipe.to_document(), sort_keys=True), str(people.resolve())
         plan_of.cache_clear()  # files may have changed since the last build
         plan = plan_of(document, kept)
         if begun is None:
-            write_json(out / ROWS / BEGUN, {"recipe": recipe.to_document(), "clips": plan.listing})
+            start = {"recipe": recipe.to_document(), "clips": plan.listing, "made_with": made}
+            write_json(out / ROWS / BEGUN, start)
         elif begun != plan.listing:
             # Samples would change their numbers, and people would come into two parts.
             raise TensorsimError(
@@ -174,7 +177,7 @@ def build_dataset(
         missing = [k for k, shard in enumerate(plan.shards) if not rows_path(out, shard).is_file()]
         count = sum(plan.shards[k].stop - plan.shards[k].first for k in missing)
         _run(engine, "samples", "sample", count, engine.run(build_shard, map(job, missing)), quiet)
-        samples, failures = finish(out, plan, [rows_path(out, shard) for shard in plan.shards])
+        samples, failures = finish(out, plan, made, [rows_path(out, shard) for shard in plan.shards])
         return Built(sum(samples), failures, sum(samples[k] for k in missing))
 
 
@@ -197,13 +200,13 @@ def _films(plan: Plan) -> list[int]:
     return list(first.values())
 
 
-def _begun(out: Path, recipe: DatasetRecipe) -> str | None:
+def _begun(out: Path, recipe: DatasetRecipe, made: dict[str, Any]) -> str | None:
     """The listing of the clips with which the data set of the folder was begun; None of a new one.
 
     What an interrupted run left half written is removed.
 
     Raises:
-        TensorsimError: another data set, or other files.
+        TensorsimError: another data set, one made with other radars, weights or another version, or other files.
     """
     path = out / ROWS / BEGUN
     if not path.is_file():
@@ -215,8 +218,13 @@ def _begun(out: Path, recipe: DatasetRecipe) -> str | None:
         there, listing = DatasetRecipe.from_document(content["recipe"], str(path)), str(content["clips"])
     if there != recipe:
         raise TensorsimError(
-            f"{out}: got a data set of another recipe (first difference: {_difference(there, recipe)}), expected "
-            "the same or a new folder"
+            f"{out}: got a data set of another recipe (first difference: "
+            f"{difference(there.to_document(), recipe.to_document())}), expected the same or a new folder"
+        )
+    if content.get("made_with") != made:
+        raise TensorsimError(
+            f"{out}: got a data set begun with another radar, other weights or another version of tensorsim (first "
+            f"difference: {difference(content.get('made_with') or {}, made)}), expected the same or a new folder"
         )
     for left in out.rglob(".*.tmp"):
         left.unlink(missing_ok=True)
@@ -230,13 +238,3 @@ def _forget_failures(out: Path, plan: Plan) -> None:
         if path.is_file() and rows_of_shard(path)["failures"]:
             (out / DONE).unlink(missing_ok=True)
             path.unlink()
-
-
-def _difference(there: Any, here: Any, name: str = "") -> str:
-    """The first field in which two recipes differ, and its values."""
-    there, here = to_document(there), to_document(here)
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in there:
-            if there[key] != here.get(key):
-                return _difference(there[key], here.get(key), f"{name}.{key}" if name else key)
-    return f"{name} {there!r} there, {here!r} here"

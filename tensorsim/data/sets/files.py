@@ -105,7 +105,9 @@ def _in_utf8(clip: Clip) -> Clip:
 
 def _told_apart(clip: Clip, source: SourceConfig, number: int) -> Clip:
     """A person known by the file alone is somebody else than in a file of the same name of another source."""
-    return replace(clip, person=f"{source.kind}{number}/{clip.person}") if clip.person == clip.origin else clip
+    return (
+        replace(clip, person=f"{source.kind}{number}/{clip.person}") if clip.person == clip.origin else clip
+    )
 
 
 def cut(motion: Motion, clip: Clip) -> Motion:

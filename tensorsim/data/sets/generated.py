@@ -62,7 +62,9 @@ class GeneratedPeople:
             proportions=body.proportions,
             left_handed=torch.tensor([variation.mirrored]),
             heading_rad=torch.full_like(manner.heading_rad, heading),
-            start_m=torch.stack([torch.full_like(manner.heading_rad, variation.side_m), manner.start_m[:, 1]], -1),
+            start_m=torch.stack(
+                [torch.full_like(manner.heading_rad, variation.side_m), manner.start_m[:, 1]], -1
+            ),
         )
         # Played at its speed, the motion lasts as long as it should.
         motion = ActivityGenerator(config).generate(

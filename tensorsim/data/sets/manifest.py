@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tensorsim.data.sets.card import card
+from tensorsim.data.sets.made_with import digest
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import columns
@@ -22,12 +23,13 @@ from tensorsim.files import complete_file, reading, write_json, write_text
 Row = dict[str, Any]
 
 
-def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[list[int], int]:
+def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]) -> tuple[list[int], int]:
     """Write everything beside the shards of a complete data set; ``dataset.json`` is the last.
 
     Args:
         out: folder of the data set.
         plan: of its recipe.
+        made: see :func:`~tensorsim.data.sets.made_with.made_with`.
         finished: the rows of each shard, in order.
 
     Returns:
@@ -40,7 +42,7 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[list[int], 
     counts: Counter[tuple[str, str]] = Counter()
     files: dict[str, str] = {}
     failed: dict[tuple[str, str], dict[str, Any]] = {}
-    with _manifest(out, plan.recipe) as add_rows:
+    with _manifest(out, plan.recipe, made) as add_rows:
         for path in finished:
             content = rows_of_shard(path)
             add_rows(content["rows"])
@@ -62,7 +64,7 @@ def finish(out: Path, plan: Plan, finished: Sequence[Path]) -> tuple[list[int], 
     write_text(out / "README.md", card(plan, counts, len(failures), sum(sizes.values())))
     summary = {
         "name": plan.recipe.name,
-        "recipe": plan.recipe.digest,
+        "recipe": digest(plan.recipe, made),
         "labels": list(plan.labels),
         "samples": sum(samples),
         "failures": len(failures),
@@ -93,8 +95,11 @@ def _write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
 
 
 @contextmanager
-def _manifest(out: Path, recipe: DatasetRecipe) -> Iterator[Callable[[list[Row]], None]]:
-    """``manifest.parquet``, which holds the recipe as well, and ``manifest.csv``: a function that adds rows to both."""
+def _manifest(
+    out: Path, recipe: DatasetRecipe, made: dict[str, Any]
+) -> Iterator[Callable[[list[Row]], None]]:
+    """``manifest.parquet``, which holds the recipe and what it was made with as well, and ``manifest.csv``: a function
+    that adds rows to both."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -102,7 +107,10 @@ def _manifest(out: Path, recipe: DatasetRecipe) -> Iterator[Callable[[list[Row]]
     names = columns(recipe)
     schema = pa.schema(
         [(name, kinds[kind]) for name, kind in names.items()],
-        metadata={"tensorsim.recipe": json.dumps(recipe.to_document())},
+        metadata={
+            "tensorsim.recipe": json.dumps(recipe.to_document()),
+            "tensorsim.made_with": json.dumps(made),
+        },
     )
     with (
         complete_file(out / "manifest.parquet") as parquet,
@@ -135,12 +143,26 @@ def recipe_of(out: Path) -> DatasetRecipe:
     Raises:
         TensorsimError: no manifest there, or a damaged one.
     """
+    return DatasetRecipe.from_document(_stored(out, "tensorsim.recipe"), str(out / "manifest.parquet"))
+
+
+def made_of(out: Path) -> dict[str, Any]:
+    """What a data set was made with, as :func:`~tensorsim.data.sets.made_with.made_with` says it.
+
+    Raises:
+        TensorsimError: no manifest there, or a damaged one.
+    """
+    return _stored(out, "tensorsim.made_with")
+
+
+def _stored(out: Path, name: str) -> dict[str, Any]:
+    """A document that the manifest of a data set holds."""
     import pyarrow.parquet as pq
 
     path = _finished(out)
     with reading(path, "a manifest"):
-        stored = json.loads(pq.read_schema(path).metadata[b"tensorsim.recipe"])
-    return DatasetRecipe.from_document(stored, str(path))
+        document: dict[str, Any] = json.loads(pq.read_schema(path).metadata[name.encode()])
+    return document
 
 
 def rows_of(out: Path, **wanted: str) -> Iterator[Row]:

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from tensorsim.data.sets.batches import Arrays, synthesize_batch
-from tensorsim.data.sets.manifest import columns_of, recipe_of
+from tensorsim.data.sets.made_with import digest
+from tensorsim.data.sets.manifest import columns_of, made_of, recipe_of
 from tensorsim.data.sets.outputs import MAPS, OutputConfig
 from tensorsim.data.sets.plan import Plan
 from tensorsim.data.sets.recipe import PARTS, DatasetRecipe
@@ -81,6 +82,7 @@ class MapDataset(Dataset[dict[str, Any]]):
     Attributes:
         labels: names of the classes.
         targets: (N,) int64 class of every sample.
+        digest: SHA-256 of the recipe and what it was made with, which tells data sets apart.
 
     Raises:
         TensorsimError: no data set there, an unknown part, output, radar or class, or no samples.
@@ -96,6 +98,7 @@ class MapDataset(Dataset[dict[str, Any]]):
     ) -> None:
         self.folder = Path(folder)
         self.recipe = recipe_of(self.folder)
+        self.digest = digest(self.recipe, made_of(self.folder))
         if split not in (None, *PARTS):
             raise TensorsimError(f"MapDataset.split: got {split!r}, expected one of {', '.join(PARTS)}")
         self.names = chosen_names(self.recipe, output, radars)

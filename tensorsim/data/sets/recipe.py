@@ -1,7 +1,5 @@
 """The recipe of a data set: which people, varied how, seen by which radars, stored as what."""
 
-import hashlib
-import json
 import os
 import re
 from dataclasses import dataclass, field, replace
@@ -320,12 +318,6 @@ class DatasetRecipe:
             for name in ("wall_permittivity", "wall_thickness_m")
             if getattr(self.variations, name) != getattr(of_variations, name)
         ]
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the recipe, which tells data sets apart."""
-        text = json.dumps(self.to_document(), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
 
     @classmethod
     def from_document(cls, document: dict[str, Any], where: str = "recipe") -> "DatasetRecipe":

@@ -20,24 +20,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from safetensors.torch import save_file
 
 from tensorsim import cli
-from tensorsim.data.sets import engines
+from tensorsim.config import FloorConfig, RadarConfig, WallConfig
+from tensorsim.data.sets import engines, made_with
 from tensorsim.data.sets.again import sample_again
 from tensorsim.data.sets.build import build_dataset, plan_of
 from tensorsim.data.sets.card import card
 from tensorsim.data.sets.engines import Processes, RayCluster
+from tensorsim.data.sets.made_with import digest
 from tensorsim.data.sets.manifest import recipe_of, rows_of
 from tensorsim.data.sets.outputs import OF_ARRAY, OF_PAIR, OutputConfig
 from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.reading import MapDataset
 from tensorsim.data.sets.recipe import DatasetRecipe, RadarView, SourceConfig, SplitConfig, StorageConfig
 from tensorsim.data.sets.samples import content_hash, make_sample
 from tensorsim.data.sets.shards import write_shard
 from tensorsim.data.sets.sheet import draw_sheet
 from tensorsim.data.sets.stored import StoredArrays
 from tensorsim.data.sets.variations import VariationConfig
+from tensorsim.enhance import DnCNN
 from tensorsim.errors import TensorsimError
 from tensorsim.motion import ActivityGenerator
+from tensorsim.radar.presets import save_radar_yaml
 from tests.data.sets.recipes import small_recipe
 
 
@@ -320,6 +326,58 @@ def test_an_interrupted_run_goes_on_to_the_same_files(
     assert build_dataset(recipe, folder, quiet=True) == (4, 0, 2)
     assert contents(folder) == contents(built)
     assert build_dataset(recipe, folder, quiet=True) == (4, 0, 0)
+
+
+def of_a_radar_file(folder: Path) -> DatasetRecipe:
+    """A recipe whose radar and denoiser are files."""
+    radar = RadarConfig.through_wall()
+    save_radar_yaml(folder / "radar.yaml", radar, WallConfig(), FloorConfig())
+    save_file(DnCNN(depth=3).state_dict(), folder / "weights.safetensors")
+    return small_recipe(
+        radars=(RadarView("front", str(folder / "radar.yaml")),),
+        variations=VariationConfig(denoisers=(str(folder / "weights.safetensors"),)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ("radar", r"first difference: radars\.front\.radar\.antenna_gain_dbi 10.0 there, 9.0 here"),
+        ("wall", r"first difference: radars\.front\.wall\.loss_tangent 0.03 there, 0.1 here"),
+        ("floor", r"first difference: radars\.front\.floor"),
+        ("weights", r"first difference: denoisers\..*weights\.safetensors"),
+        ("version", r"first difference: version '0\.[^']*' there, '99' here"),
+    ],
+)
+def test_samples_of_other_radars_weights_or_versions_are_not_mixed(
+    changed: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, out = of_a_radar_file(tmp_path), tmp_path / "set"
+    before = digest(recipe, made_with.made_with(recipe))
+    with pytest.raises(KeyboardInterrupt):
+        build_dataset(recipe, out, Interrupted(0), quiet=True)
+    radar = replace(RadarConfig.through_wall(), antenna_gain_dbi=9.0 if changed == "radar" else 10.0)
+    wall = WallConfig(loss_tangent=0.1) if changed == "wall" else WallConfig()
+    floor = None if changed == "floor" else FloorConfig()
+    save_radar_yaml(tmp_path / "radar.yaml", radar, wall, floor)
+    if changed == "weights":
+        save_file(DnCNN(depth=4).state_dict(), tmp_path / "weights.safetensors")
+    if changed == "version":
+        monkeypatch.setattr(made_with, "version", lambda name: "99")
+    with pytest.raises(TensorsimError, match=message):
+        build_dataset(recipe, out, quiet=True)
+    assert digest(recipe, made_with.made_with(recipe)) != before
+
+
+def test_a_sample_of_another_radar_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, out = of_a_radar_file(tmp_path), tmp_path / "set"
+    build_dataset(recipe, out, quiet=True)
+    monkeypatch.setattr(made_with, "version", lambda name: "99")
+    assert sample_again(out, "00000001").row["id"] == "00000001"  # the same bits, whatever made them
+    assert MapDataset(out).digest == json.loads((out / "dataset.json").read_text())["recipe"]
+    save_radar_yaml(tmp_path / "radar.yaml", RadarConfig.through_wall(isolation_db=3.0), WallConfig())
+    with pytest.raises(TensorsimError, match=r"radars\.front\.radar\.isolation_db .* there, 3\.0 here"):
+        sample_again(out, "00000001")
 
 
 def test_what_is_there_is_not_overwritten(built: Path, tmp_path: Path) -> None:

@@ -49,8 +49,6 @@ def test_yaml_and_back(tmp_path: Path) -> None:
     recipe = small_recipe(variations=VariationConfig(snr_db=None, people=(1, 3), bodies=("joints", "limbs")))
     recipe.to_yaml(tmp_path / "r.yaml")
     assert DatasetRecipe.from_yaml(tmp_path / "r.yaml") == recipe
-    assert DatasetRecipe.from_yaml(tmp_path / "r.yaml").digest == recipe.digest
-    assert small_recipe(seed=1).digest != recipe.digest
 
 
 @pytest.mark.parametrize(
