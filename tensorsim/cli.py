@@ -11,7 +11,7 @@ import tyro
 from tensorsim import __version__, process
 from tensorsim.commands.app import App
 from tensorsim.commands.check import Check
-from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample
+from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample, DatasetVerify
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_camera import EvaluateCamera
 from tensorsim.commands.evaluate_classifier import EvaluateClassifier
@@ -91,7 +91,12 @@ COMMANDS: dict[str, Any] = {
     ),
     "dataset": (
         "Labelled data sets of radar maps from a recipe.",
-        {"build": DatasetBuild, "example": DatasetExample, "sample": DatasetSample},
+        {
+            "build": DatasetBuild,
+            "example": DatasetExample,
+            "sample": DatasetSample,
+            "verify": DatasetVerify,
+        },
     ),
     "experiment": RunExperiment,
     "library": ("Pools of poses for nearest-match lifting.", {"build": BuildLibrary}),

@@ -103,3 +103,25 @@ class DatasetSample:
             for name, array in sample.arrays.items():
                 write_bytes(self.out / f"{self.id}.{name}.npy", npy_bytes(array))
         print(f"{self.id}: {sample.row['label']}, the same to the bit ({sample.row['sha256']})")
+
+
+@dataclass(frozen=True)
+class DatasetVerify:
+    """Check the files of a data set against their SHA-256 in dataset.json."""
+
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DIR")]]
+    """The data set."""
+
+    def run(self) -> None:
+        """Do it."""
+        from tensorsim.data.sets.verify import wrong_files
+
+        count, wrong = wrong_files(self.folder)
+        for name, reason in wrong.items():
+            print(f"WRONG {name}: {reason}")
+        if wrong:
+            raise TensorsimError(
+                f"dataset verify: {len(wrong)} of {count} files of {self.folder} are not in order; `dataset build` "
+                "makes missing ones again"
+            )
+        print(f"ok    {self.folder}: {count} files")

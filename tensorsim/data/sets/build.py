@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from tensorsim.data.sets.engines import Engine, Serial
 from tensorsim.data.sets.made_with import difference, made_with
-from tensorsim.data.sets.manifest import finish, rows_of_shard
+from tensorsim.data.sets.manifest import MANIFESTS, finish, rows_of_shard
 from tensorsim.data.sets.plan import Plan, Shard
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.samples import make_sample
@@ -96,7 +96,9 @@ def build_shard(job: Job) -> int:
     out = Path(job.out)
     files = write_shard(out, plan.recipe.storage, shard.name, samples)
     rows = [sample.row for sample in samples]
-    write_json(rows_path(out, shard), {"rows": rows, "failures": failures, "files": files})
+    sizes = {name: (out / name).stat().st_size for name in files}
+    content = {"rows": rows, "failures": failures, "files": files, "bytes": sizes}
+    write_json(rows_path(out, shard), content)
     return shard.stop - shard.first
 
 
@@ -117,8 +119,8 @@ def build_dataset(
     """Build the data set of a recipe, or what is missing of it.
 
     The files depend on the recipe (and the films that it names) alone: not on the engine, the number of workers, or
-    interruptions. A shard is complete or not there; one that was finished is not made again, unless some of its samples
-    failed and ``retry`` or ``strict`` asks for it.
+    interruptions. A shard is complete or not there; one that was finished is not made again, unless its files are
+    missing or of another size, or some of its samples failed and ``retry`` or ``strict`` asks for it.
 
     Args:
         recipe: what to make.
@@ -165,16 +167,18 @@ def build_dataset(
             recipe.to_yaml(out / RECIPE)
         if retry or strict:
             _forget_failures(out, plan)
-        if (out / DONE).is_file():
+        missing = [k for k, shard in enumerate(plan.shards) if not _is_there(out, shard)]
+        if not missing and (out / DONE).is_file():
             done = json.loads((out / DONE).read_text(encoding="utf-8"))
             return Built(done["samples"], done["failures"], 0)
+        for name in (DONE, *MANIFESTS):
+            (out / name).unlink(missing_ok=True)  # of a finished data set; now it is none
 
         def job(number: int) -> Job:
             return Job(document, str(out.resolve()), kept, number, strict)
 
-        films = _films(plan)
+        films = _films(plan) if missing else []
         _run(engine, "people", "film", len(films), engine.run(prepare_clip, map(job, films)), quiet)
-        missing = [k for k, shard in enumerate(plan.shards) if not rows_path(out, shard).is_file()]
         count = sum(plan.shards[k].stop - plan.shards[k].first for k in missing)
         _run(engine, "samples", "sample", count, engine.run(build_shard, map(job, missing)), quiet)
         samples, failures = finish(out, plan, made, [rows_path(out, shard) for shard in plan.shards])
@@ -231,10 +235,19 @@ def _begun(out: Path, recipe: DatasetRecipe, made: dict[str, Any]) -> str | None
     return listing
 
 
+def _is_there(out: Path, shard: Shard) -> bool:
+    """Whether a shard is finished: its rows, and the files that they name, of the sizes that were written."""
+    path = rows_path(out, shard)
+    if not path.is_file():
+        return False
+    sizes = rows_of_shard(path)["bytes"]
+    files = {out / name: size for name, size in sizes.items()}
+    return all(file.is_file() and file.stat().st_size == size for file, size in files.items())
+
+
 def _forget_failures(out: Path, plan: Plan) -> None:
     """Shards with samples that failed count as missing."""
     for shard in plan.shards:
         path = rows_path(out, shard)
         if path.is_file() and rows_of_shard(path)["failures"]:
-            (out / DONE).unlink(missing_ok=True)
             path.unlink()

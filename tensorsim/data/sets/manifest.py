@@ -22,9 +22,12 @@ from tensorsim.files import complete_file, reading, write_json, write_text
 
 Row = dict[str, Any]
 
+#: The same rows in two formats, written once all shards are there.
+MANIFESTS = ("manifest.parquet", "manifest.csv")
+
 
 def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]) -> tuple[list[int], int]:
-    """Write everything beside the shards of a complete data set; ``dataset.json`` is the last.
+    """Write everything beside the shards of a complete data set; ``dataset.json``, which says that, is the last.
 
     Args:
         out: folder of the data set.
@@ -41,6 +44,7 @@ def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]
     samples: list[int] = []
     counts: Counter[tuple[str, str]] = Counter()
     files: dict[str, str] = {}
+    size = 0
     failed: dict[tuple[str, str], dict[str, Any]] = {}
     with _manifest(out, plan.recipe, made) as add_rows:
         for path in finished:
@@ -49,6 +53,7 @@ def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]
             samples.append(len(content["rows"]))
             counts.update((row["part"], row["label"]) for row in content["rows"])
             files |= content["files"]
+            size += sum(content["bytes"].values())
             for failure in content["failures"]:
                 clip = failed.setdefault((failure["clip"], failure["path"]), failure | {"samples": 0})
                 clip["samples"] += 1
@@ -60,15 +65,14 @@ def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]
                 path.unlink()  # to be tried again
             raise TensorsimError(f"{out}: got no sample at all ({reason}), expected some")
     draw_sheet(out, plan.recipe)
-    sizes = {name: (out / name).stat().st_size for name in files}
-    write_text(out / "README.md", card(plan, counts, len(failures), sum(sizes.values())))
+    write_text(out / "README.md", card(plan, counts, len(failures), size))
     summary = {
         "name": plan.recipe.name,
         "recipe": digest(plan.recipe, made),
         "labels": list(plan.labels),
         "samples": sum(samples),
         "failures": len(failures),
-        "bytes": sum(sizes.values()),
+        "bytes": size,
         "sha256": files,
     }
     write_json(out / "dataset.json", summary)
@@ -76,7 +80,8 @@ def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]
 
 
 def rows_of_shard(path: Path) -> dict[str, Any]:
-    """What is kept of a finished shard: ``rows`` of the manifest, ``failures``, and the SHA-256 of ``files``.
+    """What is kept of a finished shard: ``rows`` of the manifest, ``failures``, the SHA-256 of ``files`` and their
+    ``bytes``.
 
     Raises:
         TensorsimError: a damaged file.
@@ -113,8 +118,8 @@ def _manifest(
         },
     )
     with (
-        complete_file(out / "manifest.parquet") as parquet,
-        complete_file(out / "manifest.csv") as table,
+        complete_file(out / MANIFESTS[0]) as parquet,
+        complete_file(out / MANIFESTS[1]) as table,
         pq.ParquetWriter(parquet, schema) as writer,
         table.open("w", newline="", encoding="utf-8") as file,
     ):
@@ -130,7 +135,7 @@ def _manifest(
 
 
 def _finished(out: Path) -> Path:
-    """The manifest of a data set, which is written last."""
+    """The manifest of a data set, which is there once all its shards are."""
     path = out / "manifest.parquet"
     if not path.is_file():
         raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")

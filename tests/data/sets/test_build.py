@@ -40,6 +40,7 @@ from tensorsim.data.sets.shards import write_shard
 from tensorsim.data.sets.sheet import draw_sheet
 from tensorsim.data.sets.stored import StoredArrays
 from tensorsim.data.sets.variations import VariationConfig
+from tensorsim.data.sets.verify import wrong_files
 from tensorsim.enhance import DnCNN
 from tensorsim.errors import TensorsimError
 from tensorsim.motion import ActivityGenerator
@@ -261,10 +262,39 @@ def test_samples_that_failed_are_tried_again_when_asked(captured: DatasetRecipe,
     assert build_dataset(captured, out, quiet=True) == (4, 1, 0)
     with pytest.raises(KeyboardInterrupt):
         build_dataset(captured, out, Interrupted(1), quiet=True, retry=True)
-    assert not (out / "dataset.json").exists()
+    # Nothing says that it is finished: one of the samples in the old manifest may be another now.
+    assert not {"dataset.json", "manifest.parquet", "manifest.csv"} & {path.name for path in out.iterdir()}
     assert build_dataset(captured, out, quiet=True, retry=True) == (6, 0, 1)
     build_dataset(captured, tmp_path / "whole", quiet=True)
     assert contents(out) == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("storage", [StorageConfig(shard_samples=2), StorageConfig("png", 2)])
+def test_files_that_are_missing_or_cut_are_noticed_and_made_again(
+    storage: StorageConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kinds: Any = ("picture",) if storage.format == "png" else ("doppler_time",)
+    recipe, out = small_recipe(storage=storage, outputs=OutputConfig(kinds=kinds)), tmp_path / "set"
+    build_dataset(recipe, out, quiet=True)
+    whole = contents(out)
+    first, *_, last = json.loads((out / "dataset.json").read_text())["sha256"]
+    cli.main(["dataset", "verify", str(out)])
+    assert f"{len(list(out.rglob('0*.png'))) or 2} files" in capsys.readouterr().out
+    (out / last).unlink()
+    (out / first).write_bytes(whole[first][:-1])
+    with pytest.raises(SystemExit):
+        cli.main(["dataset", "verify", str(out)])
+    said = capsys.readouterr()
+    assert f"WRONG {last}: no such file" in said.out
+    assert f"WRONG {first}: got SHA-256" in said.out
+    assert "dataset verify: 2 of" in said.err
+    assert build_dataset(recipe, out, quiet=True) == (4, 0, 4)
+    assert contents(out) == whole
+    (out / first).write_bytes(b"x" + whole[first][1:])
+    count, wrong = wrong_files(out)
+    assert (count, list(wrong)) == (len(list(out.rglob("0*.png"))) or 2, [first])
+    with pytest.raises(TensorsimError, match=r"got no dataset\.json, expected a finished data set"):
+        wrong_files(tmp_path)
 
 
 def test_strict_does_not_pass_over_earlier_failures(captured: DatasetRecipe, tmp_path: Path) -> None:
