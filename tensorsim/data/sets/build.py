@@ -36,6 +36,7 @@ class Job(NamedTuple):
         cache: folder of the people found in films.
         number: of the shard, or of the clip to prepare.
         strict: whether the first failure ends the work.
+        again: whether films are searched again in which nobody was found before.
     """
 
     recipe: str
@@ -43,6 +44,7 @@ class Job(NamedTuple):
     cache: str
     number: int
     strict: bool
+    again: bool = False
 
 
 class Built(NamedTuple):
@@ -70,7 +72,7 @@ def prepare_clip(job: Job) -> int:
     plan = plan_of(job.recipe, job.cache)
     source, clip = plan.clip(job.number)
     try:
-        source.prepare(clip)
+        source.prepare(clip, job.again)
     except (TensorsimError, OSError) as error:
         if job.strict or isinstance(error, NotWrittenError):
             raise
@@ -175,7 +177,7 @@ def build_dataset(
             (out / name).unlink(missing_ok=True)  # of a finished data set; now it is none
 
         def job(number: int) -> Job:
-            return Job(document, str(out.resolve()), kept, number, strict)
+            return Job(document, str(out.resolve()), kept, number, strict, retry or strict)
 
         films = _films(plan) if missing else []
         _run(engine, "people", "film", len(films), engine.run(prepare_clip, map(job, films)), quiet)

@@ -62,5 +62,10 @@ class ClipSource(Protocol):
             TensorsimError: a file that cannot be read, or nobody in it.
         """
 
-    def prepare(self, clip: Clip) -> None:
-        """Do the work that all variations of a clip share, such as finding the people of a film, and keep it."""
+    def prepare(self, clip: Clip, again: bool = False) -> None:
+        """Do the work that all variations of a clip share, such as finding the people of a film, and keep it.
+
+        Args:
+            clip: one of the clips.
+            again: also where it failed before; that it did is kept as well.
+        """

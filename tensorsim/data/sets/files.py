@@ -92,9 +92,9 @@ class FileClips:
                 used -= self._motions.pop(next(iter(self._motions))).joints.nbytes
         return self._motions[key]
 
-    def prepare(self, clip: Clip) -> None:
+    def prepare(self, clip: Clip, again: bool = False) -> None:
         """Find the people of the clip's file."""
-        self.finder.motion(clip.path, clip.key)
+        self.finder.motion(clip.path, clip.key, again)
 
 
 def _in_utf8(clip: Clip) -> Clip:

@@ -75,7 +75,7 @@ class GeneratedPeople:
         )
         return Scene(motion.joints.float(), motion.valid, self.recipe.motion_hz)
 
-    def prepare(self, clip: Clip) -> None:
+    def prepare(self, clip: Clip, again: bool = False) -> None:
         """Nothing is shared."""
 
     def _config(self, variation: Variation) -> PeopleConfig:

@@ -72,8 +72,13 @@ class PeopleFinder:
         self.source, self.cache = source, cache
 
     @torch.no_grad()
-    def motion(self, path: str, key: str) -> Motion:
+    def motion(self, path: str, key: str, again: bool = False) -> Motion:
         """The people of a file; joints are finite everywhere.
+
+        Args:
+            path: of the file.
+            key: of the motion in it.
+            again: look also where nobody was found before, see :meth:`kept`.
 
         Raises:
             TensorsimError: a file that is missing or damaged, or a film in which nobody was found.
@@ -82,7 +87,8 @@ class PeopleFinder:
         if not file.exists():
             raise TensorsimError(f"{path}: no such file")
         if is_film(file):
-            motion = self._of_film(file)
+            digest = "" if self.cache is None else self._digest(file)
+            motion = self.kept(file, digest, self._found, again)
         elif file.suffix.lower() in _MOTION:
             motion = self._captured(file, key)
         else:
@@ -105,16 +111,14 @@ class PeopleFinder:
         pose = found.find(True).pose
         return Motion(pose.joints[0], pose.valid[0], found.fps)
 
-    def _of_film(self, file: Path) -> Motion:
-        return self.kept(file, "" if self.cache is None else self._digest(file), self._found)
-
-    def kept(self, file: Path, digest: str, find: Callable[[Path], Motion]) -> Motion:
+    def kept(self, file: Path, digest: str, find: Callable[[Path], Motion], again: bool = False) -> Motion:
         """What ``find`` finds in a film, kept in ``cache`` for the next time; so is the reason if there is nobody.
 
         Args:
             file: the film, or the name of one.
             digest: of all that the people depend on.
             find: takes ``file``.
+            again: call it also where it failed before.
 
         Raises:
             TensorsimError: what ``find`` raises, or raised before.
@@ -123,7 +127,7 @@ class PeopleFinder:
             return find(file)
         kept = self.cache / f"{digest}.npz"
         failed = kept.with_suffix(".txt")
-        if failed.is_file():
+        if failed.is_file() and not again:
             raise TensorsimError(f"{file}: {failed.read_text(encoding='utf-8')}")
         if not kept.is_file():
             try:
@@ -131,6 +135,7 @@ class PeopleFinder:
             except TensorsimError as error:
                 write_text(failed, shown_name(str(error).removeprefix(f"{file}: ")))
                 raise
+            failed.unlink(missing_ok=True)
             with complete_file(kept) as scratch, scratch.open("wb") as target:
                 np.savez(target, joints=motion.joints.numpy(), valid=motion.valid.numpy(), fps=motion.fps)
         with np.load(kept) as arrays:
@@ -153,11 +158,14 @@ class PeopleFinder:
 
     @cached_property
     def of_networks(self) -> bytes:
-        """Hash of the networks, and the version of the package."""
+        """Hash of the networks, and the versions of the package and of those that read films and run networks."""
+        import cv2
+
         from tensorsim.registry import locate
 
         files = [locate(None, "RTMDet"), locate(None, "HRNet", "CPM"), locate(None, "TemporalLifter")]
-        return "".join([version("tensorsim"), *map(sha256_of, files)]).encode()
+        versions = [version("tensorsim"), cv2.__version__, str(torch.__version__)]
+        return " ".join([*versions, *map(sha256_of, files)]).encode()
 
     def _digest(self, file: Path) -> str:
         content = hashlib.sha256(self.of_networks)

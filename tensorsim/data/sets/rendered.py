@@ -59,17 +59,18 @@ class RenderedPeople:
         moved = varied(self._motion(clip), variation)
         return part_of(moved, self.recipe.duration_s, self.recipe.motion_hz, variation.start)
 
-    def prepare(self, clip: Clip) -> None:
+    def prepare(self, clip: Clip, again: bool = False) -> None:
         """Render the film and find the people in it."""
-        self._motion(clip)
+        self._motion(clip, again)
 
     @torch.no_grad()
-    def _motion(self, clip: Clip) -> Motion:
+    def _motion(self, clip: Clip, again: bool = False) -> Motion:
         film, seed = self._filmed(clip), seed_of(self.recipe.seed, clip.name, "look")
         content = hashlib.sha256(self.finder.of_networks)
         content.update(repr((CAMERA, self.size, self.fps, seed)).encode())
         content.update(film.joints.numpy().tobytes())
-        found = self.finder.kept(Path(clip.name), content.hexdigest(), lambda _: self._watched(film, seed))
+        name, digest = Path(clip.name), content.hexdigest()
+        found = self.finder.kept(name, digest, lambda _: self._watched(film, seed), again)
         return finite_everywhere(found, clip.name)
 
     def _filmed(self, clip: Clip) -> Scene:

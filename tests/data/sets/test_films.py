@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from tensorsim.data.sets.manifest import rows_of
 from tensorsim.data.sets.people import PeopleFinder
 from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig, SplitConfig
 from tensorsim.data.sets.rendered import CAMERA
+from tensorsim.data.sets.variations import VariationConfig
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.motion import ActivityGenerator, PeopleConfig
@@ -110,6 +112,45 @@ def test_good_films_arrive_bad_ones_are_named_and_people_are_found_once(
     assert asked == []
     assert [row["sha256"] for row in rows_of(tmp_path / "b")] == [row["sha256"] for row in rows]
     assert str(moved) in (tmp_path / "b" / "failures.csv").read_text()
+
+
+def test_films_that_failed_are_searched_again_when_asked(
+    films: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, trouble = [], [True]
+    found = PeopleFinder._found
+
+    def sometimes(self: PeopleFinder, file: Path) -> object:
+        asked.append(file.name)
+        if trouble and file.parent.name == "come":
+            raise TensorsimError("the disk was away")
+        return found(self, file)
+
+    monkeypatch.setattr(PeopleFinder, "_found", sometimes)
+    for file in films.glob("leave/*.*"):
+        if file.name not in ("good.avi", "text.mp4"):
+            file.unlink()
+    recipe, out = films_recipe(films, variations=VariationConfig(count=2)), tmp_path / "set"
+    assert build_dataset(recipe, out, quiet=True) == (2, 2, 2)
+    trouble.clear()
+    assert build_dataset(recipe, out, quiet=True) == (2, 2, 0)
+    assert len(asked) == 3
+    assert build_dataset(recipe, out, quiet=True, retry=True).samples == 4
+    assert sorted(asked[3:]) == ["good.avi", "text.mp4"]  # once each, not for every sample
+    with pytest.raises(TensorsimError, match=r"text\.mp4"):
+        build_dataset(recipe, out, quiet=True, strict=True)
+    assert asked[5:] == ["text.mp4"]
+
+
+@pytest.mark.parametrize("library", [cv2, torch])
+def test_other_versions_of_what_reads_films_and_runs_networks_find_people_anew(
+    library: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finder = PeopleFinder(SourceConfig("films", "films"), None)
+    known = finder.of_networks
+    monkeypatch.setattr(library, "__version__", "99.0")
+    del finder.of_networks
+    assert finder.of_networks != known
 
 
 def test_strict_stops_at_the_first(films: Path, tmp_path: Path) -> None:
