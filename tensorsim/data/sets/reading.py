@@ -210,6 +210,8 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
             a ``DataLoader`` without workers.
         batch: samples in one pass of the radar chain, see
             :func:`~tensorsim.data.sets.batches.synthesize_batch`; the maps are the same for any.
+        cache: folder of the people found in films and rendered films, such as ``.people`` in the folder of a data set.
+            None keeps nothing on disk: they are found anew in every process, of rendered films for every sample.
 
     Samples: as those of :class:`MapDataset`. Clips that fail are left out.
 
@@ -227,12 +229,14 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
         radars: Sequence[str] | None = None,
         device: str | torch.device = "cpu",
         batch: int = 1,
+        cache: str | os.PathLike[str] | None = None,
     ) -> None:
         if batch < 1:
             raise TensorsimError(f"SimulatedMaps.batch: got {batch}, expected at least 1")
         if split not in (None, *PARTS):
             raise TensorsimError(f"SimulatedMaps.split: got {split!r}, expected one of {', '.join(PARTS)}")
-        self.plan, self.split, self.rounds = Plan(recipe), split, rounds
+        self.plan = Plan(recipe, None if cache is None else os.fspath(cache))
+        self.split, self.rounds = split, rounds
         self.names = chosen_names(recipe, output, radars)
         self.labels = self.plan.labels
         self.device, self.batch = usable_device(str(device)), batch

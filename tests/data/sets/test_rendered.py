@@ -12,7 +12,11 @@ from tensorsim.data.sets.engines import Processes
 from tensorsim.data.sets.manifest import rows_of
 from tensorsim.data.sets.people import PeopleFinder
 from tensorsim.data.sets.plan import Plan
+from tensorsim.data.sets.reading import SimulatedMaps
 from tensorsim.data.sets.recipe import DatasetRecipe, SourceConfig, SplitConfig
+from tensorsim.data.sets.rendered import RenderedPeople
+from tensorsim.data.sets.scene import Scene
+from tensorsim.data.skeletons import Motion
 from tests.data.sets.recipes import small_recipe
 
 
@@ -30,6 +34,21 @@ def test_films_are_named_and_sized_by_the_recipe() -> None:
     assert film.joints.shape == (1, 30, 14, 3)
     assert 1.5 <= float(mid_hips(film.joints)[..., 1].min()) <= 7.0
     assert source.clip(1).name == "rendered0-000001/S5 Sitting Down"
+
+
+def test_simulated_maps_find_people_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rendering and networks are the slow part."""
+    watched = []
+
+    def seen(self: RenderedPeople, film: Scene, seed: int) -> Motion:
+        watched.append(seed)
+        return Motion(film.joints, film.valid, film.fps)
+
+    monkeypatch.setattr(RenderedPeople, "_watched", seen)
+    samples = list(SimulatedMaps(rendered_recipe(), rounds=2, cache=tmp_path / "people"))
+    assert len(samples) == 4
+    assert len(watched) == len(set(watched)) == 2
+    assert len(list((tmp_path / "people").glob("*.npz"))) == 2
 
 
 @pytest.mark.slow
