@@ -99,8 +99,13 @@ class FileClips:
 
 def _in_utf8(clip: Clip) -> Clip:
     """What the data set says of a clip as text that its files can hold; only the path stays that of the file."""
-    names = {name: shown_name(getattr(clip, name)) for name in ("name", "label", "person", "origin")}
-    return replace(clip, **names)
+    return replace(
+        clip,
+        name=shown_name(clip.name),
+        label=shown_name(clip.label),
+        person=shown_name(clip.person),
+        origin=shown_name(clip.origin),
+    )
 
 
 def _told_apart(clip: Clip, source: SourceConfig, number: int) -> Clip:
