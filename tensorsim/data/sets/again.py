@@ -25,7 +25,7 @@ def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample
         raise TensorsimError(f"{folder}: got no sample {sample!r}, expected an id such as {last}")
     recipe, there = recipe_of(folder), made_of(folder)
     here = made_with(recipe)
-    if there | {"version": ""} != here | {"version": ""}:
+    if there and there | {"version": ""} != here | {"version": ""}:
         raise TensorsimError(
             f"{folder}: got another radar or other weights than the data set was made with (first difference: "
             f"{difference(there | {'version': here['version']}, here)}), expected the same"
@@ -40,7 +40,7 @@ def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample
     if made.row["sha256"] != row["sha256"]:
         raise TensorsimError(
             f"{folder}: got other arrays for {sample} than were stored, expected the same: is it another version of "
-            f"tensorsim ({there['version']} there, {here['version']} here), torch or the films, or a processor of "
-            "another kind?"
+            f"tensorsim ({there.get('version', 'an earlier one')} there, {here['version']} here), torch or the films, "
+            "or a processor of another kind?"
         )
     return made

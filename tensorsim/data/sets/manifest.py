@@ -148,26 +148,31 @@ def recipe_of(out: Path) -> DatasetRecipe:
     Raises:
         TensorsimError: no manifest there, or a damaged one.
     """
-    return DatasetRecipe.from_document(_stored(out, "tensorsim.recipe"), str(out / "manifest.parquet"))
+    path = _finished(out)
+    with reading(path, "a manifest"):
+        stored = json.loads(_metadata(path)[b"tensorsim.recipe"])
+    return DatasetRecipe.from_document(stored, str(path))
 
 
 def made_of(out: Path) -> dict[str, Any]:
     """What a data set was made with, as :func:`~tensorsim.data.sets.made_with.made_with` says it.
 
+    Data sets of earlier versions do not tell it: an empty dictionary.
+
     Raises:
         TensorsimError: no manifest there, or a damaged one.
     """
-    return _stored(out, "tensorsim.made_with")
-
-
-def _stored(out: Path, name: str) -> dict[str, Any]:
-    """A document that the manifest of a data set holds."""
-    import pyarrow.parquet as pq
-
     path = _finished(out)
     with reading(path, "a manifest"):
-        document: dict[str, Any] = json.loads(pq.read_schema(path).metadata[name.encode()])
-    return document
+        made: dict[str, Any] = json.loads(_metadata(path).get(b"tensorsim.made_with", b"{}"))
+    return made
+
+
+def _metadata(path: Path) -> dict[bytes, bytes]:
+    """The documents that a manifest holds."""
+    import pyarrow.parquet as pq
+
+    return pq.read_schema(path).metadata or {}
 
 
 def rows_of(out: Path, **wanted: str) -> Iterator[Row]:

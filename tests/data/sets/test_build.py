@@ -400,11 +400,20 @@ def test_samples_of_other_radars_weights_or_versions_are_not_mixed(
 
 
 def test_a_sample_of_another_radar_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pyarrow.parquet as pq
+
     recipe, out = of_a_radar_file(tmp_path), tmp_path / "set"
     build_dataset(recipe, out, quiet=True)
     monkeypatch.setattr(made_with, "version", lambda name: "99")
     assert sample_again(out, "00000001").row["id"] == "00000001"  # the same bits, whatever made them
     assert MapDataset(out).digest == json.loads((out / "dataset.json").read_text())["recipe"]
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    table = pq.read_table(out / "manifest.parquet")
+    stored = {name: text for name, text in table.schema.metadata.items() if name != b"tensorsim.made_with"}
+    pq.write_table(table.replace_schema_metadata(stored), earlier / "manifest.parquet")
+    assert sample_again(earlier, "00000001").row["id"] == "00000001"
+    assert MapDataset(earlier).digest != MapDataset(out).digest
     save_radar_yaml(tmp_path / "radar.yaml", RadarConfig.through_wall(isolation_db=3.0), WallConfig())
     with pytest.raises(TensorsimError, match=r"radars\.front\.radar\.isolation_db .* there, 3\.0 here"):
         sample_again(out, "00000001")
