@@ -10,6 +10,7 @@ import tyro
 
 from tensorsim import __version__, process
 from tensorsim.commands.app import App
+from tensorsim.commands.arguments import describe_options, paragraphs
 from tensorsim.commands.check import Check
 from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample, DatasetVerify
 from tensorsim.commands.demo import Demo
@@ -114,9 +115,9 @@ def _choice(commands: Mapping[str, Any]) -> Any:
         tuple(
             Annotated[
                 Any,
-                tyro.conf.subcommand(
-                    name, constructor=_group(*command) if isinstance(command, tuple) else command
-                ),
+                tyro.conf.subcommand(name, description=command[0], constructor=_group(command[1]))
+                if isinstance(command, tuple)
+                else tyro.conf.subcommand(name, description=paragraphs(command.__doc__), constructor=command),
             ]
             for name, command in commands.items()
         )
@@ -124,11 +125,10 @@ def _choice(commands: Mapping[str, Any]) -> Any:
     ]
 
 
-def _group(description: str, commands: Mapping[str, Any]) -> Callable[..., Any]:
+def _group(commands: Mapping[str, Any]) -> Callable[..., Any]:
     def choose(command: Any) -> Any:
         return command
 
-    choose.__doc__ = description
     choose.__annotations__["command"] = _choice(commands)
     return choose
 
@@ -167,8 +167,22 @@ def _stop(status: int, message: str) -> NoReturn:
     sys.exit(status)
 
 
+def _named(words: list[str]) -> type | None:
+    """The command that the first of these words name, if they name one."""
+    commands: Mapping[str, Any] = COMMANDS
+    for word in words:
+        found = commands.get(word)
+        if not isinstance(found, tuple):
+            return found
+        commands = found[1]
+    return None
+
+
 def parse(arguments: list[str] | None = None) -> Any:
     """The command that the arguments (default: those of the command line) name; exits if there is none."""
+    command = _named(sys.argv[1:] if arguments is None else arguments)
+    if command is not None:
+        describe_options(command)
     return tyro.cli(
         _choice(COMMANDS),
         prog="tensorsim",

@@ -1,5 +1,6 @@
 """The command line on a film: files, contents, repeatable noise, nothing half-written."""
 
+import dataclasses
 import inspect
 import json
 import math
@@ -7,8 +8,10 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +22,7 @@ import tyro
 import tensorsim as ts
 from tensorsim import cli, streaming
 from tensorsim.commands import simulate
+from tensorsim.commands.arguments import describe_options, help_texts
 from tensorsim.commands.options import RadarOptions, load_recognizer
 from tensorsim.data.video import VideoReader
 from tensorsim.data.video_writer import write_video
@@ -416,6 +420,32 @@ def test_help_says_none_of_no_default(command: str, capsys: pytest.CaptureFixtur
     with pytest.raises(SystemExit):
         cli.main([*command.split(), "--help"])
     assert "None" not in capsys.readouterr().out
+
+
+def _commands(table: Mapping[str, Any]) -> Iterator[type]:
+    for command in table.values():
+        if isinstance(command, tuple):
+            yield from _commands(command[1])
+        else:
+            yield command
+
+
+@pytest.mark.parametrize("command", [*_commands(cli.COMMANDS)])
+def test_options_are_described_in_sentences_on_one_line(command: type) -> None:
+    describe_options(command)
+    for option in dataclasses.fields(command):
+        text = option.metadata["help"]
+        assert text[0].isupper(), option.name
+        assert text.endswith((".", '."')), option.name
+        assert "\n" not in text, option.name
+
+
+def test_help_does_not_keep_the_lines_of_the_source(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["simulate", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert " ".join(str(inspect.getdoc(simulate.Simulate)).split()) in shown
+    assert help_texts(simulate.Simulate)["initial_distance"] in shown
 
 
 def test_switches_may_be_on_off_or_as_configured() -> None:

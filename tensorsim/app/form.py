@@ -1,11 +1,9 @@
 """The controls of the app, made from the options of ``simulate``: groups, units, help, and values back to options."""
 
-import ast
-import inspect
-import textwrap
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, Literal, get_args, get_type_hints
 
+from tensorsim.commands.arguments import help_texts
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.panel import PANEL
 from tensorsim.commands.simulate import Simulate
@@ -126,7 +124,7 @@ class Control:
 
 def controls() -> list[Control]:
     """The controls in the order of their groups."""
-    helps, hints = _field_docstrings(Simulate), get_type_hints(Simulate)
+    helps, hints = help_texts(Simulate), get_type_hints(Simulate)
     defaults = {field.name: field.default for field in fields(Simulate)}
     named = [(p.option, p.group, p.name + (f" ({p.unit})" if p.unit else "")) for p in PANEL]
     for group, options in _MORE.items():
@@ -196,16 +194,3 @@ def _whole(given: Any) -> int:
     if number != int(number):
         raise ValueError
     return int(number)
-
-
-def _field_docstrings(cls: type) -> dict[str, str]:
-    """The string below each field of a data class and of its bases."""
-    texts: dict[str, str] = {}
-    for base in reversed(cls.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
-        assert isinstance(body, ast.ClassDef)
-        for field, text in zip(body.body, body.body[1:], strict=False):
-            is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
-                texts[field.target.id] = " ".join(str(text.value.value).split())  # type: ignore[attr-defined]
-    return texts

@@ -9,19 +9,19 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class App:
-    """Open the app: drop a film or choose an activity, change the parameters of the panel, look at the results.
+    """Start the web app: upload a film or choose an activity, set parameters and view the results.
 
     Needs gradio: pip install "tensorsim[app]". Only this machine can open the page unless --host says otherwise.
     """
 
     host: str = "127.0.0.1"
-    """Address to listen at."""
+    """Address to listen on."""
     port: int = 7860
-    """Port to listen at."""
+    """Port to listen on."""
     largest_mb: float = 200.0
-    """Size of the largest film in megabytes."""
+    """Largest size of a film in megabytes."""
     longest_s: float = 60.0
-    """Length of the longest film in seconds."""
+    """Longest duration of a film in seconds."""
 
     def run(self) -> None:
         """Do it."""

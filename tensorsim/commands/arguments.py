@@ -1,5 +1,11 @@
-"""How the command line reads options that need not be given, and options of several numbers."""
+"""How the command line describes options, and reads options that need not be given and options of several numbers."""
 
+import ast
+import inspect
+import re
+import textwrap
+from dataclasses import fields
+from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -8,6 +14,38 @@ from tyro.constructors import PrimitiveConstructorSpec
 _T = TypeVar("_T")
 #: An option that is None unless it is given: the help shows the default that its description names, not "None".
 Option = Annotated[_T | None, tyro.conf.DisallowNone, tyro.conf.arg(help_behavior_hint="")]
+#: An option of any number of values, none unless it is given: the help shows no "(default: )".
+Several = Annotated[tuple[_T, ...], tyro.conf.arg(help_behavior_hint="")]
+
+
+def paragraphs(text: str) -> str:
+    """A text with each of its paragraphs on one line: the help wraps them to the width of the terminal."""
+    return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n\s*\n", text.strip()))
+
+
+def help_texts(command: type) -> dict[str, str]:
+    """The string below each field of a data class and of its bases, as :func:`paragraphs`."""
+    texts: dict[str, str] = {}
+    for base in reversed(command.__mro__[:-1]):
+        try:
+            source = inspect.getsource(base)
+        except OSError:  # only compiled files are there
+            continue
+        body = ast.parse(textwrap.dedent(source)).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
+            is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
+                texts[field.target.id] = paragraphs(str(text.value.value))  # type: ignore[attr-defined]
+    return texts
+
+
+def describe_options(command: type) -> None:
+    """Give tyro the :func:`help_texts` of a command, which itself would keep the line breaks of the source."""
+    texts = help_texts(command)
+    for field in fields(command):
+        if field.name in texts:
+            field.metadata = MappingProxyType({**field.metadata, "help": texts[field.name]})
 
 
 def numbers(metavar: str, kind: type[float] = float) -> PrimitiveConstructorSpec[Any]:

@@ -14,4 +14,4 @@ class Check:
         from tensorsim.selfcheck import run_checks
 
         if not run_checks():
-            raise TensorsimError("the installation is not in order, see above")
+            raise TensorsimError("the installation check failed, see above")

@@ -36,23 +36,23 @@ class ClipOptions(RadarOptions):
     vital_signs: Option[bool] = None
     """People breathe and their hearts beat. Default: off."""
     motion: Option[Literal["smooth", "paper"]] = None
-    """Two-sided smoothing and a spline, or the paper's forward filter, straight lines and Savitzky-Golay.
-    Default: smooth."""
+    """Two-sided smoothing with spline interpolation, or, as in the paper, a forward filter with linear interpolation
+    and a Savitzky-Golay filter. Default: smooth."""
     denoiser: Option[str] = None
-    """What cleans the shown maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
+    """Denoiser for the displayed maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
     .safetensors or a name of `tensorsim models list`). Default: none."""
     figure_format: Literal["png", "pdf", "svg"] = "png"
     """Format of the pictures."""
     hide_ridges: bool = False
-    """Draw no ridges over the Doppler-time map."""
+    """Do not draw ridges on the Doppler-time map."""
     sound: bool = False
-    """Write doppler.wav as well, the micro-Doppler as sound: approaching motion left, receding motion right."""
+    """Also write doppler.wav, the micro-Doppler as sound: approaching motion left, receding motion right."""
     full_rate: bool = False
-    """Keep a column of the range-time maps for every pulse, not 256 per second."""
+    """Keep one column of the range-time maps per pulse instead of 256 per second."""
     save: Annotated[str, tyro.conf.arg(metavar="npz,mat,h5")] = "npz"
-    """Formats of maps and poses: .npz, which is always written, and mat for MATLAB or h5 for HDF5 beside it."""
+    """Formats of maps and poses: npz, which is always written, and additionally mat (MATLAB) or h5 (HDF5)."""
     device: str = "auto"
-    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
+    """Device: cpu, cuda, cuda:1, ...; auto takes a GPU if there is one."""
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""

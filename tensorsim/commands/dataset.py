@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DatasetBuild:
-    """Build a data set; run again with the same arguments, it goes on where it stopped.
+    """Build a data set; running it again with the same arguments resumes it.
 
     The files depend on the recipe alone, not on the engine or the number of workers.
     """
@@ -26,17 +26,17 @@ class DatasetBuild:
     out: Path
     """Folder of the data set."""
     workers: int = 1
-    """Processes of this machine."""
+    """Number of processes on this machine."""
     engine: Literal["processes", "ray"] = "processes"
-    """Ray runs on clusters as well: pip install 'tensorsim[scale]'."""
+    """Ray also runs on clusters: pip install "tensorsim[scale]"."""
     address: Option[str] = None
-    """Of a running Ray cluster, whose nodes all see the folder; by default one is started here."""
+    """Address of a running Ray cluster; all nodes must share the output folder. Default: one is started here."""
     cache: Option[Path] = None
-    """Folder for the people found in films, which several data sets can share. Default: OUT/.people."""
+    """Folder for the people found in films; several data sets can share it. Default: OUT/.people."""
     strict: bool = False
-    """Stop at the first clip that fails, in place of a line in failures.csv."""
+    """Stop at the first clip that fails instead of adding a line to failures.csv."""
     retry: bool = False
-    """Try samples that failed in an earlier run again."""
+    """Try again the samples that failed in an earlier run."""
     quiet: bool = False
     """No progress bars."""
 
@@ -72,7 +72,7 @@ class DatasetExample:
     """Print a small recipe with comments: two activities, 8 samples."""
 
     large: bool = False
-    """One for training instead: the 12 activities of 100 people, seen by three radars, 1200 samples."""
+    """Print one for training instead: the 12 activities of 100 people, seen by three radars, 1200 samples."""
 
     def run(self) -> None:
         """Do it."""
@@ -83,12 +83,12 @@ class DatasetExample:
 
 @dataclass(frozen=True)
 class DatasetSample:
-    """Make one sample of a data set again from its row of the manifest, and compare it with the stored hash."""
+    """Make one sample of a data set again from its row in the manifest, and compare it with the stored hash."""
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DIR")]]
     """The data set."""
     id: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="ID")]]
-    """The sample, as in the manifest."""
+    """Its name in the manifest."""
     out: Option[Path] = None
     """Folder for its arrays, as ID.RADAR.OUTPUT.npy."""
 

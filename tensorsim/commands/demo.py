@@ -40,17 +40,17 @@ CAMERA_M = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Demo(NetworkOptions, ClipOptions):
-    """Film a rendered person and turn the film into what a radar would have seen. Needs no file.
+    """Render a film of a person with known motion and simulate the radar from it. Needs no input file.
 
-    Writes what `simulate` writes, film.mp4, and the truth: maps_truth.npz, pose_truth.npz; every picture of a map
-    shows that of the film beside that of the true motion, and summary.json says how far they are apart.
+    Writes what `simulate` writes, film.mp4, and the truth: maps_truth.npz, pose_truth.npz; each map picture shows the
+    map from the film beside that of the true motion; summary.json lists the errors.
     """
 
     activity: str = "walking"
     """What the person does: walking, punching, kicking, grabbing, sitting down, standing up, rotating, sitting to
     walking, walking to sitting, falling to walking, walking to falling, or empty."""
     out: Path = Path("demo")
-    """Folder for the results; its files appear together, when all are complete."""
+    """Output folder; it is written only when the whole run has succeeded."""
     duration: float = 4.0
     """Length of the film in seconds."""
 

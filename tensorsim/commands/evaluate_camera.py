@@ -16,28 +16,28 @@ FOV_SD_DEG = 4.0
 
 @dataclass(frozen=True)
 class EvaluateCamera:
-    """Estimate cameras that are known from generated walks, and print the errors of tilt, field of view and range.
+    """Estimate known cameras from generated walks, and print the errors of tilt, field of view and range.
 
     One row per tilt and height, over all fields of view: the median and the largest error. Walks of which less than
     half is in the picture are left out.
     """
 
     tilts: tuple[float, ...] = (0.0, 12.0, 24.0, 35.0)
-    """Degrees below level."""
+    """Tilts in degrees below level."""
     heights: tuple[float, ...] = (0.8, 1.5, 3.0)
-    """Metres above the floor."""
+    """Heights in metres above the floor."""
     fovs: tuple[float, ...] = (40.0, 60.0, 90.0)
     """Horizontal fields of view in degrees."""
     walks: int = 5
-    """Of other people, before each camera."""
+    """Walks of different people in front of each camera."""
     noise: float = 2.0
     """Standard deviation of the key points in pixels, in pictures of 640 x 480."""
     turn: float = 80.0
     """Angle in degrees by which people turn after half the time; 0 for straight walks."""
     known_height: bool = True
-    """The height of the person is known; otherwise 1.70 m is assumed."""
+    """Use the true height of the person; otherwise 1.70 m is assumed."""
     seed: int = 0
-    """Of people and paths."""
+    """Random seed of people and paths."""
 
     def run(self) -> None:
         """Do it."""

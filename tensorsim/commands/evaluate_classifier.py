@@ -16,33 +16,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluateClassifier:
-    """Print accuracy against signal-to-noise ratio, and confusion matrices of the lowest and highest.
-
-    Attributes:
-        weights: SPNet's or SPGNet's (.safetensors).
-        maps: folder of maps; missing ones are made first.
-        scenes: what to evaluate on.
-        people: people per scene, each doing all 12 activities.
-        held_out: only every fifth of them: for a folder that the network was trained on.
-        maps_seed: of people, motion and noise; one that the network was not trained on makes a test set.
-        snr: signal-to-noise ratios in dB; films are judged at the highest.
-        films: folder of films that networks watched, as ``evaluate truth --settings c`` keeps them in ``films/``.
-        poses: folder with a pose.npz of ``tensorsim simulate`` per film, in folders whose names begin with S1 to S12.
-        out: folder for the confusion matrices as CSV and PNG.
-        quiet: no progress bar.
-    """
+    """Print accuracy against signal-to-noise ratio, and confusion matrices at the lowest and highest ratio."""
 
     weights: Path
+    """Weights of SPNet or SPGNet (.safetensors)."""
     maps: Option[Path] = None
+    """Folder of maps; missing ones are made first."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    """Scenes to evaluate on."""
     people: int = 40
+    """People per scene; each does all 12 activities."""
     held_out: bool = False
+    """Only every fifth of them: for a folder that the network was trained on."""
     maps_seed: int = 1
+    """Random seed of people, motion and noise; a seed that the network was not trained on makes a test set."""
     snr: tuple[float, ...] = (50.0, 40.0, 30.0, 20.0, 10.0)
+    """Signal-to-noise ratios in dB; films are evaluated at the highest."""
     films: Option[Path] = None
+    """Folder of films and what networks found in them, as kept in films/ by `tensorsim evaluate truth --settings c`."""
     poses: Option[Path] = None
+    """Folder with a pose.npz of `tensorsim simulate` per film, in folders whose names begin with S1 to S12."""
     out: Option[Path] = None
+    """Folder for the confusion matrices as CSV and PNG."""
     quiet: bool = False
+    """No progress bar."""
 
     def run(self) -> None:
         """Do it."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, check_count
 from tensorsim.files import write_text
@@ -12,29 +12,26 @@ from tensorsim.files import write_text
 
 @dataclass(frozen=True)
 class EvaluateDenoiser:
-    """Print PSNR and the errors of ridges and envelope, before and after, for each kind of map and each rival.
-
-    Attributes:
-        weights: DnCNN's (.safetensors, .pth).
-        against: more weights of DnCNN to compare with, such as dncnn_gray_blind.pth.
-        clips: clips per scene, activity after activity from S2 on.
-        scenes: what to evaluate on.
-        snr: signal-to-noise ratios in dB.
-        seed: of people, motion and noise; one that was not trained on.
-        ksvd: include K-SVD, which takes about a minute a map.
-        out: file for the table as CSV.
-        quiet: no progress bar.
-    """
+    """Print PSNR and the errors of ridges and envelope, before and after, for each kind of map and each rival."""
 
     weights: Path
-    against: tuple[Path, ...] = ()
+    """Weights of DnCNN (.safetensors, .pth)."""
+    against: Several[Path] = ()
+    """More weights of DnCNN to compare with, such as dncnn_gray_blind.pth."""
     clips: int = 11
+    """Clips per scene, activity after activity from S2 on."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    """Scenes to evaluate on."""
     snr: tuple[float, ...] = (10.0,)
+    """Signal-to-noise ratios in dB."""
     seed: int = 1
+    """Random seed of people, motion and noise; use one that was not trained on."""
     ksvd: bool = True
+    """Include K-SVD, which takes about a minute per map."""
     out: Option[Path] = None
+    """File for the table as CSV."""
     quiet: bool = False
+    """No progress bar."""
 
     def run(self) -> None:
         """Do it."""

@@ -3,29 +3,26 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)
 class EvaluateDetector:
-    """Print average precision and recall on held-out pictures, and how long films are followed beside another detector.
-
-    Attributes:
-        weights: RTMDet's (.safetensors, .pth, .onnx) or ACF's (.safetensors); the shipped ones if not given.
-        against: another detector's, measured alike; needed for films.
-        data: folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out pictures are looked at.
-        coco: folder with one COCO annotation file (*.json) and its pictures in images/.
-        films: videos to follow people in.
-        quiet: no progress bars.
-    """
+    """Print average precision and recall on held-out pictures, and how long two detectors follow people in films."""
 
     weights: Option[Path] = None
+    """Weights of RTMDet (.safetensors, .pth, .onnx) or ACF (.safetensors). Default: the shipped ones."""
     against: Option[Path] = None
+    """Weights of another detector, measured in the same way; needed for --films."""
     data: Option[Path] = None
+    """Folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out pictures are used."""
     coco: Option[Path] = None
-    films: tuple[Path, ...] = ()
+    """Folder with one COCO annotation file (*.json) and its pictures in images/."""
+    films: Several[Path] = ()
+    """Videos to follow people in."""
     quiet: bool = False
+    """No progress bars."""
 
     def run(self) -> None:
         """Do it."""

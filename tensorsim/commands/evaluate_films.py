@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
 from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
@@ -17,7 +17,7 @@ from tensorsim.files import check_folder, complete_file, write_text
 @dataclass(frozen=True, kw_only=True)
 class EvaluateFilms(NetworkOptions):
     """Label real films of known activity in each scene, as `tensorsim simulate --least-probability 0` would: every
-    film gets a label, however unsure.
+    film gets a label, however uncertain.
 
     Prints a table and writes films.md, films.json, films.csv and a contact sheet (PNG) per film. What the networks
     find is kept in cache/.
@@ -26,30 +26,30 @@ class EvaluateFilms(NetworkOptions):
     data: Path
     """Folder of films with labels.json: a list of {"file", "start_s", "end_s", "accept": [activities]}."""
     out: Path
-    """Folder of the results."""
+    """Output folder."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Radars."""
     body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
     """Scatterers of a person, as in `tensorsim simulate`."""
     classifier: Option[str] = None
     """Activity classifier: path or name. Default: the shipped one."""
-    only: tuple[str, ...] = ()
-    """Names of films, or parts of them; default all."""
+    only: Several[str] = ()
+    """Names of films, or parts of names. Default: all films."""
     lifter: Option[Literal["temporal", "nearest"]] = None
-    """How joints get their depths, as in `tensorsim simulate`."""
+    """How key points become 3D, as in `tensorsim simulate`."""
     stride: int = 1
     """Keep every n-th frame."""
     whole: bool = False
-    """Label films from beginning to end, not only the seconds in which the activity happens."""
+    """Label whole films, not only the seconds in which the activity happens."""
     variants: bool = False
-    """Label each film in five variants as well (mirrored, shortened at either end, key points a little off), and print
-    means over all six. It takes six times as long without the networks, which run once."""
+    """Also label each film in five variants (mirrored, shortened at either end, slightly perturbed key points), and
+    print means over all six. This takes six times as long, except for the networks, which run once."""
     calibrate: bool = True
-    """Estimate the camera of each film from its people; otherwise it is level, with a field of view of 60 degrees."""
+    """Estimate the camera of each film from its people; otherwise it is level and sees 60 degrees horizontally."""
     seed: int = 0
-    """Of the receiver's noise."""
+    """Random seed of the receiver's noise."""
     device: str = "auto"
-    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
+    """Device: cpu, cuda, cuda:1, ...; auto takes a GPU if there is one."""
     quiet: bool = False
     """No progress bars."""
 

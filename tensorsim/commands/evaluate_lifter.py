@@ -3,33 +3,30 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)
 class EvaluateLifter:
-    """Print errors of the three lifters: from key points to smooth joints, camera and height known.
+    """Print the errors of the three lifters, from key points to smooth joints, with known camera and body height.
 
-    Generated people have other seeds than those of training; of motion capture, every second sequence was never
-    trained on.
-
-    Attributes:
-        motion: motion capture files (.npz, .bvh).
-        films: folder films/ of `tensorsim evaluate truth --settings c`: key points of networks on rendered films.
-        weights: of the temporal lifter, a path or name. Default: the shipped one.
-        motions: held-out motions that views are drawn from.
-        seed: of motions, cameras and errors; one that was not trained on.
-        quiet: no progress bar.
+    Generated people have other seeds than in training; of motion capture, every second sequence was never trained on.
     """
 
-    motion: tuple[Path, ...] = ()
+    motion: Several[Path] = ()
+    """Motion capture files (.npz, .bvh)."""
     films: Option[Path] = None
+    """Folder films/ of `tensorsim evaluate truth --settings c`: key points that networks found in rendered films."""
     weights: Option[str] = None
+    """Weights of the temporal lifter: path or name. Default: the shipped one."""
     motions: int = 1200
+    """Held-out motions from which views are drawn."""
     seed: int = 1234
+    """Random seed of motions, cameras and errors; use one that was not trained on."""
     quiet: bool = False
+    """No progress bar."""
 
     def run(self) -> None:
         """Do it."""

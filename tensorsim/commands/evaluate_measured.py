@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, check_count
 from tensorsim.files import check_folder, write_json, write_text
@@ -12,32 +12,32 @@ from tensorsim.files import check_folder, write_json, write_text
 
 @dataclass(frozen=True)
 class EvaluateMeasured:
-    """Train on simulation alone and test on measured clips; then with 10 measured clips of each class, and with all.
+    """Train on simulation alone and test on measured clips; then fine-tune on 10 measured clips per class, and on all.
 
     Prints a table and writes measured.json, confusion matrices, calibration and the weights trained on simulation.
     """
 
     train: Path
-    """Folder of measured sets to learn from: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
+    """Folder of measured sets to train on: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
     out: Path
-    """Folder of the results."""
+    """Output folder."""
     test: Option[Path] = None
-    """Folder of measured sets to test on, the same layout; default the last 30 % of each class of --train, in the
-    order of the files, which is then trained on the others only."""
+    """Folder of measured sets to test on, with the same layout. Default: the last 30 % of each class of --train, in the
+    order of the files; then only the rest is trained on."""
     quick: bool = False
-    """Take the shipped weights, trained on simulation alone, and train nothing."""
+    """Use the shipped weights, trained on simulation alone, and train nothing."""
     ablation: bool = False
-    """Instead: train on simulation without each of its effects in turn, and print what each is worth."""
-    sets: tuple[Literal["glasgow_cfar_masks", "kmkim_cw24_iq", "radhar_points"], ...] = ()
-    """Which sets; default all that both folders have."""
+    """Instead, train on simulation without each of its effects in turn, and print how much each contributes."""
+    sets: Several[Literal["glasgow_cfar_masks", "kmkim_cw24_iq", "radhar_points"]] = ()
+    """Names of the sets. Default: all that both folders have."""
     clips: int = 300
-    """Simulated clips of each class."""
+    """Simulated clips per class."""
     repeats: int = 1
-    """Trainings of each simulation in an ablation, with the seeds from --seed on."""
+    """Trainings of each simulation in an ablation, with consecutive seeds from --seed on."""
     steps: int = 600
-    """Batches of 64 of the training on simulation; half as many on a few measured clips, twice as many on all."""
+    """Batches of 64 when training on simulation; half as many with a few measured clips, twice as many with all."""
     seed: int = 0
-    """Of simulation and training."""
+    """Random seed of simulation and training."""
     quiet: bool = False
     """No progress bar."""
 
@@ -66,7 +66,9 @@ class EvaluateMeasured:
         chosen = [s for s in SETS if s.name in self.sets] if self.sets else there
         if not chosen:
             names = ", ".join(s.name for s in SETS)
-            raise TensorsimError(f"{', '.join(map(str, folders))}: no set in all, expected some of {names}")
+            raise TensorsimError(
+                f"{', '.join(map(str, folders))}: no data set is present in every folder, expected some of {names}"
+            )
         results, errors = {}, {}
         for measured in chosen:
             experiment = Experiment(

@@ -12,28 +12,25 @@ from tensorsim.exceptions import TensorsimError
 class EvaluatePose:
     """Print mean OKS and PCK@0.1 (of the longer side of the box) on held-out people.
 
-    "Body" is without the face, "pairs" the left and right points of the body with each pair either way round.
+    The column "body" leaves out the face; "pairs" scores left/right pairs of the body with either assignment.
 
-    Then, of the same people with the edge of the picture through them, the shares of keypoints that score 0.3 or more:
-    of those in the picture ("seen") and of those beyond ("ghosts").
-
-    Attributes:
-        weights: HRNet's (.safetensors, .pth) or any heat-map network's (.onnx); the shipped ones if not given.
-        data: folder of the shards coco_small, coco_more, coco_extra and lspet (NAME-*.tar), whose held-out
-            people are looked for; "large" ones have eight labelled keypoints or more and at least a quarter
-            of the height of their picture.
-        coco: folder with one COCO annotation file (*.json) and its pictures in images/.
-        flip_test: average with the mirror image.
-        engine: what runs the network, as in `tensorsim simulate`.
-        quiet: no progress bars.
+    The columns "seen" and "ghosts" are of the same people, cut by the edge of the picture: the share of key points with
+    scores of 0.3 or more among those in the picture, and among those outside the picture, which are spurious.
     """
 
     weights: Option[Path] = None
+    """Weights of HRNet (.safetensors, .pth) or of any heat-map network (.onnx). Default: the shipped ones."""
     data: Option[Path] = None
+    """Folder of the shards coco_small, coco_more, coco_extra and lspet (NAME-*.tar), whose held-out people are used;
+    "large" ones have eight labelled key points or more and at least a quarter of the height of their picture."""
     coco: Option[Path] = None
+    """Folder with one COCO annotation file (*.json) and its pictures in images/."""
     flip_test: bool = True
+    """Average with the mirror image."""
     engine: Engine = "torch"
+    """What runs the network, as in `tensorsim simulate`."""
     quiet: bool = False
+    """No progress bars."""
 
     def run(self) -> None:
         """Do it."""

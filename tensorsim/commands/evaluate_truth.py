@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.networks import default_networks
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
@@ -15,35 +15,36 @@ from tensorsim.files import check_folder, write_text
 class EvaluateTruth:
     """Compare the maps of the pipeline with those of motion that is exactly known.
 
-    Prints a table and writes truth.md, truth.csv and a picture per scene. Goes on where it was interrupted.
+    Prints a table and writes truth.md, truth.csv and a picture per scene. Running it again with the same arguments
+    resumes it.
     """
 
     out: Path
-    """Folder of the results; cells/ in it keeps the figures of every clip."""
+    """Output folder; its cells/ keeps the figures of every clip."""
     clips: int = 10
     """Clips per row of the table."""
-    activities: tuple[str, ...] = ()
-    """Rows; default all twelve activities, or none with --motion ("all" for all with --motion)."""
-    motion: tuple[Path, ...] = ()
+    activities: Several[str] = ()
+    """Activities, each a row. Default: all twelve, or none with --motion ("all" for all with --motion)."""
+    motion: Several[Path] = ()
     """Motion capture (.npz, .bvh), each file a row."""
     motion_fps: Option[float] = None
-    """Frames per second of the motion capture, instead of what the files say; needed where they say nothing."""
+    """Frames per second of the motion capture, overriding the files' values; needed if they state none."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Radars."""
     settings: tuple[Literal["a", "b", "c"], ...] = ("a", "b")
-    """From true 3D joints at video rate (a), true 2D keypoints (b), or the rendered film by networks (c)."""
+    """Start from true 3D joints at video rate (a), true 2D key points (b), or the rendered film and networks (c)."""
     stages: bool = True
-    """Also replace each stage by the truth in turn."""
+    """Also replace each stage in turn by the truth."""
     detector: Option[str] = None
-    """For setting c: path or name. Default: $TENSORSIM_DETECTOR, else the shipped one."""
+    """Person detector for setting c: path or name. Default: $TENSORSIM_DETECTOR if it is set, else the shipped one."""
     pose: Option[str] = None
-    """For setting c: path or name. Default: $TENSORSIM_POSE, else the shipped one."""
+    """Pose network for setting c: path or name. Default: $TENSORSIM_POSE if it is set, else the shipped one."""
     lifter: Option[Literal["temporal", "nearest"]] = None
-    """How key points are lifted. Default: as `tensorsim simulate` does."""
+    """How key points are lifted. Default: as in `tensorsim simulate`."""
     seed: int = 0
-    """Of the first clip of each activity; the next have the next."""
+    """Seed of the first clip of each activity; further clips use consecutive seeds."""
     jobs: int = 1
-    """Processes, each with one thread."""
+    """Number of processes, each with one thread."""
     quiet: bool = False
     """No progress bar."""
 

@@ -16,62 +16,62 @@ class RunExperiment:
     """Run an experiment, or list them: `tensorsim experiment list`.
 
     Writes a report (NAME.md), tables (NAME*.csv), figures (NAME-*.png and .svg) and the settings that repeat it
-    (NAME.yaml). Run again with the same arguments, it goes on where it stopped, to the same numbers. Options without a
-    value keep that of the experiment; the report says what they are.
+    (NAME.yaml). Running it again with the same arguments resumes it, with the same results. Options that are not given
+    keep the experiment's defaults, which the report lists.
     """
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
-    """list, or a name that it prints."""
+    """Name of an experiment, or list, which prints the names."""
     out: Option[Path] = None
-    """Folder of the results."""
+    """Output folder."""
     quick: bool = False
-    """A small run of a minute or two, to see that everything works."""
+    """A small test run (one to two minutes)."""
     config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
     """Settings, such as the NAME.yaml of an earlier run."""
     cache: Option[Path] = None
-    """Folder of scene sets, trained networks and single results. Default: OUT/work."""
+    """Folder of scene sets, trained networks and intermediate results. Default: OUT/work."""
     networks: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """Recognisers: spnet, ccln, ..."""
     scenes: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
-    """free-space, through-wall."""
+    """Scenes: free-space, through-wall."""
     inputs: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
-    """doppler, range, ridges, merged."""
+    """Inputs of the recognisers: doppler, range, ridges, merged."""
     denoisers: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
-    """none, perona-malik, ksvd, dncnn."""
+    """Denoisers: none, perona-malik, ksvd, dncnn."""
     activities: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
-    """Names of activities; all twelve if none is given."""
+    """Names of activities. Default: all twelve."""
     data: Option[str] = None
     """Folder of measured sets: glasgow_cfar_masks, kmkim_cw24_iq, radhar_points."""
     films: Option[str] = None
-    """Folder of real films with labels.json, as `tensorsim evaluate films` takes it."""
+    """Folder of real films with labels.json, as for `tensorsim evaluate films`."""
     maps: Option[str] = None
-    """Folder of simulated maps of everyday motion, as `tensorsim train everyday` makes them. Default: in the cache."""
+    """Folder of simulated maps of everyday motion, as made by `tensorsim train everyday`. Default: in the cache."""
     groups: Option[int] = None
-    """Groups of these maps, of some 100 clips each."""
+    """Number of groups of these maps, of about 100 clips each."""
     clips: Option[int] = None
     """Clips per class."""
     test_clips: Option[int] = None
-    """Clips per class of other people, to test on."""
+    """Test clips per class, of other people."""
     size: Option[int] = None
     """Height and width of the pictures."""
     epochs: Option[int] = None
     """Passes over the training clips."""
     steps: Option[int] = None
-    """Batches of a training, where it does not count epochs."""
+    """Batches of a training that does not count epochs."""
     film_steps: Option[int] = None
     """Batches of a training on the maps of everyday motion."""
     length_s: Option[float] = None
     """Length of a clip in seconds."""
     seeds: Option[int] = None
-    """Trainings with different weights."""
+    """Number of trainings with different initial weights."""
     film_seeds: Option[int] = None
-    """Trainings with different weights on the maps of everyday motion."""
+    """Number of trainings with different initial weights on the maps of everyday motion."""
     snr_db: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="DB ...")] = None
-    """Signal-to-noise ratios of the tests."""
+    """Signal-to-noise ratios of the tests in dB."""
     seed: Option[int] = None
-    """Of people, motion and noise."""
+    """Random seed of people, motion and noise."""
     jobs: int = 1
-    """Processes at a time."""
+    """Number of processes."""
     settings: Option[str] = None
     """Folder with the NAME.yaml of earlier runs, for `paper`: the sizes of its experiments."""
     quiet: bool = False

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.options import check_seed
 from tensorsim.exceptions import TensorsimError, check_count
 
@@ -18,22 +18,22 @@ SUFFIXES = (".bvh", ".npz")
 class BuildLibrary:
     """Build a pool of poses for lifting, from motion files or from tensorsim's own generator.
 
-    Poses are scaled to one body height and turned to one heading (the lifter turns them to all), each with its mirror
-    image; of poses that are nearly alike one is kept.
+    Poses are scaled to one body height and turned to one heading (the lifter turns them to all headings), each with its
+    mirror image; of poses that are nearly the same only one is kept.
     """
 
-    sources: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Motion files (.bvh, .npz), folders that are searched for them, or patterns such as 'mocap/**/*.bvh'."""
+    sources: tyro.conf.Positional[Several[Path]] = ()
+    """Motion files (.bvh, .npz), folders to search for them, or patterns such as 'mocap/**/*.bvh'."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("pose_library.safetensors")
     """File to write."""
     generate: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Poses of the activities and the pose sampler to add."""
+    """Number of generated poses to add, from the activities and the pose sampler."""
     most: Annotated[Option[int], tyro.conf.arg(metavar="N")] = None
-    """Poses to keep at most, chosen at random; memory of the lifter is about 2 KB a pose."""
+    """Largest number of poses, chosen at random; the lifter needs about 2 KB of memory per pose."""
     tolerance: float = 0.015
-    """Poses nearer than this are duplicates: root mean square over the joints, in body heights."""
+    """Poses closer than this are duplicates: root mean square over the joints, in body heights."""
     seed: int = 0
-    """Seed of the generator and of what is chosen."""
+    """Random seed of the generator and of the choice of poses."""
     quiet: bool = False
     """No progress bars."""
 

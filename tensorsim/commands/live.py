@@ -22,27 +22,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Live(NetworkOptions, RadarOptions):
-    """Simulate the radar from a camera as it films, and show it in a page on this machine.
+    """Simulate the radar in real time from a camera and show the result on a local web page.
 
-    The page has the camera's picture with the people in it, the Doppler-time map that scrolls, and the labels. Frames
-    that come faster than they can be worked on are dropped and counted. Ends with the film, or with Ctrl-C.
+    The page has the camera's picture with the people in it, a scrolling Doppler-time map, and the labels. Frames that
+    arrive too fast to be processed are dropped and counted. Ends with the film, or with Ctrl-C.
+
+    Poses are lifted by nearest matching, and the camera is not estimated: set pose.camera in a --config.
     """
 
     camera: str
-    """Number of a camera, address of a stream (rtsp://...), or a film that is played like a camera."""
+    """Number of a camera, address of a stream (rtsp://...), or a film played in real time."""
     person_height: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
     """Body heights in metres in order of appearance, instead of those of the configuration (1.80, 1.70); the last one
-    serves the rest."""
+    applies to all further people."""
     fps: Option[float] = None
-    """Frames per second, instead of what the source announces."""
+    """Frames per second, overriding the source's value."""
     every_frame: bool = False
-    """Of a film, take every frame, however long that takes, instead of dropping frames to keep up with its time."""
+    """Process every frame of a film, however long that takes, instead of dropping frames to keep up with real time."""
     seconds: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
-    """Stop after so much time of the film."""
+    """Stop after this many seconds of the film."""
     port: int | None = 8787
-    """Port of the page at 127.0.0.1; 0 takes a free one, None shows no page."""
+    """Port of the page on 127.0.0.1; 0 takes a free one, None shows no page."""
     record: Option[Path] = None
-    """Film of what the page shows, ending in .webm or .mp4."""
+    """Record the page to this film, whose name ends in .webm or .mp4."""
 
     def run(self) -> None:
         """Do it."""

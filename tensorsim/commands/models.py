@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import tyro
 
+from tensorsim.commands.arguments import Several
 from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)
 class ListModels:
-    """List the weights that are known by name: shipped ones, and those fetched from their makers on demand."""
+    """List the weights that are known by name: shipped ones, and those downloaded from their authors on demand."""
 
     def run(self) -> None:
         """Do it."""
@@ -26,7 +27,7 @@ class ListModels:
 class FetchModels:
     """Download weights into the cache, so that later runs need no network."""
 
-    names: tyro.conf.Positional[tuple[str, ...]]
+    names: tyro.conf.Positional[Several[str]]
     """Names as `tensorsim models list` prints them."""
     quiet: bool = False
     """No progress bar."""
@@ -61,4 +62,4 @@ class VerifyModels:
                 wrong.append(entry.name)
                 print(f"WRONG {error}")
         if wrong:
-            raise TensorsimError(f"models verify: not in order: {', '.join(wrong)}")
+            raise TensorsimError(f"models verify: {', '.join(wrong)} failed verification")

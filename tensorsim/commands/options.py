@@ -73,47 +73,47 @@ def check_seed(seed: int, option: str = "--seed") -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RadarOptions(PanelOptions, ReceiverOptions):
-    """How people's joints become maps, and how these look. Options without a value keep that of the configuration."""
+    """How people's joints become maps, and how these look. Options that are not given keep the configured value."""
 
     config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
     """Configuration of a run: a YAML file with fields of SimulationConfig, or the summary.json of an earlier run. Other
-    options change it."""
+    options override it."""
     paper: bool = False
-    """The literal formulas of the paper everywhere (SimulationConfig.paper)."""
+    """Use the paper's literal formulas throughout (SimulationConfig.paper)."""
     scene: Option[Literal["free-space", "through-wall"]] = None
-    """77 GHz radar in the open, or 2 GHz radar behind a wall with multipath. Default: free-space."""
+    """Radar of 77 GHz in free space, or of 2 GHz behind a wall, with multipath. Default: free-space."""
     radar: Annotated[Option[str], tyro.conf.arg(metavar="NAME|FILE")] = None
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall, and
-    the arrays ti-awr1843-array, infineon-bgt60tr13c-array) or a YAML file with fields of RadarConfig; a wall that it
-    comes with replaces the scene's, a floor adds its reflections."""
+    the arrays ti-awr1843-array, infineon-bgt60tr13c-array) or a YAML file with fields of RadarConfig; its wall, if
+    any, replaces that of the scene; its floor, if any, adds reflections."""
     body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
     """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
-    cross section follows the aspect, the 13 points of the original's first version, or points over torso and limbs
-    with the energy over speed of measured walks. Default: joints."""
+    cross section follows the aspect, the 13 points of the original's first version, or 59 points on torso and limbs
+    whose power per speed matches measured walks. Default: joints."""
     integration: Option[Literal["noncoherent", "paper"]] = None
     """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler. Default: noncoherent."""
     wall_paths: Option[Literal["series", "paper"]] = None
-    """Bounces inside the wall: complete to first order, or the paper's. Default: series."""
+    """Internal reflections in the wall: complete to first order, or as in the paper. Default: series."""
     multipath: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
-    """Bounces inside the wall. Default: True behind a wall."""
+    """Internal reflections in the wall. Default: True if there is a wall."""
     leakage: Option[bool] = None
-    """Direct signal from transmitter to receiver. Default: off."""
+    """Direct signal from the transmitter to the receiver. Default: off."""
     wall_echo: Option[bool] = None
-    """Static mirror reflection of the wall. Default: off."""
+    """Static specular reflection from the wall. Default: off."""
     snr: Option[float] = None
     """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
     classifier: Option[str] = None
     """Activity classifier: SPGNet or SPNet as .safetensors, or a name of `tensorsim models list`; "none"
     for no label. Default: the shipped one."""
     least_probability: float = 0.2
-    """A label whose probability is lower is "not sure". 0 always gives the likeliest of the twelve."""
+    """Labels with a lower probability become "not sure"; 0 always returns the most probable class."""
     seed: Option[int] = None
-    """Seed of everything that is random. Default: 0."""
+    """Random seed. Default: 0."""
     colormap: Literal["turbo", "viridis", "jet", "parula", "gray"] = "turbo"
     """Colours of the maps."""
     dynamic_range: float = 50.0
-    """Decibels below the peak that the maps show."""
+    """Dynamic range of the maps, in dB below the peak."""
     quiet: bool = False
     """No progress bars."""
 

@@ -76,7 +76,7 @@ class PanelOptions:
     """Parameters of the control panel."""
 
     keypoint_threshold: Option[float] = None
-    """Score from which a key point counts as seen. Default: 0.3."""
+    """Smallest score of a visible key point. Default: 0.3."""
     person_weight: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="KG ...")] = None
     """Body weights in kg in order of appearance; cross sections scale with the body surface. Default: 84.24 75.00."""
     min_detection_size: Option[float] = None
@@ -84,7 +84,7 @@ class PanelOptions:
     detection_interval: Option[int] = None
     """The detector runs on every n-th frame. Default: 2."""
     max_tracks: Option[int] = None
-    """People at a time. Default: 5."""
+    """Largest number of people tracked at once. Default: 5."""
     confirmation_hits: Option[int] = None
     """Detections within --confirmation-window that confirm a track. Default: 2."""
     confirmation_window: Option[int] = None
@@ -96,27 +96,27 @@ class PanelOptions:
     assignment_threshold: Option[float] = None
     """Largest squared Mahalanobis distance of a detection from its track. Default: 150."""
     process_noise: Option[float] = None
-    """Kalman process noise of a track's box, size^2 / frame^3. Default: 0.001."""
+    """Kalman process noise of a track's box, in size^2 / frame^3 with the size of the box. Default: 0.001."""
     measurement_noise: Option[float] = None
-    """Kalman measurement noise of a track's box, size^2. Default: 0.0004 (panel: 0.01)."""
+    """Kalman measurement noise of a track's box, in size^2. Default: 0.0004 (panel: 0.01)."""
     carrier_hz: Option[float] = None
-    """Start of the sweep. Default: 77e9, behind a wall 2e9."""
+    """Start frequency of the sweep in Hz. Default: 77e9 (through-wall: 2e9)."""
     chirp_s: Option[float] = None
-    """Length of the sweep. Default: 40e-6."""
+    """Duration of the sweep in seconds. Default: 40e-6."""
     bandwidth_hz: Option[float] = None
-    """Width of the sweep. Default: 4e9, behind a wall 1e9."""
+    """Bandwidth of the sweep in Hz. Default: 4e9 (through-wall: 1e9)."""
     prf_hz: Option[float] = None
-    """Pulse repetition frequency. Default: 8192, behind a wall 128."""
+    """Pulse repetition frequency in Hz. Default: 8192 (through-wall: 128)."""
     sample_rate_hz: Option[float] = None
-    """Sample rate of the intermediate frequency. Default: 10e6."""
+    """Sample rate of the intermediate frequency in Hz. Default: 10e6."""
     tx_position: Annotated[Option[tuple[float, float, float]], _XYZ] = None
-    """Transmitter in metres. Default: -0.1 0 1.5."""
+    """Position of the transmitter in metres. Default: -0.1 0 1.5."""
     rx_position: Annotated[Option[tuple[float, float, float]], _XYZ] = None
-    """Receiver in metres. Default: 0.1 0 1.5."""
+    """Position of the receiver in metres. Default: 0.1 0 1.5."""
     antenna_gain_dbi: Option[float] = None
-    """Gain of both antennas. Default: 10."""
+    """Gain of each antenna in dBi. Default: 10."""
     isolation_db: Option[float] = None
-    """Isolation of transmitter and receiver, for --leakage. Default: 20."""
+    """Isolation between transmitter and receiver in dB, for --leakage. Default: 20."""
     wall_permittivity: Option[float] = None
     """Relative permittivity of the wall. Default: 6."""
     wall_loss_tangent: Option[float] = None
@@ -124,7 +124,7 @@ class PanelOptions:
     wall_size: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Width, thickness and height of the wall in metres. Default: 5 0.24 2.5."""
     wall_center: Annotated[Option[tuple[float, float, float]], _XYZ] = None
-    """Centre of the wall in metres. Default: the near face touches the antenna plane."""
+    """Centre of the wall in metres. Default: its near face touches the plane of the antennas."""
     smoothing_ratio: Option[float] = None
     """Length in seconds of a Savitzky-Golay filter along the pulses (panel: 0.25). Default: none, see --motion."""
     range_window: Option[Literal["hamming", "hann", "blackman"]] = None
@@ -134,9 +134,9 @@ class PanelOptions:
     stft_window: Option[float] = None
     """Length of the STFT window in seconds. Default: 0.1."""
     stft_overlap: Option[float] = None
-    """Shared part of neighbouring STFT windows. Default: 0.9."""
+    """Overlap, as a fraction, of neighbouring STFT windows. Default: 0.9."""
     ridges: Option[int] = None
-    """Ridges of the Doppler-time map. Default: 3."""
+    """Number of ridges of the Doppler-time map. Default: 3."""
 
 
 #: The field of the configuration that an option of :class:`PanelOptions` sets.

@@ -58,40 +58,40 @@ _MEANT_FOR = {
 
 @dataclass(frozen=True)
 class Simulate(NetworkOptions, ClipOptions):
-    """Turn a video into what a radar would have seen; or motion capture, or keypoints of a video.
+    """Simulate the radar maps of the people in a video, in motion capture, or in key points of a video.
 
     Writes report.html, maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
     """
 
     source: tyro.conf.Positional[Path]
-    """A video that OpenCV decodes; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or
-    keypoints of a video, COCO or BlazePose, as .json, or a folder with one per frame."""
+    """A video that OpenCV can decode; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or key
+    points of a video, COCO or BlazePose, as .json, or a folder with one such file per frame."""
     out: Path
-    """Folder for the results; its files appear together, when all are complete."""
+    """Output folder; it is written only when the whole run has succeeded."""
     person_height: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
-    """Body heights in metres in order of appearance; the last one serves the rest. Default: 1.80 1.70."""
+    """Body heights in metres in order of appearance; the last one applies to all further people. Default: 1.80 1.70."""
     initial_distance: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
-    """Distances of the people in metres when they first appear. Of a video they calibrate the focal length; captured
-    motion is moved so that the first person starts there (default: where the file has it, if in front of the
-    radar)."""
+    """Distances of the people in metres when they first appear. For videos and key points they determine the focal
+    length. Motion capture is shifted so that the first person starts there; by default it stays where the file puts
+    it, if that is in front of the radar."""
     camera_fov: Option[float] = None
-    """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: estimated; with
-    --no-calibrate, and where nothing in the film tells, 60 along the longer side of the picture."""
+    """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: estimated. With
+    --no-calibrate: 60 degrees horizontally. If the film gives no information: 60 degrees along the longer side."""
     calibrate: Option[bool] = None
-    """Estimate tilt, roll, height and field of view of the camera from the people of the film. Default: on, unless
-    --camera-fov or --initial-distance tells it, or the position is the paper's; a --config says itself whether to."""
+    """Estimate tilt, roll, height and field of view of the camera from the people in the film. Default: on, except with
+    --camera-fov, --initial-distance or --position paper; with --config, as stated there."""
     position: Option[Literal["camera", "paper"]] = None
     """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
     lifter: Option[Literal["temporal", "nearest"]] = None
-    """How key points become 3D: by a network that sees a window of time, or from the nearest poses of a library.
+    """How key points become 3D: by a network that uses a window of frames, or from the nearest poses of a library.
     Default: temporal."""
     library: Option[Path] = None
-    """Pool of poses for the nearest lifter, as `tensorsim library build` writes it. Default: the shipped one."""
+    """Pool of poses for the nearest lifter, as written by `tensorsim library build`. Default: the shipped one."""
     per_person: bool = False
-    """Where several people are in the scene, simulate and label each one alone as well: maps_person_N.npz and
-    doppler_time_person_N.png, N as in the overlay."""
+    """If there are several people in the scene, also simulate and label each one alone: maps_person_N.npz and
+    doppler_time_person_N.png, with N as in the overlay."""
     fps: Option[float] = None
-    """Frames per second, instead of what the file says."""
+    """Frames per second, overriding the file's value."""
     start: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
     """Where to start, in seconds of the film."""
     end: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
@@ -99,11 +99,13 @@ class Simulate(NetworkOptions, ClipOptions):
     stride: int = 1
     """Keep every n-th frame."""
     image_size: Annotated[Option[tuple[int, int]], numbers("WIDTH HEIGHT", int)] = None
-    """Width and height in pixels of the pictures that keypoints were found in, where their file does not say."""
+    """Width and height in pixels of the pictures in which the key points were found, if their file does not state
+    them."""
     clip: Option[str] = None
-    """Which motion of a file with several: the name of an array, or subject and action as in "S1/Walking"."""
+    """Which motion to take from a file with several: the name of an array, or subject and action as in
+    "S1/Walking"."""
     heading: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
-    """Turn of captured motion about the vertical in degrees, counter-clockwise seen from above."""
+    """Rotation of motion capture about the vertical axis, in degrees (counter-clockwise seen from above)."""
 
     def run(self) -> None:
         """Do it."""

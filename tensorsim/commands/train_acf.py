@@ -9,26 +9,23 @@ from tensorsim.files import check_folder
 
 @dataclass(frozen=True)
 class TrainAcf:
-    """Train boosted trees on aggregate channel features of upright people; takes minutes and needs scikit-learn.
-
-    Attributes:
-        data: folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, pedestrian and backgrounds
-            (NAME-*.tar).
-        out: folder for acf.safetensors.
-        rounds: trees of each stage; a stage starts anew with the mistakes of the one before.
-        positives: most windows with people, mirrored ones included.
-        negatives: windows without people that each stage adds.
-        seed: of draws and boosting.
-        quiet: no progress bars.
-    """
+    """Train boosted trees on aggregate channel features of upright people; takes minutes and needs scikit-learn."""
 
     data: Path
+    """Folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, pedestrian and backgrounds
+    (NAME-*.tar)."""
     out: Path
+    """Folder for acf.safetensors."""
     rounds: tuple[int, ...] = (32, 64, 256)
+    """Trees of each stage; each stage starts anew with the mistakes of the one before."""
     positives: int = 3000
+    """Largest number of windows with people, mirrored ones included."""
     negatives: int = 3000
+    """Windows without people that each stage adds."""
     seed: int = 0
+    """Random seed of sampling and boosting."""
     quiet: bool = False
+    """No progress bars."""
 
     def run(self) -> None:
         """Do it."""

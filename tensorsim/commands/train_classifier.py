@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tensorsim.commands.arguments import Option
+from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions, check_size
 from tensorsim.exceptions import TensorsimError, check_positive
@@ -15,53 +15,50 @@ _OF_MAPS = ("scenes", "people", "snr", "films", "film_maps", "film_people", "map
 
 @dataclass(frozen=True)
 class TrainClassifier(TrainOptions):
-    """Train SPNet or SPGNet on Doppler-time maps; run again with the same arguments, it goes on where it stopped.
-
-    Attributes:
-        maps: folder of maps; those that are missing are made first (hours: 12 clips per person and scene).
-        data: a data set of ``tensorsim dataset build`` in place of ``maps``: its classes, its parts for training and
-            validation. Beside the weights, the confusion matrix (confusion.md) and the network as TorchScript and ONNX
-            (picture_to_label.pt, .onnx) are written. Scenes, people, snr, maps_seed and films go with ``maps`` and
-            are refused; ``init`` may have other classes.
-        labels: classes of ``data`` to train on; all if none are given.
-        radars: radars of ``data`` whose maps are seen, as channels; all if none are given.
-        network: SPNet on 224x224 pictures, or SPGNet (s2p6) on 32x32.
-        scenes: what to train on.
-        people: people per scene; each does all 12 activities, and every fifth is held out.
-        snr: lowest and highest signal-to-noise ratio in dB; 50 50 is the paper's.
-        size: height and width of the pictures, a divisor of 224; the network's own if not given.
-        films: folder of films that networks watched, as ``evaluate truth --settings c`` keeps them in ``films/``: their
-            errors are given to the motion of ``film_maps``.
-        film_maps: folder of more maps to train on, of motion as the pipeline finds it in films; those that are missing
-            are made first, without rendering.
-        film_people: people per scene in it.
-        learning_rate: of the first half of the epochs; the second has a tenth of it. Less is better from ``init`` on.
-        masks: largest part of the rows (speeds) and of the columns (time) of a picture that is masked in training, as
-            SpecAugment does; 0 0 masks nothing.
-        epochs: passes over the training clips.
-        batch: clips per step.
-        maps_seed: of people, motion and noise of the maps.
-        film_seed: of people, motion and noise of ``film_maps``.
-    """
+    """Train SPNet or SPGNet on Doppler-time maps; running it again with the same arguments resumes it."""
 
     maps: Option[Path] = None
+    """Folder of maps; missing ones are made first (hours: 12 clips per person and scene)."""
     data: Option[Path] = None
-    labels: tuple[str, ...] = ()
-    radars: tuple[str, ...] = ()
+    """Data set of `tensorsim dataset build` instead of --maps: its classes, and its parts for training and validation.
+    Besides the weights, the confusion matrix (confusion.md) and the network as TorchScript and ONNX
+    (picture_to_label.pt, .onnx) are written. --scenes, --people, --snr, --maps-seed, --films, --film-maps,
+    --film-people and --film-seed need --maps; --init may have other classes."""
+    labels: Several[str] = ()
+    """Classes of --data to train on. Default: all."""
+    radars: Several[str] = ()
+    """Radars of --data whose maps are used, as channels. Default: all."""
     network: Literal["spnet", "spgnet"] = "spnet"
+    """SPNet on 224x224 pictures, or SPGNet (s2p6) on 32x32."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
+    """Scenes to train on."""
     people: int = 300
+    """People per scene; each does all 12 activities, and every fifth is held out."""
     snr: tuple[float, float] = (10.0, 50.0)
+    """Lowest and highest signal-to-noise ratio in dB; the paper uses 50 50."""
     size: Option[int] = None
+    """Height and width of the pictures, a divisor of 224. Default: that of the network."""
     films: Option[Path] = None
+    """Folder of films and what networks found in them, as kept in films/ by `tensorsim evaluate truth --settings c`:
+    their errors are applied to the motion of --film-maps."""
     film_maps: Option[Path] = None
+    """Folder of further maps to train on, of motion as the pipeline finds it in films; missing ones are made first,
+    without rendering."""
     film_people: int = 40
+    """People per scene in --film-maps."""
     learning_rate: float = 1.47e-3
+    """Learning rate of the first half of the epochs; the second half has a tenth of it. With --init use less."""
     masks: tuple[float, float] = (0.0, 0.0)
+    """Largest share of the rows (speeds) and of the columns (time) of a picture that is masked in training, as in
+    SpecAugment; 0 0 masks nothing."""
     epochs: int = 20
+    """Passes over the training clips."""
     batch: int = 64
+    """Clips per step."""
     maps_seed: int = 0
+    """Random seed of people, motion and noise of --maps."""
     film_seed: int = 2
+    """Random seed of people, motion and noise of --film-maps."""
 
     def run(self) -> None:
         """Do it."""

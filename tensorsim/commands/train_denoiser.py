@@ -10,23 +10,20 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class TrainDenoiser(TrainOptions):
-    """Train DnCNN on maps with and without noise; run again with the same arguments, it goes on where it stopped.
-
-    Attributes:
-        maps: folder of patches of maps; those that are missing are made first.
-        clips: clips per scene, activity after activity; every eleventh is held out.
-        depth: convolutions.
-        steps: optimiser steps.
-        batch: patches per step.
-        maps_seed: of people, motion and noise of the maps.
-    """
+    """Train DnCNN on maps with and without noise; running it again with the same arguments resumes it."""
 
     maps: Path
+    """Folder of patches of maps; missing ones are made first."""
     clips: int = 240
+    """Clips per scene, activity after activity; every eleventh is held out."""
     depth: int = 20
+    """Number of convolutions."""
     steps: int = 20_000
+    """Optimiser steps."""
     batch: int = 128
+    """Patches per step."""
     maps_seed: int = 0
+    """Random seed of people, motion and noise of the maps."""
 
     def run(self) -> None:
         """Do it."""

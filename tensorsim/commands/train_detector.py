@@ -11,28 +11,26 @@ from tensorsim.exceptions import check_positive
 
 @dataclass(frozen=True)
 class TrainDetector(PeopleOptions):
-    """Train RTMDet, small, on tar shards of people; run again with the same arguments, it goes on where it stopped.
+    """Train the person detector RTMDet on tar shards of people; running it again with the same arguments resumes it.
 
     OUT/detector.safetensors has the best weights with calibrated scores.
-
-    Attributes:
-        data: folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, films_teacher, lspet, pedestrian
-            and backgrounds (NAME-*.tar).
-        teacher: weights of a better RTMDet (.safetensors, .pth, .onnx), whose answers are learnt besides the labels.
-        variant: of RTMDet, of those for people alone.
-        steps: optimiser steps.
-        batch: pictures per step.
-        learning_rate: highest learning rate.
-        validate_every: steps between measurements on the held-out pictures.
     """
 
     data: Path
+    """Folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, films_teacher, lspet, pedestrian and
+    backgrounds (NAME-*.tar)."""
     teacher: Option[Path] = None
+    """Weights of a better RTMDet (.safetensors, .pth, .onnx), whose output is learnt besides the labels."""
     variant: Literal["nano-person", "small-person", "m-person"] = "small-person"
+    """Variant of RTMDet, for people only."""
     steps: int = 5000
+    """Optimiser steps."""
     batch: int = 16
+    """Pictures per step."""
     learning_rate: float = 1e-3
+    """Peak learning rate."""
     validate_every: int = 250
+    """Steps between validations on the held-out pictures."""
 
     def run(self) -> None:
         """Do it."""

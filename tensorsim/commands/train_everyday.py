@@ -14,28 +14,27 @@ from tensorsim.exceptions import TensorsimError, check_positive
 class TrainEveryday(TrainOptions):
     """Train SPNet or SPGNet on pictures of everyday motion in both presets, and calibrate it on held-out ones.
 
-    Run again with the same arguments, it goes on where it stopped. Writes OUT/classifier.safetensors.
+    Writes OUT/classifier.safetensors; running it again with the same arguments resumes it.
     """
 
     maps: Path
-    """Folder of pictures; groups that are missing are made first (about 10 s each on one core)."""
+    """Folder of pictures; missing groups are made first (about 10 s each on one core)."""
     groups: int = 50
-    """Groups of up to 99 clips and some of an empty scene; every fifth is held out."""
+    """Number of groups, each of up to 99 clips and some of an empty scene; every fifth group is held out."""
     maps_seed: int = 0
-    """Of people, motion, cameras and errors of the pictures."""
+    """Random seed of the people, motion, cameras and errors of the pictures."""
     network: Literal["spnet", "spgnet"] = "spgnet"
     """SPGNet (s2p6) on 32x32 pictures, or SPNet."""
     size: Option[int] = None
-    """Height and width of the pictures, a divisor of 64; 32 for SPGNet and 64 for SPNet if not given."""
+    """Height and width of the pictures, a divisor of 64. Default: 32 for SPGNet, 64 for SPNet."""
     learning_rate: float = 1e-3
-    """The highest."""
+    """Peak learning rate."""
     epochs: int = 10
     """Passes over the training pictures."""
     batch: int = 64
     """Pictures per step."""
-
     share: float = 1.0
-    """Of the way from --init to the trained weights that the result has, from 0 to 1: less keeps more of --init."""
+    """Weight of the trained parameters when averaged with --init, from 0 (only --init) to 1 (only trained)."""
 
     def run(self) -> None:
         """Do it."""

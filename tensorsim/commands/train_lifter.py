@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tensorsim.commands.arguments import Several
 from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
 from tensorsim.exceptions import TensorsimError
@@ -11,29 +12,26 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class TrainLifter(TrainOptions):
-    """Train a lifter; run again with the same arguments, it goes on where it stopped.
-
-    Attributes:
-        network: TemporalLifter, or VideoPose3D with a window of 27 frames.
-        motion: motion capture files (.npz, .bvh) beside the generated motion; every second sequence is held out.
-        motions: motions of all kinds; they are made first, in OUT/motion.pt.
-        steps: optimiser steps.
-        batch: windows per step.
-        frames: of a window.
-        channels: width of the network.
-        learning_rate: largest learning rate.
-        motion_seed: of the motions.
-    """
+    """Train a lifter; running it again with the same arguments resumes it."""
 
     network: Literal["temporal", "videopose3d"] = "temporal"
-    motion: tuple[Path, ...] = ()
+    """TemporalLifter, or VideoPose3D with a window of 27 frames."""
+    motion: Several[Path] = ()
+    """Motion capture files (.npz, .bvh) in addition to the generated motion; every second sequence is held out."""
     motions: int = 12_000
+    """Number of motions of all kinds; they are made first, in OUT/motion.pt."""
     steps: int = 7000
+    """Optimiser steps."""
     batch: int = 48
+    """Windows per step."""
     frames: int = 64
+    """Frames per window."""
     channels: int = 256
+    """Width of the network."""
     learning_rate: float = 1.5e-3
+    """Peak learning rate."""
     motion_seed: int = 0
+    """Random seed of the motions."""
 
     def run(self) -> None:
         """Do it."""

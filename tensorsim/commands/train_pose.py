@@ -15,44 +15,41 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainPose(PeopleOptions):
-    """Train a small HRNet or CPM on tar shards of people; run again with the same arguments, it goes on where it was.
-
-    Attributes:
-        data: folder of the shards coco_small, coco_more, coco_extra, films_teacher, lspet and, for rendered people,
-            backgrounds (NAME-*.tar).
-        network: HRNet, or CPM with three stages.
-        size: height and width of the crops.
-        first_size: height and width of smaller crops to begin with.
-        first_steps: steps with those, fewer than ``steps``; half of them, at most 6000, if not given, none with init.
-        width: channels of HRNet's branch of highest resolution (24 if not given), or of most layers of CPM (32).
-        steps: optimiser steps.
-        batch: crops per step.
-        learning_rate: highest learning rate.
-        augmentation: how far crops are turned, scaled, shifted and cut: "full", or "mild" to end a training with crops
-            nearer to those of films.
-        second_labels: keypoints of the people of lspet by another network, COCO's format of results (.json): where they
-            agree with the labels, they put them right and add the face.
-        teacher: a better network of COCO-17 heat maps for crops of the same size (.onnx), whose answers the HRNet
-            learns besides the labels.
-        validate_every: steps between measurements on held-out people, which pick the best weights.
-        presence: train nothing but the head of the HRNet in --init that tells which keypoints are in the picture, on
-            crops of one size and without rendered people.
-    """
+    """Train a small HRNet or CPM on tar shards of people; running it again with the same arguments resumes it."""
 
     data: Path
+    """Folder of the shards coco_small, coco_more, coco_extra, films_teacher, lspet and, for rendered people,
+    backgrounds (NAME-*.tar)."""
     network: Literal["hrnet", "cpm"] = "hrnet"
+    """HRNet, or CPM with three stages."""
     size: tuple[int, int] = (128, 96)
+    """Height and width of the crops."""
     first_size: tuple[int, int] = (96, 64)
+    """Height and width of smaller crops to begin with."""
     first_steps: Option[int] = None
+    """Steps with the smaller crops, fewer than --steps. Default: half of --steps, at most 6000; 0 with --init."""
     width: Option[int] = None
+    """Channels of HRNet's branch of highest resolution (default: 24), or of most layers of CPM (default: 32)."""
     steps: int = 12000
+    """Optimiser steps."""
     batch: int = 32
+    """Crops per step."""
     learning_rate: float = 2e-3
+    """Peak learning rate."""
     augmentation: Literal["full", "mild"] = "full"
+    """How much crops are rotated, scaled, shifted and cut: "full", or "mild" to end a training with crops closer to
+    those of films."""
     second_labels: Option[Path] = None
+    """Key points of the people of lspet by another network, in COCO's results format (.json): where they agree with
+    the labels, they correct these and add the face."""
     teacher: Option[Path] = None
+    """A better network of COCO-17 heat maps for crops of the same size (.onnx), whose output the HRNet learns besides
+    the labels."""
     validate_every: int = 500
+    """Steps between validations on held-out people, by which the best weights are chosen."""
     presence: bool = False
+    """Train only the head of the HRNet in --init that tells which key points are in the picture, on crops of one size
+    and without rendered people."""
 
     def run(self) -> None:
         """Do it."""

@@ -24,13 +24,13 @@ class TrainOptions:
     init: Option[Path] = None
     """Weights to start from (.safetensors)."""
     seed: int = 0
-    """Of everything random but the maps or rendered people of a folder."""
+    """Random seed, except for stored maps or rendered people."""
     device: str = "auto"
-    """cpu, cuda, cuda:1, ...; auto takes a GPU where there is one."""
+    """Device: cpu, cuda, cuda:1, ...; auto takes a GPU if there is one."""
     workers: int = 1
     """Processes that prepare samples."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Of convolutions and products; auto takes bfloat16 where the device has instructions for it."""
+    """Precision of convolutions and matrix products; auto takes bfloat16 if the device supports it."""
     quiet: bool = False
     """No progress bar."""
 
@@ -103,11 +103,11 @@ class PeopleOptions(TrainOptions):
     """How a network is trained on labelled and rendered people."""
 
     cutouts: Option[Path] = None
-    """Folder of rendered people, cutouts-*.tar; missing shards are rendered. OUT/cutouts if not given."""
+    """Folder of rendered people, cutouts-*.tar; missing shards are rendered. Default: OUT/cutouts."""
     rendered: int = 0
-    """Number of rendered people; a core renders about five a second."""
+    """Number of rendered people; one core renders about five per second."""
     rendered_seed: int = 0
-    """Of their poses, looks and cameras."""
+    """Random seed of their poses, looks and cameras."""
 
     def loop(self, **settings: Any) -> "LoopConfig":
         """As of all training commands."""

@@ -79,7 +79,8 @@ def ksvd_denoise(
         from sklearn.decomposition import MiniBatchDictionaryLearning, sparse_encode
     except ImportError as error:
         raise TensorsimError(
-            f"ksvd_denoise: scikit-learn does not import ({error}); install tensorsim[train]"
+            f"ksvd_denoise: scikit-learn cannot be imported ({error}), expected it installed: "
+            'pip install "tensorsim[train]"'
         ) from error
     from torch.nn.functional import fold, unfold
 
@@ -143,7 +144,9 @@ class KSVD(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         if importlib.util.find_spec("sklearn") is None:
-            raise TensorsimError("KSVD: scikit-learn is not installed; install tensorsim[train]")
+            raise TensorsimError(
+                'KSVD: scikit-learn cannot be imported, expected it installed: pip install "tensorsim[train]"'
+            )
 
     def forward(self, maps: Tensor) -> Tensor:
         """Maps (..., H, W) to maps of the same shape, not negative."""

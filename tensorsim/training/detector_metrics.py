@@ -92,7 +92,10 @@ def average_precision(
         from pycocotools.coco import COCO
         from pycocotools.cocoeval import COCOeval
     except ImportError as error:
-        raise TensorsimError(f"average precision: {error}; install tensorsim[train]") from error
+        raise TensorsimError(
+            f"average precision: pycocotools cannot be imported ({error}), expected it installed: "
+            'pip install "tensorsim[train]"'
+        ) from error
 
     def rows(people: Sequence[Tensor], crowds: Sequence[Tensor] = ()) -> list[dict[str, Any]]:
         result: list[dict[str, Any]] = []

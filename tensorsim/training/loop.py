@@ -193,7 +193,8 @@ def _events(out: Path, step: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise TensorsimError(
-            f"training logs: TensorBoard does not import ({error}); install tensorsim[train]"
+            f"training logs: TensorBoard cannot be imported ({error}), expected it installed: "
+            'pip install "tensorsim[train]"'
         ) from error
     return SummaryWriter(str(out), purge_step=step + 1)
 

@@ -58,7 +58,7 @@ def lda_logits(train: Tensor, labels: Tensor, test: Tensor, classes: int) -> Ten
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     except ImportError as error:
         raise TensorsimError(
-            f"LDA: scikit-learn does not import ({error}); install tensorsim[train]"
+            f'LDA: scikit-learn cannot be imported ({error}), expected it installed: pip install "tensorsim[train]"'
         ) from error
     features = [torch.nn.functional.avg_pool2d(x, 2).flatten(1).double().numpy() for x in (train, test)]
     model = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features[0], labels.numpy())
