@@ -309,7 +309,7 @@ def _chosen(found: Found, people: str, fps: float) -> Found:
     chosen = found._replace(pose=select_people(found.pose, people, fps))
     if bool(found.pose.valid.any()) and not bool(chosen.pose.valid.any()):
         warnings.warn(
-            f"people {people!r} leaves out everybody who was found: the maps show the empty scene",
+            f"--people {people} selects none of the people found: the maps show an empty scene",
             TensorsimWarning,
             stacklevel=2,
         )

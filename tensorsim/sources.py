@@ -128,14 +128,12 @@ def keypoint_source(
         TensorsimError: no frame rate, no size, a file that cannot be read, or pictures of another size.
     """
     if fps is None:
-        raise TensorsimError(f"{path}: got keypoints without a frame rate, expected --fps")
+        raise TensorsimError(f"{path}: the file has no frame rate; give --fps")
     check_positive(fps, "fps")
     found = load_keypoints(path, size)
     size = found.size if size is None else size
     if size is None:
-        raise TensorsimError(
-            f"{path}: got keypoints without the size of their pictures, expected --image-size"
-        )
+        raise TensorsimError(f"{path}: the file has no size of its pictures; give --image-size")
     kept = cut.frames(found.valid.shape[0], fps, path)
     _check_size(found, size)
     people = _lifted(found, stage, kept, size, fps / cut.stride, calibrate)
@@ -214,7 +212,7 @@ def motion_source(
     motion = Motion(motion.joints[:, kept], motion.valid[:, kept], motion.fps / cut.stride)
     present = motion.valid.any(dim=1)
     if not bool(present.any()):
-        raise TensorsimError(f"{path}: got nobody in these frames, expected at least one person")
+        raise TensorsimError(f"{path}: contains no people in these frames, expected at least one")
     motion = place(
         Motion(motion.joints[present], motion.valid[present], motion.fps), start_range_m, heading_rad
     )

@@ -71,8 +71,8 @@ def within_reach(found: Found, radar: RadarConfig) -> Found:
     if ahead_m == 0:
         return found
     warnings.warn(
-        f"people are beyond the {radar.reach_m:.2f} m of this radar's range axis: the radar is put {ahead_m:.1f} m in "
-        "front of the camera (--camera-fov or --initial-distance leaves it there)",
+        f"people are beyond the {radar.reach_m:.2f} m of this radar's range axis: the radar is placed {ahead_m:.1f} m "
+        "in front of the camera (with --camera-fov or --initial-distance it stays at the camera)",
         TensorsimWarning,
         stacklevel=2,
     )
@@ -326,7 +326,7 @@ def maps_of_pose(
     if bool((valid & (stage.heard(joints) == 0)).any()):
         warnings.warn(
             f"people are farther away than {stage.unheard_m:.1f} m, 1.9 times the range axis of this radar: the "
-            "receiver filters out their echo, and no map shows them",
+            "receiver filters out their echo, so they do not appear in any map",
             TensorsimWarning,
             stacklevel=2,
         )

@@ -253,7 +253,7 @@ def test_libraries_stay_quiet_about_a_broken_video(folder: Path) -> None:
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.strip().splitlines() == [
-        "tensorsim: error: text.mp4: not a kind of film that is read, expected a video (mp4, mov, mkv, avi, ...)"
+        "tensorsim: error: text.mp4: unsupported file type, expected a video (mp4, mov, mkv, avi, ...)"
     ]
 
 

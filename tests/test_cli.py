@@ -204,7 +204,7 @@ def test_a_camera_that_is_told_is_not_estimated(
 ) -> None:
     with pytest.raises(SystemExit):
         cli.main(["simulate", "clip.mp4", "--out", str(tmp_path / "out"), "--calibrate", *told])
-    assert "--calibrate: got it with " in capsys.readouterr().err
+    assert "--calibrate cannot be combined with " in capsys.readouterr().err
 
 
 def test_the_distances_of_the_panel_calibrate_no_camera() -> None:

@@ -135,7 +135,7 @@ def test_cut_clip_and_people_who_are_never_there(walk: np.ndarray, tmp_path: Pat
     )
     with pytest.raises(TensorsimError, match="expected one of joints, other"):
         motion_source(path, "nothing")
-    with pytest.raises(TensorsimError, match="nobody in these frames"):
+    with pytest.raises(TensorsimError, match="contains no people in these frames"):
         motion_source(_never_there(tmp_path, walk))
 
 

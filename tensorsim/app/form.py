@@ -162,7 +162,7 @@ def for_demo(options: dict[str, Any]) -> dict[str, Any]:
     unknown = [name for name in options if name not in Demo.__dataclass_fields__]
     if unknown:
         raise TensorsimError(
-            f"{unknown[0].replace('_', ' ')}: got it for a generated person, expected it for a file only"
+            f"{unknown[0].replace('_', ' ')} applies to a file only, not to a generated person"
         )
     return options
 

@@ -228,9 +228,7 @@ def _part(film: Path, given: dict[str, Any]) -> tuple[float | None, float]:
         motion = load_motion(film, given.get("clip"), fps)
         count, fps = motion.valid.shape[1], motion.fps
     elif fps is None:
-        raise TensorsimError(
-            f"{film.name}: got key points without a frame rate, expected Fps in the group Camera"
-        )
+        raise TensorsimError(f"{film.name}: the file has no frame rate; give Fps in the group Camera")
     else:
         size = given.get("image_size")
         count = load_keypoints(film, None if size is None else size[::-1]).valid.shape[0]

@@ -44,7 +44,7 @@ class DatasetBuild:
         """Do it."""
         check_count(self.workers, "--workers")
         if self.address is not None and self.engine != "ray":
-            raise TensorsimError("--address: got one without --engine ray, expected both")
+            raise TensorsimError("--address needs --engine ray")
         check_folder(self.out)
         from tensorsim.data.sets.build import build_dataset
         from tensorsim.data.sets.recipe import DatasetRecipe

@@ -44,7 +44,7 @@ class EvaluateDetector:
                 "evaluate detector: got nothing to look at, expected --data, --coco or --films"
             )
         if self.films and self.against is None:
-            raise TensorsimError("--films: got no --against, the detector to compare with")
+            raise TensorsimError("--films needs --against, the detector to compare with")
 
         files = [self.weights] if self.against is None else [self.weights, self.against]
         detectors = [("shipped" if file is None else str(file), pretrained_detector(file)) for file in files]

@@ -53,7 +53,7 @@ class EvaluateMeasured:
                 raise TensorsimError(f"{folder}: no such folder, expected measured sets")
 
         if self.quick and self.ablation:
-            raise TensorsimError("--quick, --ablation: got both, expected one: an ablation trains")
+            raise TensorsimError("--quick cannot be combined with --ablation, which trains networks")
         if self.repeats > 1 and not self.ablation:
             raise TensorsimError(f"--repeats: got {self.repeats} without --ablation, expected 1")
 

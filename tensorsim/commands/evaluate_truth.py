@@ -53,12 +53,12 @@ class EvaluateTruth:
         check_folder(self.out)
         check_seed(self.seed)
         if self.motion_fps is not None and not self.motion:
-            raise TensorsimError("--motion-fps: got it without --motion, which it is of")
+            raise TensorsimError("--motion-fps needs --motion")
         detector = pose = None
         if "c" in self.settings:
             detector, pose = default_networks(self.detector, self.pose)
         elif self.detector is not None or self.pose is not None:
-            raise TensorsimError("--detector, --pose: got them without setting c, which they are for")
+            raise TensorsimError("--detector and --pose apply to --settings c only")
 
         from tensorsim.evaluation.report import markdown, save_pictures, write_csv
         from tensorsim.evaluation.truth import TruthLoop, example_maps

@@ -151,9 +151,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         for option, (part, is_there) in _NEEDED.items():
             value = getattr(self, option)
             if value is not None and value is not False and not is_there(config.scene):
-                raise TensorsimError(
-                    f"--{option.replace('_', '-')}: got it without {part}, expected it with {part} only"
-                )
+                raise TensorsimError(f"--{option.replace('_', '-')} has no effect without {part}")
         return config
 
     def _begun(self) -> "SimulationConfig":
@@ -221,7 +219,7 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
 
     The pictures of the shipped networks show speeds up to 3.8 m/s, resolved to 0.6 m/s or better. A radar for which
     faster motion folds, or which resolves speeds less, gets no label but a warning. Maps that they were not trained on
-    otherwise (interference, both signs of Doppler mixed up) get a label and a warning.
+    for other reasons (interference, both signs of Doppler mixed up) get a label and a warning.
 
     Raises:
         TensorsimError: weights that are not there, of another network, or without names of their classes.
@@ -250,7 +248,7 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
         warnings.warn(f"no label: the radar {unlike}", TensorsimWarning, stacklevel=2)
         return None
     for reason in _unlike_training(config, recognizer):
-        warnings.warn(f"the label means little: {reason}", TensorsimWarning, stacklevel=2)
+        warnings.warn(f"the label is unreliable: {reason}", TensorsimWarning, stacklevel=2)
     return recognizer
 
 
@@ -264,30 +262,31 @@ def _unlike_training(config: "SimulationConfig", recognizer: "ActivityRecognizer
             "integration 'paper' folds approaching and receding motion, the classifier was trained on signed Doppler"
         )
     if config.scene.interference is not None:
-        unlike.append("another radar is heard, the shipped classifiers were trained without interference")
+        unlike.append("another radar interferes, the shipped classifiers were trained without interference")
     one_channel = config.scene.receiver.real and config.scene.radar.range_resolution_m > COARSEST_M
     if one_channel and isinstance(recognizer.network, SPNet):
         unlike.append(
-            "a radar of one channel without range folds approaching and receding motion, which the shipped SPGNet "
-            "knows and the shipped SPNet does not"
+            "a radar of one channel without range folds approaching and receding motion, on which the shipped SPGNet "
+            "was trained and the shipped SPNet was not"
         )
     return unlike
 
 
 def warn_of_label(recognizer: "ActivityRecognizer | None", people: int, duration_s: float) -> None:
-    """Say where a label means little: several people, or a short scene."""
+    """Warn of a label that is unreliable: several people, or a short scene."""
     if recognizer is None:
         return
     if people > 0 and duration_s < SHORTEST_S:
         warnings.warn(
-            f"the scene lasts {duration_s:.3g} s: its label means little, the shipped classifiers were trained on "
+            f"the label is unreliable: the scene lasts {duration_s:.3g} s, the shipped classifiers were trained on "
             "clips of 2.4 to 5 s",
             TensorsimWarning,
             stacklevel=2,
         )
     if people > 1:
         warnings.warn(
-            "several people are in the scene: the label is of all of them, the classifier was trained on one person",
+            "several people are in the scene: the label refers to all of them, but the classifier was trained on "
+            "single people",
             TensorsimWarning,
             stacklevel=2,
         )

@@ -126,7 +126,7 @@ class Simulate(NetworkOptions, ClipOptions):
             if unlike and kind not in _MEANT_FOR.get(field.name, KINDS):
                 meant = " or ".join(KINDS[k] for k in _MEANT_FOR[field.name])
                 name = field.name.replace("_", "-")
-                raise TensorsimError(f"--{name}: got it for {KINDS[kind]}, expected it for {meant} only")
+                raise TensorsimError(f"--{name} applies to {meant} only, not to {KINDS[kind]}")
         config = self.configuration()
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
@@ -183,7 +183,7 @@ class Simulate(NetworkOptions, ClipOptions):
                 config = config.replace(**{field: value})
         paper, calibrate = config.pose.position == "paper", self.calibrate
         if calibrate and paper:
-            raise TensorsimError("--calibrate: got it with the paper's position, expected that of a camera")
+            raise TensorsimError("--calibrate cannot be combined with --position paper (or --paper)")
         if calibrate:
             config = config.replace(pose__initial_distance_m=None)
         if calibrate is None:
@@ -213,10 +213,10 @@ class Simulate(NetworkOptions, ClipOptions):
         for option in ("camera_fov", "initial_distance"):
             if self.calibrate and getattr(self, option) is not None:
                 raise TensorsimError(
-                    f"--calibrate: got it with --{option.replace('_', '-')}, expected one of them: both tell the camera"
+                    f"--calibrate cannot be combined with --{option.replace('_', '-')}: both determine the camera"
                 )
         if self.position == "paper" and self.initial_distance is None and self.config is None:
-            raise TensorsimError("--position paper: got no --initial-distance, which it starts from")
+            raise TensorsimError("--position paper needs --initial-distance")
 
     def _source(
         self, kind: str, config: "SimulationConfig", device: "torch.device"
@@ -233,8 +233,8 @@ class Simulate(NetworkOptions, ClipOptions):
         if kind == "motion":
             if self.initial_distance is not None and len(self.initial_distance) > 1:
                 raise TensorsimError(
-                    f"--initial-distance: got {self.initial_distance} for motion capture, expected that of the "
-                    "first person: the others keep their places beside it"
+                    f"--initial-distance: got {self.initial_distance} for motion capture, expected only that of the "
+                    "first person: the others keep their places relative to it"
                 )
             start_m = None if self.initial_distance is None else self.initial_distance[0]
             turn = math.radians(self.heading)

@@ -66,13 +66,13 @@ class TrainClassifier(TrainOptions):
             raise TensorsimError("--maps, --data: got both or none, expected one of them")
         if self.maps is not None:
             if self.labels or self.radars:
-                raise TensorsimError("--labels, --radars: got some without --data, expected none")
+                raise TensorsimError("--labels and --radars need --data")
             self._train_on_activities(self.maps)
         elif self.data is not None:
             given = [name for name in _OF_MAPS if getattr(self, name) != getattr(TrainClassifier, name)]
             if given:
                 raise TensorsimError(
-                    f"--{given[0].replace('_', '-')}: got one with --data, expected none: it goes with --maps"
+                    f"--{given[0].replace('_', '-')} needs --maps and cannot be combined with --data"
                 )
             self._train_on_data(self.data)
 

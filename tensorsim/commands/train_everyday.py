@@ -50,7 +50,7 @@ class TrainEveryday(TrainOptions):
         if not 0 <= self.share <= 1:
             raise TensorsimError(f"--share: got {self.share}, expected a number from 0 to 1")
         if self.share < 1 and self.init is None:
-            raise TensorsimError("--share: got no --init, expected the weights to stay near")
+            raise TensorsimError("--share below 1 needs --init")
         settings = EverydaySettings(seed=self.maps_seed)
         check_size(self.size, settings.size)
         check_positive(self.learning_rate, "--learning-rate")

@@ -71,13 +71,11 @@ class TrainPose(PeopleOptions):
 
         check_positive(self.learning_rate, "--learning-rate")
         if self.presence and (self.init is None or self.network != "hrnet"):
-            raise TensorsimError("--presence: got no --init of an HRNet, whose keypoints it is about")
+            raise TensorsimError("--presence needs --init with an HRNet")
         without = ("rendered", "cutouts", "augmentation", "first_size", "first_steps", "teacher")
         given = [name for name in without if getattr(self, name) != getattr(TrainPose, name)]
         if self.presence and given:
-            raise TensorsimError(
-                f"--presence: got --{given[0].replace('_', '-')}, which the head is trained without"
-            )
+            raise TensorsimError(f"--presence cannot be combined with --{given[0].replace('_', '-')}")
         first_steps = self.first_steps
         if first_steps is None:
             first_steps = min(6000, self.steps // 2) if self.init is None else 0
@@ -115,7 +113,7 @@ class TrainPose(PeopleOptions):
         for name in ("COCO, large", "LSPE, upright"):
             if not held_out[name]:
                 raise TensorsimError(
-                    f"{self.data}: got nobody held out of {name}, expected some to measure on"
+                    f"{self.data}: got no held-out people of {name}, expected some for validation"
                 )
         validation = {"coco": some(held_out["COCO, large"]), "lspet": some(held_out["LSPE, upright"])}
         cutouts = self.rendered_people()

@@ -160,14 +160,14 @@ class SimulationConfig:
 def _replaced(config: Any, path: list[str], value: Any) -> Any:
     """A configuration with another value at the end of a path of fields."""
     known = list(config.__dataclass_fields__) if hasattr(config, "__dataclass_fields__") else []
-    if config is None:
-        raise TensorsimError(
-            f"got {path[0]!r} of a part that this scene does not have (--scene through-wall has a wall)"
-        )
     if path[0] not in known:
         raise TensorsimError(
             f"got no {path[0]!r} in {type(config).__name__}, expected one of its fields{suggestion(path[0], known)}"
         )
     if len(path) > 1:
-        value = _replaced(getattr(config, path[0]), path[1:], value)
+        part = getattr(config, path[0])
+        if part is None:
+            hint = " (--scene through-wall has one)" if path[0] == "wall" else ""
+            raise TensorsimError(f"got {path[1]!r}, but this scene has no {path[0]!r}{hint}")
+        value = _replaced(part, path[1:], value)
     return replace(config, **{path[0]: value})

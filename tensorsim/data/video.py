@@ -107,7 +107,7 @@ class VideoReader:
             file_fps, announced = properties(capture)
             if fps is None and not 0 < file_fps < ABSURD_FPS:
                 raise TensorsimError(
-                    f"{self.path}: the file announces {file_fps} frames per second, expected a positive "
+                    f"{self.path}: the file states {file_fps} frames per second, expected a positive "
                     f"number below {ABSURD_FPS:g}; give the frame rate as fps"
                 )
             film_fps, length_s = float(file_fps if fps is None else fps), None
@@ -254,8 +254,8 @@ class VideoReader:
             # Containers count by duration and are often a frame or two off.
             if expected - index > max(2, 0.02 * expected):
                 warnings.warn(
-                    f"{self.path}: got {index} frames, expected {expected} as the file announces: "
-                    f"it seems cut off",
+                    f"{self.path}: got {index} frames, expected {expected} as the file states: "
+                    "it seems to be truncated",
                     TensorsimWarning,
                     stacklevel=2,
                 )
@@ -337,9 +337,7 @@ def _check_is_film(path: Path) -> None:
     if not path.is_file():
         raise TensorsimError(f"{path}: got a folder, expected a video file")
     if not _begins_with(path, _CONTAINERS):
-        raise TensorsimError(
-            f"{path}: not a kind of film that is read, expected a video (mp4, mov, mkv, avi, ...)"
-        )
+        raise TensorsimError(f"{path}: unsupported file type, expected a video (mp4, mov, mkv, avi, ...)")
 
 
 def _begins_with(path: Path, marks: Iterable[tuple[int, bytes]]) -> bool:

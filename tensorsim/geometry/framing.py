@@ -44,7 +44,7 @@ def camera_on(
     points = torch.cat([bodies + reach[0], bodies + reach[1]]).flatten(0, -2) - bodies.new_tensor(position_m)
     points = points[points[:, 1] > NEAR_M]
     if points.numel() == 0:
-        raise TensorsimError(f"camera: got nobody in front of {position_m}, expected somebody at larger y")
+        raise TensorsimError(f"camera: got no people in front of {position_m}, expected some at larger y")
     yaw = _middle(torch.atan2(points[:, 0], points[:, 1]))
     pitch = _middle(torch.atan2(points[:, 2], points[:, :2].norm(dim=-1)))
     pose = camera_to_world(CameraConfig(position_m=(0.0, 0.0, 0.0), pitch_rad=pitch, yaw_rad=yaw))

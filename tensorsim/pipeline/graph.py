@@ -122,8 +122,8 @@ class VideoToDoppler(nn.Module):
         """
         if config.pose.calibrate:
             warnings.warn(
-                "pose.calibrate: a graph does not estimate the camera and has that of pose.camera; "
-                "tensorsim.streaming.people_of_film(..., calibrate=True) does",
+                "pose.calibrate is ignored here, pose.camera is used; use "
+                "tensorsim.streaming.people_of_film(..., calibrate=True) to estimate the camera",
                 TensorsimWarning,
                 stacklevel=2,
             )

@@ -83,7 +83,8 @@ class ActivityRecognizer(nn.Module):
         check_choice(inputs, INPUTS, "ActivityRecognizer.inputs")
         if either_way and inputs == "merged":
             raise TensorsimError(
-                "ActivityRecognizer.either_way: got True with 'merged', ranges have no other way"
+                "ActivityRecognizer.either_way: cannot be used with inputs='merged': range-time maps have no reversed "
+                "form"
             )
         self.either_way = bool(either_way)
         channels = getattr(network, "in_channels", INPUTS[inputs])

@@ -297,7 +297,9 @@ class PoseRecipe(Recipe):
         self.seed, self.learning_rate, self.sigma = seed, learning_rate, sigma
         self.shares = np.where(np.array(sizes) > 0, shares, 0.0)
         if not self.shares.sum() > 0:
-            raise TensorsimError("PoseRecipe: got nobody to train on, expected people from some source")
+            raise TensorsimError(
+                "PoseRecipe: got no people to train on, expected some from at least one source"
+            )
         self.shares /= self.shares.sum()
         self.weights = [_weights(group) for group in self.groups]
 

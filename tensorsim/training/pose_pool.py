@@ -120,7 +120,7 @@ def recorded_poses(file: Path) -> Tensor:
         motion = load_motion(file, key=key, fps=30.0)  # a pool of poses knows no time
         poses.append(motion.joints[motion.valid].double())
     if sum(len(p) for p in poses) == 0:
-        raise TensorsimError(f"{file}: got nobody in any frame, expected poses")
+        raise TensorsimError(f"{file}: contains no people, expected poses")
     return facing_away(standardise_poses(torch.cat(poses)))
 
 

@@ -46,13 +46,13 @@ def test_none_is_wanted():
     ("scene", "classifier", "change", "message"),
     [
         ("through-wall", None, {"processing__integration": "paper"}, "integration 'paper' folds"),
-        ("through-wall", None, {"scene__interference": InterferenceConfig()}, "another radar is heard"),
+        ("through-wall", None, {"scene__interference": InterferenceConfig()}, "another radar interferes"),
         ("cw-24ghz", "spnet-activities", {"scene__receiver__real": True}, "one channel without range folds"),
     ],
 )
 def test_maps_unlike_those_of_training_get_a_warning(scene, classifier, change, message):
     config = SimulationConfig(scene=PRESETS[scene], classifier=classifier)
-    with pytest.warns(TensorsimWarning, match=f"the label means little: .*{message}"):
+    with pytest.warns(TensorsimWarning, match=f"the label is unreliable: .*{message}"):
         assert load_recognizer(config.replace(**change)) is not None
 
 

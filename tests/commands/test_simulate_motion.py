@@ -46,7 +46,7 @@ def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
     assert summary["frames"] == 45
     assert summary["config"]["tracking"]["detector"] is None
     (warning,) = summary["warnings"]
-    assert warning.startswith("the scene lasts 1.5 s: its label means little")
+    assert warning.startswith("the label is unreliable: the scene lasts 1.5 s")
 
     simulator = ts.radar.RadarSimulator(
         ts.RadarConfig.through_wall(), ts.WallConfig(), multipath=True, snr_db=None
@@ -65,7 +65,7 @@ def test_that_nobody_moves_is_said(tmp_path: Path) -> None:
     out = tmp_path / "out"
     cli.main(["simulate", str(tmp_path / "still.npz"), "--out", str(out), "--people", "moving", *QUICK])
     (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
-    assert warning == "people 'moving' leaves out everybody who was found: the maps show the empty scene"
+    assert warning == "--people moving selects none of the people found: the maps show an empty scene"
 
 
 def test_maps_at_display_rate_or_of_every_pulse(walk: np.ndarray, tmp_path: Path) -> None:
@@ -154,15 +154,19 @@ def test_keypoints_give_what_a_video_gives(
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("walk.npz", ["--detector", "x.onnx"], r"--detector: got it for motion capture .* for a video only"),
+        ("walk.npz", ["--detector", "x.onnx"], r"--detector applies to a video only, not to motion capture"),
         (
             "walk.npz",
             ["--camera-fov", "50"],
-            r"--camera-fov: got it for motion capture .* a video or keypoints",
+            r"--camera-fov applies to a video or keypoints .* only, not to motion capture",
         ),
-        ("walk.npz", ["--image-size", "9", "9"], "--image-size: got it for motion capture"),
-        ("walk.json", ["--heading", "9"], "--heading: got it for keypoints"),
-        ("walk.mp4", ["--clip", "a"], "--clip: got it for a video"),
+        (
+            "walk.npz",
+            ["--image-size", "9", "9"],
+            r"--image-size applies to keypoints .* not to motion capture",
+        ),
+        ("walk.json", ["--heading", "9"], r"--heading applies to motion capture .* not to keypoints"),
+        ("walk.mp4", ["--clip", "a"], r"--clip applies to motion capture .* not to a video"),
         ("walk.json", ["--image-size", "0", "9"], "--image-size: got 0, expected image side"),
         ("walk.npz", ["--heading", "nan"], "--heading: got nan"),
         ("walk.npz", ["--initial-distance", "1", "2"], "--initial-distance: got .* the first person"),
@@ -177,7 +181,7 @@ def test_keypoints_give_what_a_video_gives(
         ("walk.npz", ["--end", "0.1"], r"frames: got 3 at 30 fps, expected at least 4 for one .* of 0.109 s"),
         ("nothing.bvh", [], "nothing.bvh: no such file"),
         ("nothing.json", ["--fps", "30"], "nothing.json: no such file"),
-        ("walk.json", [], "walk.json: got keypoints without a frame rate, expected --fps"),
+        ("walk.json", [], "walk.json: the file has no frame rate; give --fps"),
         ("walk.json", ["--fps", "30"], "walk.json: got a file that cannot be read as JSON"),
     ],
 )

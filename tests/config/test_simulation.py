@@ -84,7 +84,7 @@ def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: P
     [
         ({"scene__snr": 3.0}, "got no 'snr' in SceneConfig, expected one of its fields, perhaps 'snr_db'"),
         ({"pose__keypoint_threshold": 1.5}, "keypoint_threshold: got 1.5, expected a score in"),
-        ({"scene__wall__loss_tangent": 0.1}, "got 'loss_tangent' of a part that this scene does not have"),
+        ({"scene__wall__loss_tangent": 0.1}, "got 'loss_tangent', but this scene has no 'wall'"),
         ({"scene": 3}, "SimulationConfig.scene: got 3, expected a SceneConfig"),
         ({"pose__person_weight_kg": ()}, "person_weight_kg: got no values"),
         ({"scene__paths": ("direct",), "scene__leakage": True}, "got names of paths and leakage"),
@@ -129,7 +129,7 @@ def test_options_change_the_configuration_of_a_file(tmp_path: Path) -> None:
     assert paper == ts.SimulationConfig.paper(ts.SimulationConfig.through_wall())
     with pytest.raises(
         TensorsimError,
-        match="--wall-permittivity: got 'relative_permittivity' of a part that this scene",
+        match="--wall-permittivity: got 'relative_permittivity', but this scene has no 'wall'",
     ):
         RadarOptions(wall_permittivity=4.0).configuration()
 
@@ -147,7 +147,7 @@ def test_options_change_the_configuration_of_a_file(tmp_path: Path) -> None:
 def test_an_option_that_would_do_nothing_is_refused(
     option: str, value: object, beside: dict[str, object], tmp_path: Path
 ) -> None:
-    with pytest.raises(TensorsimError, match=f"--{option.replace('_', '-')}: got it without"):
+    with pytest.raises(TensorsimError, match=f"--{option.replace('_', '-')} has no effect without"):
         RadarOptions(**{option: value}).configuration()  # type: ignore[arg-type]
     config = RadarOptions(**{option: value}, **beside).configuration()  # type: ignore[arg-type]
     # What a configuration says without effect is no option.

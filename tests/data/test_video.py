@@ -148,9 +148,7 @@ def test_refuses_absurd_fps_unless_one_is_given(
     clip: Path, monkeypatch: pytest.MonkeyPatch, fps: float
 ) -> None:
     monkeypatch.setattr(video, "properties", lambda capture: (fps, 20))
-    with pytest.raises(
-        TensorsimError, match=f"the file announces {fps} frames per second.*give the frame rate"
-    ):
+    with pytest.raises(TensorsimError, match=f"the file states {fps} frames per second.*give the frame rate"):
         VideoReader(clip)
     assert VideoReader(clip, fps=25.0).fps == 25.0
 
@@ -188,7 +186,7 @@ def test_cut_off_film_gives_what_is_there(tmp_path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     reader = VideoReader(path)
-    with pytest.warns(TensorsimWarning, match=r"got \d+ frames, expected 30 as the file announces"):
+    with pytest.warns(TensorsimWarning, match=r"got \d+ frames, expected 30 as the file states"):
         frames = torch.cat(list(reader.chunks(8)))
     assert 5 < len(frames) < 25
     assert torch.equal(frames, whole[: len(frames)])
@@ -270,9 +268,7 @@ def test_refuses_what_is_no_film(tmp_path: Path) -> None:
         ("zeros.mp4", bytes(4096)),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(
-            TensorsimError, match=f"{name}: not a kind of film that is read, expected a video"
-        ):
+        with pytest.raises(TensorsimError, match=f"{name}: unsupported file type, expected a video"):
             VideoReader(tmp_path / name)
     # A header, and not one frame behind it.
     path = write_clip(tmp_path / "head.avi")
@@ -405,9 +401,7 @@ def test_playlists_are_not_opened(clip: Path) -> None:
     ):
         path = clip.with_name(name)
         path.write_text(text)
-        with pytest.raises(
-            TensorsimError, match=f"{name}: not a kind of film that is read, expected a video"
-        ):
+        with pytest.raises(TensorsimError, match=f"{name}: unsupported file type, expected a video"):
             VideoReader(path)
 
 

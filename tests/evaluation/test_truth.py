@@ -443,7 +443,7 @@ def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
     ("options", "message"),
     [
         ({"detector": "x.onnx"}, "without setting c"),
-        ({"motion_fps": 30.0}, "--motion-fps: got it without --motion"),
+        ({"motion_fps": 30.0}, "--motion-fps needs --motion"),
         ({"seed": -1}, "--seed: got -1"),
     ],
 )

@@ -81,9 +81,9 @@ def test_who_is_not_there_does_not_count() -> None:
 
 def test_nobody_in_front_is_refused() -> None:
     valid = torch.ones(1, 2, dtype=torch.bool)
-    with pytest.raises(TensorsimError, match="nobody in front"):
+    with pytest.raises(TensorsimError, match="no people in front"):
         camera_on(bodies((0.0, -3.0)), valid, HEIGHT, WIDTH)
-    with pytest.raises(TensorsimError, match="nobody in front"):
+    with pytest.raises(TensorsimError, match="no people in front"):
         camera_on(bodies((0.0, 3.0)), ~valid, HEIGHT, WIDTH)
 
 

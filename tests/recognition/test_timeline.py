@@ -127,7 +127,7 @@ def test_the_other_way_round_counts_as_much() -> None:
     turned = scene._replace(doppler_time=torch.cat([scene.doppler_time[:1], scene.doppler_time[1:].flip(0)]))
     torch.testing.assert_close(both(scene), (plain + recognizer()(turned)) / 2, atol=1e-3, rtol=0)
     torch.testing.assert_close(torch.jit.script(both)(scene), both(scene))
-    with pytest.raises(TensorsimError, match="ranges have no other way"):
+    with pytest.raises(TensorsimError, match="range-time maps have no reversed form"):
         ts.recognition.ActivityRecognizer(RADAR, BrightHalf(), "merged", either_way=True)
 
 

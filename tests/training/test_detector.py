@@ -429,7 +429,7 @@ def test_sources_are_sorted_by_what_they_know(tmp_path: Path) -> None:
 def test_evaluation_asks_for_something_to_look_at(tmp_path: Path) -> None:
     with pytest.raises(TensorsimError, match="expected --data, --coco or --films"):
         EvaluateDetector(weights=tmp_path / "x.safetensors").run()
-    with pytest.raises(TensorsimError, match="--films: got no --against"):
+    with pytest.raises(TensorsimError, match="--films needs --against"):
         EvaluateDetector(weights=tmp_path / "x.safetensors", films=(tmp_path / "a.mp4",)).run()
     with pytest.raises(TensorsimError, match="got 0 json files"):
         EvaluateDetector(weights=tmp_path / "x.safetensors", coco=tmp_path).run()

@@ -223,7 +223,7 @@ def test_the_command_trains_and_writes_a_classifier_that_the_recognizer_takes(tm
     ("options", "message"),
     [
         ({"groups": 4}, "--groups: got 4, expected at least 5"),
-        ({"share": 0.5}, "--share: got no --init"),
+        ({"share": 0.5}, "--share below 1 needs --init"),
         ({"share": 1.5}, "--share: got 1.5, expected a number from 0 to 1"),
         ({"maps_seed": -1}, "--maps-seed"),
         ({"size": 7}, "--size: got 7, expected a divisor of 64"),

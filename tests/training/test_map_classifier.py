@@ -78,9 +78,12 @@ def test_confusion_counts_true_by_row(folder: Path) -> None:
 def test_one_of_both_kinds_of_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, message in (
         ([], "got both or none"),
-        (["--maps", "m", "--labels", "a"], "got some without --data"),
-        (["--data", "d", "--snr", "20", "20"], "--snr: got one with --data, expected none"),
-        (["--data", "d", "--film-people", "3"], "--film-people: got one with --data, expected none"),
+        (["--maps", "m", "--labels", "a"], "--labels and --radars need --data"),
+        (["--data", "d", "--snr", "20", "20"], "--snr needs --maps and cannot be combined with --data"),
+        (
+            ["--data", "d", "--film-people", "3"],
+            "--film-people needs --maps and cannot be combined with --data",
+        ),
     ):
         with pytest.raises(SystemExit):
             cli.main(["train", "classifier", "--out", str(tmp_path), *arguments])

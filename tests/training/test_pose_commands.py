@@ -129,7 +129,7 @@ def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> No
         ({"rendered_seed": -1}, "--rendered-seed: got -1"),
         ({"learning_rate": float("nan")}, "--learning-rate: got nan"),
         ({"width": 0}, "HRNetConfig"),
-        ({"presence": True}, "--presence: got no --init"),
+        ({"presence": True}, "--presence needs --init"),
         ({"second_labels": Path("none.json")}, "none.json: not a COCO file of keypoint results"),
         (
             {"steps": 2, "first_steps": 1, "first_size": (192, 144)},
@@ -139,11 +139,11 @@ def test_people_of_lspe_who_are_confirmed_have_sides_that_hold(data: Path) -> No
         ({"rendered": -5}, "--rendered: got -5, expected at least 0"),
         (
             {"presence": True, "init": Path("w")},
-            "--presence: got --rendered, which the head is trained without",
+            "--presence cannot be combined with --rendered",
         ),
         (
             {"presence": True, "init": Path("w"), "rendered": 0, "first_steps": 0},
-            "--presence: got --first-steps",
+            "--presence cannot be combined with --first-steps",
         ),
     ],
 )
@@ -204,7 +204,7 @@ def test_training_with_a_teacher_goes_on_with_no_other(data: Path) -> None:
 def test_nobody_to_measure_on_is_told_before_training(data: Path) -> None:
     write_tar(data / "lspet-00.tar", {"a.jpg": jpg(0, 80, 60)})
     with pytest.raises(
-        TensorsimError, match="got nobody held out of LSPE, upright, expected some to measure on"
+        TensorsimError, match="got no held-out people of LSPE, upright, expected some for validation"
     ):
         TrainPose(data, out=data / "out", steps=1, quiet=True).run()
     assert not (data / "out").exists()

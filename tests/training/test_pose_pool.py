@@ -90,7 +90,7 @@ def test_reads_all_clips_of_a_file_and_leaves_out_who_is_not_there(tmp_path: Pat
     np.savez(tmp_path / "some.npz", joints_m=clip[None], valid=valid | (np.arange(40) < 7), fps=30.0)
     assert len(recorded_poses(tmp_path / "some.npz")) == 7
     np.savez(tmp_path / "none.npz", joints_m=clip[None], valid=valid, fps=30.0)
-    with pytest.raises(TensorsimError, match=r"none\.npz: got nobody"):
+    with pytest.raises(TensorsimError, match=r"none\.npz: contains no people"):
         recorded_poses(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("no archive")
     with pytest.raises(TensorsimError, match=r"text\.npz: got a file that cannot be read"):

@@ -72,8 +72,8 @@ class Processes:
                 waiting += running.values()
                 if deaths == _DEATHS:
                     raise TensorsimError(
-                        f"workers: got {_DEATHS} processes that died in a row, expected them to live; is the memory "
-                        "enough for so many?"
+                        f"{_DEATHS} worker processes in a row died; there may be too little memory for this many "
+                        "workers"
                     ) from None
             finally:
                 _end(pool)

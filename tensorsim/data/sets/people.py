@@ -50,10 +50,10 @@ def finite_everywhere(motion: Motion, name: str) -> Motion:
     Splines run through these places.
 
     Raises:
-        TensorsimError: nobody in it.
+        TensorsimError: a motion without people.
     """
     if not bool(motion.valid.any()):
-        raise TensorsimError(f"{name}: got nobody in it, expected at least one person")
+        raise TensorsimError(f"{name}: contains no people, expected at least one")
     somebody = motion.valid.any(dim=1)
     joints, valid = motion.joints[somebody], motion.valid[somebody]
     nearest = nearest_valid(valid)[..., None, None].expand(-1, -1, 14, 3)

@@ -42,7 +42,7 @@ def varied(motion: Motion, variation: Variation) -> Motion:
     """
     present = motion.valid.any(dim=1)
     if not bool(present.any()):
-        raise TensorsimError("motion: got nobody in it, expected at least one person")
+        raise TensorsimError("motion: contains no people, expected at least one")
     joints, valid = motion.joints[present].double(), motion.valid[present]
     if variation.height_m is not None:
         joints = joints * (variation.height_m / float(body_height(joints[0, valid[0]]).median()))

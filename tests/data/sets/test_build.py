@@ -544,7 +544,7 @@ def die(_: str) -> int:
 def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
     jobs = [str(tmp_path / name) for name in ("a", "deadly", "b")]
     assert sum(Processes(2).run(die_once, jobs)) == 3
-    with pytest.raises(TensorsimError, match="got 3 processes that died in a row"):
+    with pytest.raises(TensorsimError, match="3 worker processes in a row died"):
         list(Processes(1).run(die, ["x"]))
 
 
