@@ -1,8 +1,9 @@
 """tensorsim: what a radar would have seen of the people in a video.
 
 One graph of ``nn.Module`` stages on batched tensors: video -> people -> 2D joints -> 3D joints -> smooth motion ->
-FMCW echo -> range-time -> Doppler-time -> ridges. ``VideoToDoppler`` is the whole; ``vision``, ``motion``, ``radar``
-and ``enhance`` hold the stages.
+FMCW echo -> range-time -> Doppler-time -> ridges -> activity label. ``VideoToDoppler`` is the whole up to the maps,
+``VideoToActivity`` up to the label; ``vision``, ``motion``, ``radar``, ``enhance`` and ``recognition`` hold the stages.
+``data`` reads and writes films, motion and data sets; ``export`` writes TorchScript and ONNX files.
 
 Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where they are (see ``tensorsim.paper``):
 """
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
         WallConfig,
     )
     from tensorsim.exceptions import TensorsimError, TensorsimWarning
-    from tensorsim.live import LiveSimulator
+    from tensorsim.live import LiveFrame, LiveSimulator
     from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
     from tensorsim.types import Detections, Pose, RadarMaps, Recognition, Simulation, Tracks
 
@@ -56,6 +57,7 @@ __all__ = [
     "Detections",
     "FloorConfig",
     "InterferenceConfig",
+    "LiveFrame",
     "LiveSimulator",
     "Pose",
     "PoseConfig",

@@ -10,11 +10,11 @@ from typing import Any
 
 
 class TensorsimError(ValueError):
-    """Input that tensorsim refuses; the message says what came and what was expected."""
+    """Invalid input (a ValueError); the message states what was received and what was expected."""
 
 
 class TensorsimWarning(UserWarning):
-    """A result is returned, but it may not be what the caller expects."""
+    """Issued when a result is returned but may not be what the caller expects."""
 
 
 def check_positive(value: float, name: str) -> None:

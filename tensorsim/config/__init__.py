@@ -1,7 +1,10 @@
 """Frozen configurations: one dataclass per concern, joined in :class:`SimulationConfig`.
 
-Every default is that of the control panel of the original application (RadHARSimulator V2), or the physically correct
-form where the paper's is not; :meth:`SimulationConfig.paper` is the literal paper.
+Defaults follow the control panel of the original application (RadHARSimulator V2) except: the tracker's measurement
+noise is 0.0004 (panel: 0.01), there is no Savitzky-Golay filter (panel: 0.25 s), no initial distances are assumed
+(panel: 4.00 and 0.50 m), a network lifts people (the paper: the nearest pose; the nearest lifter averages 128), and the
+wall touches the plane of the antennas. Formulas of the paper that are not physically correct are replaced by correct
+ones; :meth:`SimulationConfig.paper` is the literal paper.
 """
 
 from tensorsim.config.camera import CameraConfig

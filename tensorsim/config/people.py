@@ -26,17 +26,19 @@ class TrackerConfig:
 
     Attributes:
         detector: name or file of the detector's weights; None is the shipped network.
-        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2), of films faster than
-            45 frames per second more seldom, see :class:`~tensorsim.pipeline.VideoToPose`.
+        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2), above 45 frames per
+            second less often, see :class:`~tensorsim.pipeline.VideoToPose`.
         min_box_px: smallest width and height of a detection in pixels (panel: minimum detection size, 5 x 5).
-        max_tracks: people at a time (panel: maximum number of tracks, 5).
+        max_tracks: largest number of people tracked at once (panel: maximum number of tracks, 5).
         confirm_hits: detections that confirm a track (panel: confirmation threshold, 2 of 5) ...
         confirm_window: ... within this many frames in which the detector ran.
         delete_misses: misses that end a track (panel: deletion threshold, 23 of 23) ...
         delete_window: ... within this many frames in which the detector ran.
         assignment_threshold: largest squared Mahalanobis distance of an assignment (panel: 150).
-        process_noise: density of the acceleration noise of a box, size^2 / frame^3 (panel: process noise, 0.001).
-        measurement_noise: variance of a detected coordinate, size^2 (panel: Kalman measurement noise, 0.01).
+        process_noise: density of the acceleration noise of a box in size^2 / frame^3, where size is the longer side of
+            the box (panel: process noise, 0.001).
+        measurement_noise: variance of a detected coordinate in size^2, default 0.0004 (panel: Kalman measurement
+            noise, 0.01).
 
     Raises:
         TensorsimError: numbers out of range.
@@ -80,21 +82,24 @@ class PoseConfig:
         network: name or file of the pose network's weights; None is the shipped network.
         flip_test: average the network's answer with that for the mirror image.
         keypoint_threshold: score from which a key point counts as seen (panel: key point threshold, 0.3).
-        person_height_m: body heights by order of appearance; the last serves all others (panel: 1.80, 1.70 m).
-        person_weight_kg: body weights likewise (panel: 84.24, 75.00 kg). Cross sections scale with the body surface,
-            ``(weight / panel weight)^0.425``.
+        person_height_m: body heights in metres in order of appearance; the last one applies to all further people
+            (panel: 1.80, 1.70 m).
+        person_weight_kg: body weights in kg likewise (panel: 84.24, 75.00 kg). Cross sections scale with the body
+            surface, ``(weight / panel weight)^0.425``.
         initial_distance_m: distances of the people when they appear, which calibrate the focal length (panel:
             4.00, 0.50 m); None takes the camera's focal length.
         camera: pinhole camera.
         calibrate: estimate tilt, height and field of view of the camera from the people of a film, in place of
             ``camera``; see :class:`tensorsim.vision.CameraCalibrator`.
         position: ``"camera"`` (pinhole camera) or ``"paper"`` (increments of pixels times metres per pixel).
-        lifter: ``"temporal"`` (a network that sees a window of time) or ``"nearest"`` (nearest poses of a library).
+        lifter: ``"temporal"`` (a network that uses a window of frames) or ``"nearest"`` (nearest poses of a library).
         lifter_weights: name or file of the temporal lifter's weights; None is the shipped network.
-        library: file of the pose library of the nearest lifter; None is the shipped one.
-        neighbours: poses of the library that are averaged per frame; 1 is the paper's nearest match.
-        temporal: weight of the change between frames in the choice of poses; 0 matches each frame alone.
-        fewest_joints: joints of the 14 that a frame needs to count.
+        library: nearest lifter only: file of the pose library; None is the shipped one.
+        neighbours: nearest lifter only: poses of the library that are averaged per frame; 1 is the paper's nearest
+            match.
+        temporal: nearest lifter only: weight of the change between frames in the choice of poses; 0 matches each frame
+            alone.
+        fewest_joints: smallest number of the 14 joints for a frame to be used.
         people: who is simulated: ``"all"``, ``"moving"``, ``"nearest"`` or a person's number from 1.
 
     Raises:
@@ -141,7 +146,7 @@ class PoseConfig:
                 check_per_person(getattr(self, name), f"PoseConfig.{name}")
 
     def rcs_scale(self, person: int) -> float:
-        """Factor on the cross sections of this person, by weight."""
+        """Factor, without unit, on the cross sections in m^2 of person number ``person`` (from 0), by weight."""
         weight = self.person_weight_kg[min(person, len(self.person_weight_kg) - 1)]
         panel = PANEL_WEIGHTS_KG[min(person, len(PANEL_WEIGHTS_KG) - 1)]
         return (weight / panel) ** WEIGHT_EXPONENT

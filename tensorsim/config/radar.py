@@ -20,6 +20,18 @@ class RadarConfig:
     of shape (A, 3). Several give the echo an antenna dimension of K * A channels, transmitter by transmitter.
     Transmitters fire in turn (time division): number k at ``k / (K PRF)`` after the start of a pulse interval.
 
+    Attributes:
+        carrier_hz: frequency at the start of the sweep in Hz.
+        bandwidth_hz: width of the sweep in Hz.
+        chirp_s: duration of the sweep in seconds.
+        prf_hz: pulse repetition frequency in Hz; K transmitters fire once each in a pulse interval.
+        sample_rate_hz: complex samples of the intermediate frequency per second.
+        tx_m: position of the transmitter in metres, or K positions.
+        rx_m: position of the receiver in metres, or A positions.
+        antenna_gain_dbi: gain of each antenna in dBi, transmitters and receivers alike.
+        isolation_db: attenuation in dB of the direct signal from transmitter to receiver; it counts with leakage only
+            (:attr:`SceneConfig.leakage`).
+
     Raises:
         TensorsimError: a frequency or duration that is not positive, a position without three finite numbers, values
             beyond the plausible (:mod:`tensorsim.limits`), or K chirps that do not fit a pulse interval.
@@ -77,17 +89,17 @@ class RadarConfig:
 
     @property
     def tx_positions_m(self) -> tuple[Vector, ...]:
-        """Every transmitter, also where there is one."""
+        """Position (x, y, z) in metres of every transmitter, also where there is one."""
         return listed(self.tx_m)
 
     @property
     def rx_positions_m(self) -> tuple[Vector, ...]:
-        """Every receiver, also where there is one."""
+        """Position (x, y, z) in metres of every receiver, also where there is one."""
         return listed(self.rx_m)
 
     @property
     def middle_m(self) -> Vector:
-        """Half way between the first transmitter and the first receiver: where ranges of one pair count from."""
+        """Midpoint in metres of the first transmitter and receiver: the origin of the range axis of one pair."""
         tx, rx = self.tx_positions_m[0], self.rx_positions_m[0]
         return ((tx[0] + rx[0]) / 2, (tx[1] + rx[1]) / 2, (tx[2] + rx[2]) / 2)
 
@@ -98,36 +110,36 @@ class RadarConfig:
 
     @property
     def slope_hz_per_s(self) -> float:
-        """Chirp slope mu = B / T."""
+        """Chirp slope mu = B / T in Hz/s."""
         return self.bandwidth_hz / self.chirp_s
 
     @property
     def samples_per_chirp(self) -> int:
-        """N = round(fs T)."""
+        """Number of samples per chirp, N = round(fs T)."""
         return round(self.sample_rate_hz * self.chirp_s)
 
     @property
     def wavelength_m(self) -> float:
-        """c / fc, the wavelength of the amplitude (radar equation)."""
+        """Wavelength of the amplitude (radar equation) in metres, c / fc."""
         return SPEED_OF_LIGHT_M_S / self.carrier_hz
 
     @property
     def doppler_wavelength_m(self) -> float:
-        """c / (fc + B/2): Doppler of a range bin scales with the centre of the sweep."""
+        """Wavelength of Doppler shifts in metres, c / (fc + B/2): those of a range bin go with the sweep's centre."""
         return SPEED_OF_LIGHT_M_S / (self.carrier_hz + self.bandwidth_hz / 2)
 
     @property
     def range_resolution_m(self) -> float:
-        """Spacing of range bins, c / (2B); where fs T is no whole number, B is what the N samples span."""
+        """Spacing of range bins in metres, c / (2B); where fs T is no whole number, B is what the N samples span."""
         span = self.samples_per_chirp / (self.sample_rate_hz * self.chirp_s)
         return SPEED_OF_LIGHT_M_S / (2 * self.bandwidth_hz * span)
 
     @property
     def reach_m(self) -> float:
-        """Range at half the sample rate, where the N / 2 range bins end."""
+        """Range in metres at half the sample rate, where the N / 2 range bins end."""
         return self.range_resolution_m * (self.samples_per_chirp // 2)
 
     @property
     def unambiguous_speed_m_s(self) -> float:
-        """Largest radial speed without Doppler aliasing, lambda PRF / 4 (7.8 m/s and 3.8 m/s in the presets)."""
+        """Largest radial speed in m/s without Doppler aliasing, lambda PRF / 4 (presets: 7.8 m/s and 3.8 m/s)."""
         return self.doppler_wavelength_m * self.prf_hz / 4

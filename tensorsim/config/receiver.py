@@ -1,4 +1,4 @@
-"""Imperfections of the receiver, the furniture of a room, and another radar that is heard."""
+"""Imperfections of the receiver, the furniture of a room, and an interfering radar."""
 
 import math
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ class ReceiverConfig:
     """What the receiver does to the signal. Every effect is off unless it is asked for.
 
     Attributes:
-        phase_noise_dbc_hz: single-sideband phase noise of the oscillator 1 MHz from the carrier; its form over
-            frequency is that of :class:`tensorsim.radar.PhaseNoise`. None is a clean oscillator.
-        iq_imbalance_db: gain of Q over I, see :class:`tensorsim.radar.QuadratureImbalance`.
-        iq_phase_rad: angle by which Q is not a quarter turn from I.
-        dc_offset_db: power of a constant offset over the mean power of the echo that the noise refers to; None is
-            no offset.
+        phase_noise_dbc_hz: single-sideband phase noise of the oscillator in dBc/Hz, 1 MHz from the carrier; its form
+            over frequency is that of :class:`tensorsim.radar.PhaseNoise`. None is a clean oscillator.
+        iq_imbalance_db: gain of Q relative to I in dB, see :class:`tensorsim.radar.QuadratureImbalance`.
+        iq_phase_rad: deviation of the I/Q phase difference from a quarter turn, in radians.
+        dc_offset_db: power of a constant offset relative to the mean power of the echo that the noise refers to, in dB;
+            None is no offset.
         real: the receiver has one channel, I alone, see :class:`tensorsim.radar.RealReceiver`. With the same
             ``snr_db``, which is that of samples, range bins have 3 dB less.
         adc_bits: bits of the converters of I and Q, see :class:`tensorsim.radar.Converter`; None does not quantise.
-        adc_headroom_db: full scale of the converters over the root mean square magnitude of what arrives at them,
-            over the clip; 0 dB is a wave of full scale, less saturates more.
+        adc_headroom_db: full scale of the converters above the rms magnitude of their input over the clip, in dB; 0 dB
+            is a wave of full scale, smaller values saturate more.
 
     Raises:
         TensorsimError: numbers that are not finite, bits out of range.
@@ -83,11 +83,11 @@ class ReceiverConfig:
 
 @dataclass(frozen=True)
 class ClutterConfig:
-    """The furniture and walls of a room in front of a sensor that vibrates, see :class:`tensorsim.radar.RoomClutter`.
+    """Furniture and walls of a room, seen by a slightly vibrating sensor, see :class:`tensorsim.radar.RoomClutter`.
 
     Attributes:
-        reflectors: their number.
-        jitter_m: root mean square of the sensor's vibration along each axis.
+        reflectors: number of reflectors.
+        jitter_m: rms vibration of the sensor along each axis in metres.
 
     Raises:
         TensorsimError: no reflector, a jitter below 0.
@@ -107,14 +107,14 @@ class ClutterConfig:
 
 @dataclass(frozen=True)
 class InterferenceConfig:
-    """Another radar of the same band that is heard, see :class:`tensorsim.radar.Interference`.
+    """An interfering radar in the same band, see :class:`tensorsim.radar.Interference`.
 
     Attributes:
-        position_m: where it stands.
-        chirp_ratio: length of its sweeps over that of this radar; the slopes differ, and the sweeps cross. Its sweeps
-            follow one another almost without a pause.
-        power_ratio_db: its transmit power over that of this radar.
-        delay_s: time at which its first sweep arrives.
+        position_m: its position (x, y, z) in metres.
+        chirp_ratio: duration of its sweeps relative to that of this radar; the slopes differ, and the sweeps cross. Its
+            sweeps follow one another almost without a pause.
+        power_ratio_db: its transmit power relative to that of this radar, in dB.
+        delay_s: time in seconds at which its first sweep arrives.
 
     Raises:
         TensorsimError: a position without three finite numbers, a ratio that is not positive.

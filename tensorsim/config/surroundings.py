@@ -21,6 +21,12 @@ class WallConfig:
     The default centre puts the near face of the panel's wall on the antenna plane. (The paper's centre
     (-0.1, 0, 1.5) has the antennas inside the slab; the simulator then moves it here, with a warning.)
 
+    Attributes:
+        center_m: centre (x, y, z) in metres.
+        size_m: width (along x), thickness (along y) and height (along z) in metres.
+        relative_permittivity: real part of the relative permittivity.
+        loss_tangent: imaginary over real part of the permittivity.
+
     Raises:
         TensorsimError: a size or permittivity that is not physical.
     """
@@ -44,7 +50,7 @@ class WallConfig:
 
     @property
     def refractive_index(self) -> complex:
-        """n = sqrt(eps_r (1 - j tan d)) = n' - j n''."""
+        """Complex refractive index, n = sqrt(eps_r (1 - j tan d)) = n' - j n''."""
         return (self.relative_permittivity * (1 - 1j * self.loss_tangent)) ** 0.5
 
 

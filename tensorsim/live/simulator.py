@@ -25,10 +25,10 @@ class LivePerson(NamedTuple):
     """Somebody in a frame.
 
     Attributes:
-        number: by order of appearance, from 1.
+        number: in order of appearance, from 1.
         box: (4,) ``xyxy`` pixels.
         keypoints: (17, 2) COCO key points in pixels.
-        scores: (17,).
+        scores: (17,) of the key points, from 0.
         joints: (14, 3) world metres, filtered.
         present: whether the person is in the radar's scene.
     """
@@ -45,14 +45,15 @@ class LiveFrame(NamedTuple):
     """What a frame adds.
 
     Attributes:
-        number: of the frame, from 0; frames that were missed count.
-        time_s: of the frame, ``number / fps``.
-        people: in the frame.
-        doppler_time: (F, k) new columns of the Doppler-time map.
-        doppler_time_s: (k,) their centres.
-        range_time, range_time_mti: (R, c) new columns of the range-time maps at the display rate.
-        label: of the last four seconds, where one is due.
-        delay_s: from the end of the last Doppler window to this frame, in seconds of the film.
+        number: of the frame, from 0; missing frames count.
+        time_s: of the frame in seconds, ``number / fps``.
+        people: people in the frame.
+        doppler_time: (F, k) new columns of the Doppler-time map, linear magnitude; k is 0 where none is complete.
+        doppler_time_s: (k,) float64 centres of their windows in seconds.
+        range_time: (R, c) new columns of the range-time map at the display rate, linear magnitude.
+        range_time_mti: (R, c') the same after the moving target indicator.
+        label: activity of the last four seconds, once a second; else None.
+        delay_s: time from the end of the last Doppler window to this frame, in seconds of the film.
     """
 
     number: int
@@ -67,23 +68,25 @@ class LiveFrame(NamedTuple):
 
 
 class LiveSimulator:
-    """Frames of a camera in one by one, people and maps out: nothing looks ahead, nothing grows with time.
+    """Processes camera frames one at a time and returns people and new map columns. Causal, with bounded memory.
 
-    Detection n frames after the last one, tracking (:class:`~tensorsim.live.tracking.OnlineTracker`), key points,
-    lifting and the forward Kalman filter (:class:`~tensorsim.live.pose.CausalPose`), a spline and the radar
-    (:class:`~tensorsim.live.radar.LiveRadar`). Columns of the maps come a frame after their last pulse.
+    Detection in every n-th frame, tracking (:class:`~tensorsim.live.tracking.OnlineTracker`), key points, lifting and
+    the forward Kalman filter (:class:`~tensorsim.live.pose.CausalPose`), a spline and the radar
+    (:class:`~tensorsim.live.radar.LiveRadar`). Map columns are returned one frame after their last pulse.
 
     Args:
-        config: of the run; None is the free-space scene. The camera is that of ``pose.camera``. Nearest matching lifts,
-            each frame alone, for the temporal lifter needs the frames to come.
+        config: configuration of the run; None is the free-space scene. The camera is ``pose.camera``; it is not
+            estimated. Poses are lifted by nearest matching, frame by frame, because the temporal lifter needs future
+            frames.
         fps: frames per second of the camera.
-        detector, pose: networks in place of those that the configuration names.
-        recognizer: names the activity of the last four seconds every second; None gives no labels.
-        least_probability: below it the label is "not sure".
+        detector, pose: networks that replace those of the configuration.
+        recognizer: labels the activity of the last four seconds once a second; None gives no labels.
+        least_probability: labels with a lower probability become "not sure". The default, 0.0, always gives the most
+            probable class; the default of ``tensorsim live`` is 0.2.
 
     Attributes:
-        missed: frames that were given as missed so far.
-        config: with nearest matching, and range-time maps at a display rate.
+        missed: number of frames registered as missing so far.
+        config: the configuration with nearest matching, and range-time maps at a display rate.
 
     Example:
         >>> live = ts.LiveSimulator(fps=fps)
@@ -94,7 +97,9 @@ class LiveSimulator:
 
     Raises:
         TensorsimError: settings that need the whole film: a known initial distance, calibration, the paper's position,
-            smoothing along the pulses, sway, vital signs, a denoiser.
+            people other than ``"all"``, the MTI methods ``"mean"`` and ``"high-pass"``, smoothing along the pulses,
+            sway, vital signs, a denoiser, effects of the receiver, an interfering radar; several antennas; a frame rate
+            that is not positive; weights that are missing or of another network.
     """
 
     def __init__(
@@ -143,10 +148,14 @@ class LiveSimulator:
 
     @torch.inference_mode()
     def push(self, frame: Tensor) -> LiveFrame:
-        """Take the next frame.
+        """Process the next frame.
 
         Args:
             frame: (3, H, W) uint8 RGB.
+
+        Returns:
+            What the frame adds: people with key points in pixels and joints in metres, and new columns (F, k), (R, c)
+            and (R, c') of the maps, of any number including 0; see :class:`LiveFrame`.
 
         Raises:
             TensorsimError: another shape or type.
@@ -166,7 +175,11 @@ class LiveSimulator:
 
     @torch.inference_mode()
     def miss(self) -> LiveFrame:
-        """Take note of a frame that is missing: people go on as they moved."""
+        """Register a missing frame; people continue at their last velocity.
+
+        Returns:
+            As :meth:`push`; the people have key points and scores of 0.
+        """
         self.index += 1
         self.missed += 1
         self.tracks = self.tracker.step(self.tracks, None)

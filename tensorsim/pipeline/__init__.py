@@ -1,4 +1,4 @@
-"""The graph that joins the rooms: video -> pose -> motion -> echo -> maps -> label.
+"""The pipeline that joins the stages: video -> pose -> motion -> echo -> maps -> label.
 
 Each class is one ``nn.Module`` made of stages; every stage can be replaced by another with the same interface.
 ``forward`` works on whole clips in memory and scripts; the methods it is made of are public so that a long film can be

@@ -27,17 +27,18 @@ class VideoToDoppler(nn.Module):
         detector, pose: the two networks, see :class:`VideoToPose`.
         radar: a radar, or the name of a preset (``tensorsim.radar.PRESETS``), whose wall and floor come with it;
             default the panel's free-space radar.
-        wall: a slab between or behind; see :class:`tensorsim.radar.EchoSynthesizer`.
-        multipath, leakage, wall_echo: paths of the scene beyond the direct one.
-        snr_db: signal-to-noise ratio per IF sample of the targets' echo; None is free of noise. The noise is drawn
-            from torch's global generator (``torch.manual_seed``).
+        wall: a wall between the radar and the people, or behind them; see :class:`tensorsim.radar.EchoSynthesizer`.
+        multipath, leakage, wall_echo: paths beyond the direct one; all off by default, also for the preset
+            ``"through-wall"`` (:meth:`from_config` and the command turn multipath on where there is a wall).
+        snr_db: signal-to-noise ratio in dB per IF sample of the people's echo; None is free of noise. The noise is
+            drawn from torch's global generator (``torch.manual_seed``).
         person_height_m, initial_distance_m, camera, detection_interval: see :class:`VideoToPose`.
         denoiser: see :class:`PoseToDoppler`.
-        video_to_pose, pose_to_doppler: ready halves in place of those that the arguments above describe.
+        video_to_pose, pose_to_doppler: prebuilt stages, instead of building them from the arguments above.
 
     Raises:
-        TensorsimError: a ready half beside arguments that describe it; no detector or pose network and no ready half;
-            parts that are not such stages.
+        TensorsimError: a prebuilt stage together with arguments from which it would be built; no detector or pose
+            network and no prebuilt stage; parts that are not such stages.
 
     Example:
         >>> sim = ts.VideoToDoppler(detector, pose, radar=ts.RadarConfig.free_space())
@@ -140,7 +141,7 @@ class VideoToDoppler(nn.Module):
         flip_test: bool = True,
         **options: Any,
     ) -> "VideoToDoppler":
-        """The whole with trained networks, in evaluation mode, its networks frozen.
+        """The complete pipeline with trained networks, in evaluation mode, its networks frozen.
 
         Args:
             detector, pose: paths or names of ``tensorsim models list``; None: the shipped weights.
@@ -225,7 +226,7 @@ class VideoToActivity(nn.Module):
         radar: RadarConfig | str | None = None,
         **options: Any,
     ) -> "VideoToActivity":
-        """The whole with trained networks, in evaluation mode, its networks frozen.
+        """The complete pipeline with trained networks, in evaluation mode, its networks frozen.
 
         Args:
             detector, pose, classifier: paths or names of ``tensorsim models list``; None: the shipped weights.

@@ -28,8 +28,8 @@ from tensorsim.types import RadarMaps
 class PoseToDoppler(nn.Module):
     """Joints at video rate -> maps of the radar: resample to the pulse rate, place scatterers, simulate.
 
-    Several people of a clip are one scene: their scatterers are summed in one echo. People far beyond the range axis
-    are not heard (:meth:`heard`).
+    Several people of a clip are one scene: their scatterers are summed in one echo. Echoes of people far beyond the
+    range axis are filtered out (:meth:`heard`).
 
     Args:
         simulator: scatterers -> maps.
@@ -193,7 +193,7 @@ class PoseToDoppler(nn.Module):
 
     @torch.jit.export
     def heard(self, joints: Tensor) -> Tensor:
-        """Amplitude (..., M) with which the receiver hears people with joints (..., M, 14, 3): its low-pass filter.
+        """Amplitude factor (..., M) of the receiver's low-pass filter for people with joints (..., M, 14, 3) in metres.
 
         A range of twice that of the last bin has a beat frequency of the sample rate and would appear at the radar.
         Receivers filter before they sample: here the amplitude falls as a raised cosine, from 1 at 1.5 times the range

@@ -40,21 +40,21 @@ class VideoToPose(nn.Module):
     """Video -> people with metric 3D joints.
 
     Detects in every ``detection_interval``-th frame and in the last one, tracks, estimates COCO-17 keypoints in
-    every frame, lifts them to 3D, places them in the world and smooths them. Of films faster than 45 frames per second
-    it detects in about as many frames per second as of one of 30, because the tracker counts in frames with detections.
+    every frame, lifts them to 3D, places them in the world and smooths them. Above 45 frames per second the detector
+    runs about as often per second as at 30, because the tracker's limits are counted in frames with detections.
 
     Args:
         detector: images -> :class:`~tensorsim.types.Detections`, e.g. :class:`tensorsim.vision.RTMDet`.
-        pose: crops -> heat maps, e.g. :class:`tensorsim.vision.HRNet`, which is asked about the mirror image as well;
+        pose: crops -> heat maps, e.g. :class:`tensorsim.vision.HRNet`, which is also applied to the mirror image;
             or a module (frames, boxes, valid) -> (key points, scores), e.g. :class:`tensorsim.vision.TopDownPose`.
-        person_height_m: body heights in metres by person (order of appearance); the last one serves the rest.
-            Default 1.80 and 1.70.
+        person_height_m: body heights in metres by person (order of appearance); the last one applies to all further
+            people. Default 1.80 and 1.70.
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
         camera: where the camera stands and its focal length.
         keypoint_threshold: score from which a keypoint counts as seen.
-        detection_interval: run the detector on every n-th frame (panel: 2), of faster films more seldom, see above.
-        fewest_joints: of the 14, in a frame that says anything of the pose.
-        brief_gap_s: a joint that hides for at most this many seconds coasts through the smoother.
+        detection_interval: run the detector on every n-th frame (panel: 2), above 45 frames per second less often.
+        fewest_joints: smallest number of the 14 joints for a frame to be used.
+        brief_gap_s: a joint hidden for at most this many seconds is predicted by the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
         tracker, lifter, metric_pose, smoother: replacements of the default stages; ``lifter`` is the shipped
             :class:`~tensorsim.vision.TemporalLifter`. A ``metric_pose`` has heights, distances and camera of its own.

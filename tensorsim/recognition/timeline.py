@@ -67,7 +67,8 @@ def label_windows(
         duration_s: of the scene; the columns of each map are spread over it evenly.
         window_s: length of a window.
         step_s: from one window to the next.
-        least_probability: a window whose best class has less is :data:`NOT_SURE`.
+        least_probability: a window whose most probable class has less is :data:`NOT_SURE`. The default, 0.0, always
+            gives the most probable class; the default of ``tensorsim simulate`` is 0.2.
 
     Raises:
         TensorsimError: maps with batch dimensions, or a length that is not positive.
