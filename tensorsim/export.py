@@ -15,6 +15,8 @@ from tensorsim.files import complete_file, write_bytes
 from tensorsim.onnx_operations import translations
 from tensorsim.protocols import check_instance
 
+__all__ = ["ComplexPairs", "to_onnx", "to_torchscript"]
+
 
 def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
     """Script a stage or a whole pipeline in evaluation mode and save it.

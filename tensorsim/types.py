@@ -80,7 +80,7 @@ class Pose(NamedTuple):
     Attributes:
         boxes: (B, P, T, 4) ``xyxy`` pixels.
         keypoints: (B, P, T, 17, 2) COCO-17 ``uv`` pixels.
-        keypoint_scores: (B, P, T, 17).
+        keypoint_scores: (B, P, T, 17) from 0, higher is surer.
         joints: (B, P, T, 14, 3) world metres in the order of ``tensorsim.JOINTS``; finite everywhere.
         valid: (B, P, T) bool, whether the person is in the scene.
     """
@@ -96,12 +96,12 @@ class RadarMaps(NamedTuple):
     """What a radar shows of a scene. Magnitudes are linear, not dB.
 
     Attributes:
-        range_time: (..., R, M) magnitude of the range profiles.
+        range_time: (..., R, M) magnitude of the range profiles; with a display rate, M columns of several pulses each.
         range_time_mti: (..., R, M') the same after the moving target indicator (M' = M - 1 for two-pulse).
         doppler_time: (..., F, K) magnitude, Doppler ascending, positive = approaching.
         ridges: (..., C, K) int64 Doppler bin of each of C ridges.
-        ridge_magnitudes: (..., C, K).
-        snr_db: (...) realised signal-to-noise ratio per IF sample; +inf without noise.
+        ridge_magnitudes: (..., C, K) values of ``doppler_time`` in these bins.
+        snr_db: (...) realised signal-to-noise ratio per IF sample in dB; +inf without noise.
     """
 
     range_time: Tensor
@@ -117,6 +117,19 @@ class Simulation(NamedTuple):
 
     ``valid`` is false everywhere in a clip in which nobody was found: its maps show the empty scene. Eager code warns
     of it as well; TorchScript cannot.
+
+    Attributes:
+        boxes: (B, P, T, 4) ``xyxy`` pixels.
+        keypoints: (B, P, T, 17, 2) COCO-17 ``uv`` pixels.
+        keypoint_scores: (B, P, T, 17).
+        joints: (B, P, T, 14, 3) world metres in the order of ``tensorsim.JOINTS``.
+        valid: (B, P, T) bool, whether the person is in the scene.
+        range_time: (B, R, M) linear magnitude.
+        range_time_mti: (B, R, M') linear magnitude.
+        doppler_time: (B, F, K) linear magnitude.
+        ridges: (B, C, K) int64 Doppler bins.
+        ridge_magnitudes: (B, C, K) linear magnitude.
+        snr_db: (B,) dB.
     """
 
     boxes: Tensor
@@ -133,10 +146,10 @@ class Simulation(NamedTuple):
 
 
 class Recognition(NamedTuple):
-    """Everything :class:`tensorsim.VideoToActivity` makes of clips: the fields of Simulation, then the label.
+    """Everything :class:`tensorsim.VideoToActivity` makes of clips: the fields of :class:`Simulation`, then logits.
 
     Attributes:
-        logits: (B, classes) in the order of ``tensorsim.ACTIVITIES``.
+        logits: (B, classes) in the order of the recognizer's ``class_names``.
     """
 
     boxes: Tensor

@@ -401,7 +401,7 @@ def test_which_ids_number_frames(numbers: list[int | str], frames: int, tmp_path
 
 @pytest.mark.parametrize(
     ("fps", "size", "message"),
-    [(None, CANVAS, "expected --fps"), (0.0, CANVAS, "fps: got 0.0"), (30.0, None, "expected --image-size")],
+    [(None, CANVAS, "give --fps"), (0.0, CANVAS, "fps: got 0.0"), (30.0, None, "give --image-size")],
 )
 def test_keypoints_need_a_rate_and_a_size(
     filmed: tuple[ts.CameraConfig, np.ndarray, np.ndarray],

@@ -153,7 +153,11 @@ class SimulationConfig:
         return cls.from_document(document.get("config", document), str(path))
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
-        """Write a file from which :meth:`from_yaml` reads the same."""
+        """Write a file from which :meth:`from_yaml` reads the same.
+
+        Raises:
+            TensorsimError: the disk is full, or the folder is not writable.
+        """
         write_text(path, dump_limited_yaml(self.to_document()))
 
 

@@ -43,12 +43,16 @@ def slow_time_signal(
 
     Args:
         simulator: computes the range profiles, which are summed coherently over range.
-        source: as in ``RadarSimulator.stream``: ``source(start, stop)`` gives positions (stop - start, S, 3) and RCS.
-        pulses: of the scene.
+        source: as in ``RadarSimulator.stream``: ``source(start, stop)`` gives positions (stop - start, S, 3) in metres
+            and RCS (S,) or (stop - start, S) in m^2.
+        pulses: number of pulses of the scene.
 
     Returns:
         (M,) complex, conjugated so that positive frequencies approach, as in the Doppler-time map; a two-pulse
         canceller leaves one pulse fewer than ``pulses``.
+
+    Raises:
+        TensorsimError: fewer pulses than the moving target indicator needs. What the source gives is not checked.
     """
     samples, bins = simulator.radar.samples_per_chirp, simulator.range_profile.range_m.shape[0]
     parts = []
@@ -142,7 +146,15 @@ def _stretched(
 
 
 def write_sound(path: str | os.PathLike[str], sound: Sound) -> None:
-    """Write a 16-bit stereo wav file, completely or not at all."""
+    """Write a 16-bit stereo wav file.
+
+    Args:
+        path: file to write; it appears only when complete.
+        sound: waveform (2, n); values beyond [-1, 1] are clipped.
+
+    Raises:
+        TensorsimError: the disk is full, or the folder is not writable.
+    """
     samples = (sound.waveform.clamp(-1, 1) * 32767).round().to(torch.int16)
     with complete_file(path) as scratch, wave.open(str(scratch), "wb") as file:
         file.setnchannels(samples.shape[0])

@@ -16,7 +16,7 @@ class DenseSearch(nn.Module):
     Args:
         search: the pool, its headings and the number of neighbours.
 
-    Shape:
+    Shapes:
         key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, best first.
     """
 

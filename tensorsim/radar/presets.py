@@ -165,7 +165,11 @@ def radar_scene(name_or_path: str) -> SceneConfig:
 
 
 def load_radar_yaml(path: str | Path) -> RadarConfig:
-    """The radar of a YAML file; see the module for the format and :func:`load_scene_yaml` for the whole scene."""
+    """The radar of a YAML file; see the module for the format and :func:`load_scene_yaml` for the whole scene.
+
+    Raises:
+        TensorsimError: as :func:`load_scene_yaml`.
+    """
     return load_scene_yaml(path).radar
 
 
@@ -194,7 +198,17 @@ def load_scene_yaml(path: str | Path) -> SceneConfig:
 def save_radar_yaml(
     path: str | Path, radar: RadarConfig, wall: WallConfig | None = None, floor: FloorConfig | None = None
 ) -> None:
-    """Write a file from which :func:`load_scene_yaml` reads the same scene."""
+    """Write a file from which :func:`load_scene_yaml` reads the same scene.
+
+    Args:
+        path: YAML file to write; it appears only when complete.
+        radar: the radar.
+        wall: a wall, or None.
+        floor: a floor, or None.
+
+    Raises:
+        TensorsimError: the disk is full, or the folder is not writable.
+    """
     document = to_document(radar)
     for name, part in (("wall", wall), ("floor", floor)):
         if part is not None:

@@ -39,10 +39,14 @@ class DIATRadHARNet(ImageClassifier):
     """DIAT-RadHARNet: a stem and five separable blocks.
 
     Args:
-        num_classes, in_channels: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
+        num_classes: number of classes.
+        in_channels: number of channels C of the images.
 
     Shapes: images (..., C, H, W) in [0, 1], 224x224 in the source -> logits (..., num_classes). Differentiable.
     213 783 parameters for 6 classes and 3 channels, 214 941 for 12.
+
+    Raises:
+        TensorsimError: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
     """
 
     def __init__(self, num_classes: int = 12, in_channels: int = 1) -> None:

@@ -30,10 +30,14 @@ class MCGCLU(ImageClassifier):
     In training a patch of 16x16 pixels is masked with a probability of 0.3, in evaluation none is.
 
     Args:
-        num_classes, in_channels: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
+        num_classes: number of classes.
+        in_channels: number of channels C of the images.
 
     Shapes: images (..., C, H, W) in [0, 1] -> logits (..., num_classes). Differentiable. 2 483 404 parameters for 12
     classes and 3 channels.
+
+    Raises:
+        TensorsimError: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
     """
 
     def __init__(self, num_classes: int = 12, in_channels: int = 1) -> None:

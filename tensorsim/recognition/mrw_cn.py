@@ -47,10 +47,14 @@ class MRWCN(ImageClassifier):
     """MRW-CN, the multi-scale residual weighted classification network.
 
     Args:
-        num_classes, in_channels: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
+        num_classes: number of classes.
+        in_channels: number of channels C of the images.
 
     Shapes: images (..., C, H, W) in [0, 1], columns in time -> logits (..., num_classes). Differentiable.
     2 777 689 parameters for 12 classes and 3 channels.
+
+    Raises:
+        TensorsimError: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
     """
 
     def __init__(self, num_classes: int = 12, in_channels: int = 1) -> None:

@@ -41,9 +41,13 @@ class SPNetDense(ImageClassifier):
     """SPNet with dense blocks; a reconstruction from the prose of the paper.
 
     Args:
-        num_classes, in_channels: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
+        num_classes: number of classes.
+        in_channels: number of channels C of the images.
 
     Shapes: images (..., C, H, W) in [0, 1], 224x224 in the paper -> logits (..., num_classes). Differentiable.
+
+    Raises:
+        TensorsimError: see :class:`~tensorsim.recognition.blocks.ImageClassifier`.
     """
 
     def __init__(self, num_classes: int = 12, in_channels: int = 1) -> None:

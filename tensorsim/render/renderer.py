@@ -107,6 +107,10 @@ class PersonRenderer:
                 makes a room.
             valid: (P, T) bool, in which frames each person is present; None is all. A film without people is empty.
 
+        Returns:
+            :class:`RenderedVideo`: T frames (T, 3, H, W), and boxes, masks, key points and visibility of P people, with
+            the camera that took them.
+
         Raises:
             TensorsimError: other shapes, no frames or people, NaN.
         """

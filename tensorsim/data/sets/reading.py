@@ -155,7 +155,16 @@ def stacked(maps: Sequence[Tensor], names: Sequence[str]) -> Tensor:
 
 
 def collate_maps(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Samples as a batch: maps (B, C, H, W), labels (B,); shorter maps are padded with the floor at their end."""
+    """Samples as a batch, for the ``collate_fn`` of a ``DataLoader``.
+
+    Args:
+        samples: B of those of :class:`MapDataset`, with maps (C, H, W) of one C and H. They are not checked: torch
+            raises RuntimeError for maps that do not fit together.
+
+    Returns:
+        ``{"map": (B, C, H, W) float32, "label": (B,) int64, "id": list of B str}``; W is that of the longest map,
+        shorter ones are padded with 0, the floor, at their end.
+    """
     width = max(sample["map"].shape[-1] for sample in samples)
     maps = [torch.nn.functional.pad(s["map"], (0, width - s["map"].shape[-1])) for s in samples]
     return {
@@ -166,12 +175,17 @@ def collate_maps(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 class MapStream(IterableDataset[dict[str, Any]]):
-    """A data set shard by shard, shared out to ranks and workers; every sample comes once in an epoch.
+    """A data set shard by shard, distributed over ranks and workers; every sample comes once in an epoch.
 
     Args:
-        maps: what to read.
-        shuffle: shards and the samples in them come in another order in every epoch.
-        seed: of the order.
+        maps: data set to read.
+        shuffle: shards, and the samples in them, come in another order in every epoch; call :meth:`set_epoch`.
+        seed: random seed of the order.
+
+    Samples: as those of :class:`MapDataset`.
+
+    Raises:
+        TensorsimError: while reading, a shard that is missing or damaged.
     """
 
     def __init__(self, maps: MapDataset, shuffle: bool = True, seed: int = 0) -> None:

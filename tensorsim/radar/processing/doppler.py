@@ -32,6 +32,8 @@ def doppler_time_map(profiles: Tensor, window: Tensor, hop: int, fft_length: int
         (..., F, K) magnitude, K = ``(M - L) // hop + 1`` frames, Doppler ascending as in
         ``fftshift(fftfreq(F, 1 / PRF))``. Differentiable, with gradient 0 where the map is 0.
 
+    Inputs are not checked; torch raises RuntimeError for shapes that do not fit.
+
     >>> approaching = torch.polar(torch.ones(64), -2 * math.pi * torch.arange(64) / 4)  # phase decreases
     >>> doppler_time_map(approaching[:, None], torch.hann_window(16), hop=8, fft_length=16).argmax(0)
     tensor([12, 12, 12, 12, 12, 12, 12])
@@ -163,7 +165,9 @@ class DopplerTimeMap(DopplerFrames):
     """Doppler-time map (DTM) of complex range profiles.
 
     Args:
-        radar, window_s, overlap: see :class:`DopplerFrames`.
+        radar: the radar (its PRF and range bins).
+        window_s: length of the window in seconds.
+        overlap: overlap of neighbouring windows as a fraction of their length, in [0, 1).
         integration: over range bins. ``"noncoherent"``: :func:`doppler_time_map`. ``"coherent"``: |STFT| of
             :func:`coherent_sum`, which adds the bins of one target in phase, but not those of several: for a gate
             around one target. ``"paper"``: the paper's formula, the STFT of the sum of magnitudes over range.
@@ -173,6 +177,12 @@ class DopplerTimeMap(DopplerFrames):
 
     Shapes: (..., M, R) complex -> (..., F, K) magnitude, Doppler ascending. Differentiable, with gradient
     0 where the map is 0.
+
+    Attributes:
+        doppler_hz: (F,) Doppler axis in Hz, ascending, positive = approaching.
+        length: L, pulses of a window.
+        hop: pulses from one window to the next.
+        frame_rate_hz: columns per second, PRF / hop; :meth:`frame_times_s` gives their (K,) times in seconds.
 
     Raises:
         TensorsimError: as :class:`DopplerFrames`; unknown integration, a gate without bins, real profiles, fewer
@@ -270,10 +280,18 @@ class RangeDopplerVideo(DopplerFrames):
     """Range-Doppler power of each frame: the Doppler-time map before its sum over range.
 
     Args:
-        radar, window_s, overlap: see :class:`DopplerFrames`.
+        radar: the radar (its PRF).
+        window_s: length of the window in seconds.
+        overlap: overlap of neighbouring windows as a fraction of their length, in [0, 1).
 
     Shapes: (..., M, R) complex -> (..., K, R, F) power ``|STFT|^2``; the sum over R is the square of the noncoherent
     Doppler-time map. Differentiable.
+
+    Attributes:
+        doppler_hz: (F,) Doppler axis in Hz, ascending, positive = approaching.
+        length: L, pulses of a window.
+        hop: pulses from one window to the next.
+        frame_rate_hz: columns per second, PRF / hop; :meth:`frame_times_s` gives their (K,) times in seconds.
 
     Raises:
         TensorsimError: as :class:`DopplerFrames`; real profiles, fewer than L pulses.

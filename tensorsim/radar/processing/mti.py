@@ -20,6 +20,8 @@ def two_pulse_canceller(profiles: Tensor) -> Tensor:
     r"""Two-pulse canceller: (..., M, R) -> (..., M - 1, R).
 
     $$ y[m] = x[m + 1] - x[m], \quad |H(f_d)| = |2 \sin(\pi f_d / \mathrm{PRF})| $$
+
+    Inputs are not checked; one pulse gives none.
     """
     return profiles[..., 1:, :] - profiles[..., :-1, :]
 

@@ -22,9 +22,16 @@ class RangeDopplerCube(DopplerFrames):
 
     Args:
         radar: the array, its channels in the order of the echo, ``v = k A + a``; or one antenna pair.
-        window_s, overlap: see :class:`DopplerFrames`.
+        window_s: length of the window in seconds.
+        overlap: overlap of neighbouring windows as a fraction of their length, in [0, 1).
 
     Shapes: profiles (..., V, M, R) complex -> (..., K, V, R, F) complex. Differentiable.
+
+    Attributes:
+        doppler_hz: (F,) Doppler axis in Hz, ascending, positive = approaching.
+        length: L, pulses of a window.
+        hop: pulses from one window to the next.
+        frame_rate_hz: columns per second, PRF / hop; :meth:`frame_times_s` gives their (K,) times in seconds.
 
     Raises:
         TensorsimError: as :class:`DopplerFrames`; another number of channels, real profiles, fewer than L pulses.

@@ -32,6 +32,8 @@ def range_profile(
 
     Returns:
         (..., M, last_bin + 1 - first_bin) complex; bin $k$ is at range $k c / (2 B)$.
+
+    Inputs are not checked; torch raises RuntimeError for shapes that do not fit.
     """
     stop = intermediate.shape[-1] // 2 if last_bin is None else last_bin + 1
     return torch.fft.fft(intermediate * window)[..., first_bin:stop]

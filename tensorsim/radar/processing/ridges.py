@@ -25,7 +25,7 @@ class Ridges(NamedTuple):
 
     Attributes:
         indices: (..., C, K) int64 Doppler bin.
-        magnitudes: (..., C, K) the map's value there.
+        magnitudes: (..., C, K) value of the map in this bin.
     """
 
     indices: Tensor
@@ -94,8 +94,9 @@ class RidgeExtractor(nn.Module):
     Args:
         count: number of ridges, 1 to 6.
 
-    Shapes: (..., F, K) magnitude -> :class:`Ridges` with (..., count, K). See :func:`strongest_peaks` for
-    frames with too few maxima and :func:`connect` for the rows. Bins have no gradient, magnitudes do.
+    Shapes: (..., F, K) magnitude -> :class:`Ridges`: ``indices`` (..., count, K) int64 Doppler bins and ``magnitudes``
+    (..., count, K), the values of the map in them. See :func:`strongest_peaks` for frames with too few maxima and
+    :func:`connect` for the rows. Bins have no gradient, magnitudes do.
 
     Raises:
         TensorsimError: a count outside 1 to 6, fewer Doppler bins than ridges, no frame, NaN.
@@ -167,8 +168,9 @@ class PathRidgeExtractor(nn.Module):
         band: bins on either side of a found path that belong to it.
         floor_db: bins at least this far below the map's peak have no gain.
 
-    Shapes: (..., F, K) magnitude -> :class:`Ridges` with (..., count, K). The Doppler axis is periodic with the PRF.
-    The ridges of an empty map are at the first bin. Bins have no gradient, magnitudes do.
+    Shapes: (..., F, K) magnitude -> :class:`Ridges`: ``indices`` (..., count, K) int64 Doppler bins and ``magnitudes``
+    (..., count, K), the values of the map in them. The Doppler axis is periodic with the PRF. The ridges of an empty
+    map are at the first bin. Bins have no gradient, magnitudes do.
 
     Raises:
         TensorsimError: settings out of range, fewer Doppler bins than a jump either way, no frame, NaN.

@@ -42,7 +42,9 @@ class SynchrosqueezedMap(DopplerFrames):
     referred to the centre of the frame, its pulse ``L // 2``.
 
     Args:
-        radar, window_s, overlap: see :class:`~tensorsim.radar.processing.doppler.DopplerFrames`.
+        radar: the radar (its PRF).
+        window_s: length of the window in seconds.
+        overlap: overlap of neighbouring windows as a fraction of their length, in [0, 1).
         hop: pulses from frame to frame instead of ``overlap``, at most those of a window; 1 for a transform that can
             be inverted at every pulse.
         threshold_db: values this far below the strongest of their frame and range bin are not moved.
@@ -50,6 +52,12 @@ class SynchrosqueezedMap(DopplerFrames):
     Shapes: (..., M, R) complex -> (..., F, K) magnitude, ``sqrt(sum over range bins of |T|^2)``; for one
     coherent series pass it as R = 1 (see :func:`~tensorsim.radar.processing.doppler.coherent_sum`). Differentiable
     by the values, not by their bins.
+
+    Attributes:
+        doppler_hz: (F,) Doppler axis in Hz, ascending, positive = approaching.
+        length: L, pulses of a window.
+        hop: pulses from one window to the next.
+        frame_rate_hz: columns per second, PRF / hop; :meth:`frame_times_s` gives their (K,) times in seconds.
 
     Raises:
         TensorsimError: as :class:`~tensorsim.radar.processing.doppler.DopplerFrames`; a hop below 1 or above L, real

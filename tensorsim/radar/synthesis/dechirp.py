@@ -35,6 +35,8 @@ def intermediate_frequency(
 
     Returns:
         (..., N) complex128. Differentiable.
+
+    Inputs are not checked; torch raises RuntimeError for shapes that do not fit.
     """
     tau, t = delay_s.double().unsqueeze(-1), time_s.double()
     cycles = carrier_hz * tau + slope_hz_per_s * tau * t - 0.5 * slope_hz_per_s * tau.square()

@@ -82,10 +82,12 @@ def mirror_delays(
         positions: (..., 3) metres, in front of the face.
         tx_m, rx_m: (3,) or (..., 3) metres.
         face_y: y of the wall face, whose normal is y, in metres.
-        speed_m_s: speed of light c.
+        speed_m_s: speed of light c in m/s.
 
     Returns:
         (..., 3) seconds: a, b, c.
+
+    Inputs are not checked; positions behind the face get delays as well.
     """
     out, back = leg_length(positions, tx_m, 0.0), leg_length(positions, rx_m, 0.0)
     out_image = leg_length(positions, mirror_image(tx_m, face_y), 0.0)

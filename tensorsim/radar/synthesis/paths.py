@@ -71,13 +71,15 @@ def radar_equation_amplitude(
     (Richards, *Fundamentals of Radar Signal Processing*, ch. 2).
 
     Args:
-        rcs_m2: (...) radar cross section $\sigma$.
-        tx_range_m, rx_range_m: (...) lengths $R_1$ and $R_2$ of the two legs of the path.
-        wavelength_m: $\lambda = c / f_c$.
+        rcs_m2: (...) radar cross section $\sigma$ in m^2.
+        tx_range_m, rx_range_m: (...) lengths $R_1$ and $R_2$ of the two legs of the path in metres.
+        wavelength_m: $\lambda = c / f_c$ in metres.
         tx_gain, rx_gain: $G_t$ and $G_r$, linear power gains.
 
     Returns:
-        (...) real. Differentiable; the gradient by an RCS of 0 is 0.
+        (...) real, square root of received over transmitted power. Differentiable; the gradient by an RCS of 0 is 0.
+
+    Inputs are not checked; a range of 0 gives an infinite amplitude.
 
     >>> one = torch.ones(())
     >>> float(radar_equation_amplitude(one, 2 * one, 2 * one, 0.01) / radar_equation_amplitude(one, one, one, 0.01))

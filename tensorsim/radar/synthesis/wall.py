@@ -32,9 +32,9 @@ class Slab(NamedTuple):
     Attributes:
         reflection: complex ``G``, air to wall; wall to air is ``-G``, and one passage through both faces is
             ``T12 T21 = 1 - G^2``.
-        loss_neper: ``alpha d``, attenuation of one passage at the given frequency.
-        excess_s: additional delay of one passage compared with air, ``d (n' cos t - cos i) / c``.
-        bounce_s: delay of a pair of internal bounces, ``2 d n' cos t / c``.
+        loss_neper: ``alpha d``, attenuation of one passage at the given frequency in neper.
+        excess_s: additional delay of one passage compared with air in seconds, ``d (n' cos t - cos i) / c``.
+        bounce_s: delay of a pair of internal bounces in seconds, ``2 d n' cos t / c``.
     """
 
     reflection: Tensor
@@ -48,7 +48,7 @@ class WallTerms(NamedTuple):
 
     Attributes:
         gain: (..., 3) complex factor of the received wave: ``T0^2``, ``2 T0 T1``, ``T1^2``.
-        delay_s: (..., 3) delay of each beyond that of the same path in air.
+        delay_s: (..., 3) delay of each in seconds, beyond that of the same path in air.
     """
 
     gain: Tensor
@@ -165,7 +165,13 @@ def two_way_wall_transmission(slab: Slab) -> WallTerms:
         2 T0 T1  2 excess + bounce       one bounce pair, on the way to the target or back
         T1^2     2 excess + 2 bounce     one bounce pair on both
 
-    The paper keeps ``T0^2`` and ``T1^2`` only.
+    The paper keeps ``T0^2`` and ``T1^2`` only. Inputs are not checked.
+
+    Args:
+        slab: coefficients (...) of the wall, see :func:`slab_coefficients`.
+
+    Returns:
+        :class:`WallTerms`: ``gain`` (..., 3) complex and ``delay_s`` (..., 3) seconds, in the order of the table.
     """
     t0, t1 = transmission(slab, 0), transmission(slab, 1)
     excess, bounce = 2 * slab.excess_s, slab.bounce_s

@@ -144,7 +144,7 @@ class CameraCalibrator(nn.Module):
         most_frames: of those in which somebody is upright that are used, at most: evenly spread, or windows of six
             seconds that are.
 
-    Shape:
+    Shapes:
         keypoints (..., P, T, 17, 2) pixels, scores (..., P, T, 17), valid (..., P, T) bool, image height and width in
         pixels, frames per second -> :class:`CameraEstimate` of shape (...). Computed in float64 without gradients.
 

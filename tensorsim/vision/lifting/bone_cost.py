@@ -99,7 +99,7 @@ class BoneCost(nn.Module):
         floor_m: deviation of joints that are below the floor.
         has_floor: whether the floor is known.
 
-    Shape:
+    Shapes:
         clip, distances r (S, T, 13), logarithms of relative lengths ``stretch`` (S, 8), deviation of bones ``bone_m``
         (S) -> (S). Differentiable.
     """

@@ -42,7 +42,7 @@ class BoneDescent(nn.Module):
     Args:
         cost: the sum to minimise.
 
-    Shape:
+    Shapes:
         clip, distances (S, T, 13), logarithms of relative lengths (S, 8), deviation of bones (S), number of steps ->
         distances and logarithms after these steps, of no higher cost. Differentiable.
     """

@@ -61,7 +61,7 @@ class BoneFit(nn.Module):
         steps: of Levenberg-Marquardt, while bones may still stretch much and when they no longer may.
         rounds: how often other branches are tried, at most.
 
-    Shape:
+    Shapes:
         joints (..., P, T, 14, 3) in world metres, seen (..., P, T, 14) bool and frames per second -> joints, moved
         along their lines of sight; the neck comes out in the middle of the shoulders. Frames in which nothing is
         seen and clips of fewer than 4 frames stay. Computed in float64. Differentiable by joints, but for the

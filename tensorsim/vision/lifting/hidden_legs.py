@@ -31,7 +31,7 @@ class HiddenLegs(nn.Module):
         slow_m_s, walking_m_s: speeds of the hips below which nothing is changed and from which all is a gait.
         blend_s: seconds for which legs are hidden before they begin to step, and over which they come to do so.
 
-    Shape:
+    Shapes:
         joints (..., T, 14, 3) in metres, z up, seen (..., T, 14) bool, valid (..., T) bool, frames per second ->
         joints (..., T, 14, 3). Differentiable.
 

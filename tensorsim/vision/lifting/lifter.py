@@ -121,7 +121,7 @@ class NearestPoseLifter(nn.Module):
         pitch_rad: upward tilt of the camera; depths are along its optical axis.
         roll_rad: turn of the camera about it, see :class:`tensorsim.CameraConfig`.
 
-    Shape:
+    Shapes:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
         :class:`tensorsim.types.Lifted`. A frame with fewer than two weighted joints takes the nearest other
         frame. Differentiable by joints and weights through the fit and the shares of the candidates; the

@@ -135,7 +135,7 @@ class MetricPose(nn.Module):
         calibrated: height and tilt of the camera are known well: no floor is estimated, joints keep the heights that
             the camera gives.
 
-    Shape:
+    Shapes:
         joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
         (..., P, T) bool, image height and width in pixels, frames per second, where the camera moves its
         world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward), and where it is known the

@@ -201,7 +201,7 @@ class PoseSearch(nn.Module):
         blocks: order and starts of another search of the same poses, whose blocks are nearly as good for another
             tilt; None sorts anew.
 
-    Shape:
+    Shapes:
         key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, ``pose * yaws + heading``, best
         first; the lower index first where two fit equally well. A frame without weights gets the first poses.
         Not differentiable.

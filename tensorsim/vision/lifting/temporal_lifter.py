@@ -89,7 +89,7 @@ class TemporalLifter(nn.Module):
             of those who lie or sit from it, which a tilt that is wrong by some degrees moves by a metre. Then people
             are put where their bones have the lengths that they should have.
 
-    Shape:
+    Shapes:
         COCO key points (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
         valid (..., P, T) bool, height and width of the picture, frames per second -> :class:`TemporalPose`. Frames
         in which nobody is followed are filled from those around them, those far from anybody with the camera's place.

@@ -57,7 +57,7 @@ class TemporalNet(nn.Module):
         channels: width; 256 makes 1.6 million parameters.
         dilations: of the blocks.
 
-    Shape:
+    Shapes:
         :class:`~tensorsim.vision.lifting.sight.Sight` of S tracks and T frames -> :class:`Located`. Differentiable.
     """
 

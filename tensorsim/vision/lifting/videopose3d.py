@@ -207,7 +207,7 @@ class VideoPoseLifter(nn.Module):
         network: with its weights.
         image_height, image_width: of the picture in pixels: the network takes coordinates about its centre.
 
-    Shape:
+    Shapes:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) -> :class:`tensorsim.types.Lifted`,
         without a deviation. A frame with fewer than two weighted joints takes the nearest other frame; the network
         knows no weights and sees hidden joints where they are given. Differentiable.

@@ -33,7 +33,10 @@ class RtmPose(TopDownPose):
         path: the ``.onnx`` file, with outputs ``simcc_x`` and ``simcc_y`` of 17 key points.
         flip_test: average with the mirror image: more accurate, at twice the cost.
         padding: boxes are enlarged by this factor; 1.25 as in training.
-        crops_per_batch: how many crops the network gets at once.
+        crops_per_batch: largest number of crops in one batch of the network.
+
+    Shapes: images (B, 3, H, W) RGB, uint8 or float in [0, 1], boxes (B, P, 4) ``xyxy`` pixels, valid (B, P) bool ->
+    key points (B, P, 17, 2), ``uv`` pixels of the image, and scores (B, P, 17), from 0; both zero where not valid.
 
     Raises:
         TensorsimError: a file that is missing, unreadable or of another layout, arguments out of range; see
@@ -120,7 +123,7 @@ class SimccDecoder(nn.Module):
         bins_x: columns; the rest are rows.
         split: columns per pixel.
 
-    Shape:
+    Shapes:
         (..., X + Y) -> points (..., 2), ``uv`` in pixels of the crop, and scores (...), the lower one of the two,
         at least 0. Only the scores are differentiable.
 

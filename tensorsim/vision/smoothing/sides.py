@@ -56,7 +56,7 @@ class SteadySides(nn.Module):
         exchanged: cost of an exchanged frame at up to 30 frames per second; per second it is the same above.
         threshold: score from which a point counts.
 
-    Shape:
+    Shapes:
         COCO key points (..., T, 17, 2) pixels, scores (..., T, 17), valid (..., T) bool, frames per second -> key
         points and scores. Differentiable; which are exchanged is not.
 
