@@ -20,7 +20,7 @@ def times_as_fast(fps: float) -> int:
 
 
 def of_person(values: Tensor, person: Tensor) -> Tensor:
-    """Values (N,) by order of person, for people with these numbers (...): the last one serves all further people."""
+    """Values (N,) by order of person, for people numbered (...): the last one applies to all further people."""
     return values[person.clamp(max=values.shape[0] - 1)]
 
 

@@ -253,7 +253,7 @@ def name_of(path: Path) -> str:
 
 
 def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
-    """The file of an entry, downloaded if it is not there. An interrupted download goes on where it stopped.
+    """The file of an entry, downloaded if it is not there. An interrupted download is resumed.
 
     The whole SHA-256 of the download is kept beside it, so that later changes are noticed also where only eight digits
     are published.

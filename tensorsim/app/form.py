@@ -53,7 +53,7 @@ _OTHERWISE: dict[str, dict[str, Any]] = {
     # The command takes files of weights as well; who opens the app may not read files of its machine.
     "denoiser": {
         "label": "Denoiser",
-        "help": "What cleans the shown maps; ksvd takes minutes. Default: none.",
+        "help": "Denoiser for the displayed maps; ksvd takes minutes. Default: none.",
         "kind": "choice",
         "choices": ("", *DENOISERS),
     },

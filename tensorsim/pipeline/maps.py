@@ -38,7 +38,7 @@ class PoseToDoppler(nn.Module):
         scatterers: joints -> scatterers; default one point per joint with the panel's RCS.
         denoiser: optional module on magnitude maps (..., H, W), e.g. ``tensorsim.enhance.MapDenoiser``. It cleans
             the shown maps; the Doppler-time map is computed from data that was not denoised.
-        rcs_scale: factor on the cross sections by person; the last one serves the rest.
+        rcs_scale: factor on the cross sections by person; the last one applies to all further people.
         small_motions: motions of the body that no camera resolves, added at the pulse rate, e.g.
             :class:`tensorsim.motion.PosturalSway` and :class:`tensorsim.motion.VitalSigns`: modules
             (joints (B, P, M, 14, 3), first pulse) -> joints.

@@ -218,7 +218,7 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
     Args:
         recipe: as for :class:`MapDataset`.
         split: part of it; None takes all.
-        rounds: number of rounds through its samples; None goes on for ever.
+        rounds: number of rounds through its samples; None never ends.
         output, radars: see :class:`MapDataset`.
         device: where the radar chain runs, and where the maps are. People are generated or read on the CPU. A GPU needs
             a ``DataLoader`` without workers.

@@ -136,7 +136,7 @@ class CameraCalibrator(nn.Module):
     person, and tells nothing.
 
     Args:
-        person_height_m: standing heights by order of person; the last one serves all further people.
+        person_height_m: standing heights by order of person; the last one applies to all further people.
         height_sd_m: standard deviation of these heights: 0.08 m for people of unknown height, less for known ones.
         keypoint_threshold: score from which a key point counts. The usual 0.3 is too low for this: key points of low
             scores err to one side (feet below the picture are found at its edge), and one camera is told from all

@@ -48,7 +48,7 @@ class BoneFit(nn.Module):
 
     Args:
         camera_m: (3,) position of the camera.
-        person_height_m: standing heights by order of person; the last one serves all further people.
+        person_height_m: standing heights by order of person; the last one applies to all further people.
         calibrated: height and tilt of the camera are known well, so that the floor determines distances.
         bone_m: standard deviation of the lengths of a bone over time, besides the noise of the keypoints.
         length_share: relative deviation of bodies from mean proportions.

@@ -124,7 +124,7 @@ class MetricPose(nn.Module):
 
     Args:
         camera: pinhole camera; None is the default one, at the radar.
-        person_height_m: standing heights by order of person; the last one serves all further people.
+        person_height_m: standing heights by order of person; the last one applies to all further people.
         initial_distance_m: range of each person in its first half second, likewise by order. In the camera
             mode it replaces the focal length, person by person. None takes the camera's focal length (in the
             paper's mode the panel's 4.00 and 0.50 m).
@@ -315,7 +315,7 @@ class MetricPose(nn.Module):
         return camera_pose.to(keypoints.dtype).unsqueeze(-4)
 
     def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
-        """A value per person, (P, 1): the last one serves all further people."""
+        """A value per person, (P, 1): the last one applies to all further people."""
         return of_person(values.to(like.dtype), torch.arange(like.shape[-4], device=like.device))[:, None]
 
     def _focal_from(

@@ -81,7 +81,7 @@ class TemporalLifter(nn.Module):
     Args:
         network: with its weights; None is an untrained one. :meth:`from_pretrained` loads the shipped one.
         camera: where the camera stands, its tilt and focal length; None is the default one, at the radar.
-        person_height_m: standing heights by order of person; the last one serves all further people.
+        person_height_m: standing heights by order of person; the last one applies to all further people.
         keypoint_threshold: score from which a key point counts as seen.
         frames_per_block: frames that go through the network at once, of the tracks with somebody in or near them,
             which bounds time and memory; the result, where somebody is followed, does not depend on it.
