@@ -96,7 +96,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     wall_paths: Option[Literal["series", "paper"]] = None
     """Internal reflections in the wall: complete to first order, or as in the paper. Default: series."""
     multipath: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
-    """Internal reflections in the wall. Default: True if there is a wall."""
+    """Paths reflected inside the wall or by it. Default: True if there is a wall."""
     leakage: Option[bool] = None
     """Direct signal from the transmitter to the receiver. Default: off."""
     wall_echo: Option[bool] = None
