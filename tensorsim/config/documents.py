@@ -96,6 +96,8 @@ def _convert(where: str, value: Any, hint: Any) -> Any:
         if isinstance(value, hint):
             return value
         raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
+    if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        return value  # a float would round those beyond 2**53
     number = _number(value)
     if number is None or (hint is int and not number.is_integer()):
         raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
