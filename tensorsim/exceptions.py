@@ -51,6 +51,15 @@ def check_choice(value: object, choices: Collection[str], name: str) -> None:
         raise TensorsimError(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
 
 
+def check_distinct(values: Iterable[object], name: str) -> None:
+    """Refuse a list in which something stands twice."""
+    seen: list[object] = []
+    for value in values:
+        if value in seen:
+            raise TensorsimError(f"{name}: got {value!r} twice, expected each once")
+        seen.append(value)
+
+
 def first_line(error: BaseException) -> str:
     """What an error says first, or its class if it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(":")

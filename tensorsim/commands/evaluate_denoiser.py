@@ -6,7 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, check_count
+from tensorsim.exceptions import TensorsimError, check_count, check_distinct
 from tensorsim.files import write_text
 
 
@@ -38,12 +38,14 @@ class EvaluateDenoiser:
         from tensorsim.enhance.dncnn import MapDenoiser
         from tensorsim.enhance.ksvd import KSVD
         from tensorsim.enhance.perona_malik import PeronaMalik
+        from tensorsim.training.classifier import check_ratios
         from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, compare
 
         check_seed(self.seed)
-        counts = {"--clips": self.clips, "--scenes": len(self.scenes), "--snr": len(self.snr)}
-        for name, count in counts.items():
-            check_count(count, name)
+        check_count(self.clips, "--clips")
+        check_count(len(self.scenes), "--scenes")
+        check_distinct(self.scenes, "--scenes")
+        check_ratios(self.snr, "--snr")
         if self.out is not None and (self.out.is_dir() or not self.out.parent.is_dir()):
             raise TensorsimError(
                 f"--out: got {self.out}, expected the name of a file in a folder that is there"

@@ -12,17 +12,18 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES, SceneConfig, SimulationConfig
 from tensorsim.enhance.choice import DENOISERS, map_denoiser
-from tensorsim.errors import TensorsimError, TensorsimWarning, check_choice, check_count
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_count, check_distinct
 from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
 from tensorsim.experiments import figures
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, check_scenes, counted, mean_and_spread
 from tensorsim.files import sha256_of
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.registry import shipped_weights
+from tensorsim.training.classifier import check_ratios
 from tensorsim.training.denoiser import simulate_pair
 from tensorsim.training.denoiser_scores import COLUMNS, scores
 from tensorsim.training.maps import SCENES
@@ -189,15 +190,10 @@ class DenoiserConfig:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for scene in self.scenes:
-            check_choice(scene, SCENES, "scenes")
-        counts = {
-            "denoisers": len(self.denoisers),
-            "scenes": len(self.scenes),
-            "snr_db": len(self.snr_db),
-            "clips": self.clips,
-            "columns": self.columns,
-        }
+        check_scenes(self.scenes)
+        check_ratios(self.snr_db)
+        check_distinct(self.denoisers, "denoisers")
+        counts = {"denoisers": len(self.denoisers), "clips": self.clips, "columns": self.columns}
         for what, count in counts.items():
             check_count(count, what)
 

@@ -9,12 +9,13 @@ import torch
 from torch import nn
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError, check_choice, check_count
+from tensorsim.errors import TensorsimError, check_count, check_distinct
 from tensorsim.experiments import figures
 from tensorsim.experiments.pictures import INPUTS
 from tensorsim.experiments.trials import Trial, run_trials
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, check_scenes, counted, mean_and_spread
 from tensorsim.recognition.networks import CLASSIFIERS, find_classifier
+from tensorsim.training.classifier import check_ratios
 from tensorsim.training.maps import SCENES
 
 #: The comparison of the paper in the order in which it lists the networks; its figures are confusion matrices only.
@@ -50,8 +51,9 @@ class NetworksConfig:
 
     def __post_init__(self) -> None:
         check_trainings(self.networks, self.scenes, self.seeds)
-        if len(self.snr_db) == 0:
-            raise TensorsimError("snr_db: got no ratios, expected at least one")
+        check_ratios(self.snr_db)
+        for trial in self.trials():
+            trial.check()
 
     def trials(self) -> list[Trial]:
         """All trainings, seed after seed, so that an interrupted run has all networks of some seeds."""
@@ -84,8 +86,9 @@ class InputsConfig:
         check_trainings(self.networks, self.scenes, self.seeds)
         if not self.inputs:
             raise TensorsimError("inputs: got none, expected at least one")
-        for name in self.inputs:
-            check_choice(name, INPUTS, "inputs")
+        check_distinct(self.inputs, "inputs")
+        for trial in self.trials():
+            trial.check()
 
     def trials(self) -> list[Trial]:
         """All trainings, seed after seed."""
@@ -98,14 +101,19 @@ class InputsConfig:
         ]
 
 
-def check_trainings(networks: Sequence[str], scenes: Sequence[str], seeds: int) -> None:
-    """Refuse unknown names and empty lists."""
+def check_networks(networks: Sequence[str]) -> None:
+    """Refuse unknown names, one that is there twice, and an empty list."""
     for name in networks:
         find_classifier(name)
-    for scene in scenes:
-        check_choice(scene, SCENES, "scenes")
-    for what, count in (("networks", len(networks)), ("scenes", len(scenes)), ("seeds", seeds)):
-        check_count(count, what)
+    check_count(len(networks), "networks")
+    check_distinct(networks, "networks")
+
+
+def check_trainings(networks: Sequence[str], scenes: Sequence[str], seeds: int) -> None:
+    """Refuse networks and scenes that are unknown, there twice or none, and no training."""
+    check_networks(networks)
+    check_scenes(scenes)
+    check_count(seeds, "seeds")
 
 
 def protocol(clips: int, test_clips: int, size: int, epochs: int, seeds: int) -> str:

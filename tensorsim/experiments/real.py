@@ -15,7 +15,7 @@ from tensorsim.evaluation.labelled_films import read_labels
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
 from tensorsim.evaluation.measured.training import fit_pictures, predict, square
 from tensorsim.experiments import figures
-from tensorsim.experiments.networks import USUAL
+from tensorsim.experiments.networks import USUAL, check_networks
 from tensorsim.experiments.real_films import (
     SCENES,
     WATCHERS,
@@ -70,10 +70,9 @@ class RealConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in self.networks:
-            find_classifier(name)
+        check_networks(self.networks)
         for what, count, least in (
-            ("networks", len(self.networks), 1), ("clips", self.clips, 1), ("steps", self.steps, 1),
+            ("clips", self.clips, 1), ("steps", self.steps, 1),
             ("seeds", self.seeds, 1), ("film_seeds", self.film_seeds, 1), ("groups", self.groups, 5),
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip

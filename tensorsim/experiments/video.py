@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from tensorsim.errors import TensorsimError, TensorsimWarning, check_choice
+from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import ActivityClip, activity_clips
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Observed
 from tensorsim.evaluation.scores import MAPS, Maps, compare
@@ -17,7 +17,7 @@ from tensorsim.evaluation.settings import Pipelines, Setting
 from tensorsim.evaluation.truth import pose_errors
 from tensorsim.experiments import figures
 from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
-from tensorsim.experiments.work import Report, Table, Work
+from tensorsim.experiments.work import Report, Table, Work, check_scenes
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import VideoToPose, pretrained_pose
 from tensorsim.radar.presets import PRESETS
@@ -62,10 +62,7 @@ class VideoConfig:
     def __post_init__(self) -> None:
         for name in self.activities:
             activity_index(name)
-        for scene in self.scenes:
-            check_choice(scene, SCENES, "scenes")
-        if not self.scenes:
-            raise TensorsimError("scenes: got none, expected at least one")
+        check_scenes(self.scenes)
         if self.clips < 1 or not 0.5 <= self.length_s <= 60:
             raise TensorsimError(
                 f"clips, length_s: got {self.clips} and {self.length_s}, expected at least 1 and from 0.5 to 60 s"

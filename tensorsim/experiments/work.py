@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensorsim.config.documents import digest
-from tensorsim.errors import TensorsimError
+from tensorsim.errors import TensorsimError, check_choice, check_distinct
 from tensorsim.files import write_text
+from tensorsim.training.maps import SCENES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +41,15 @@ class Work:
         if not path.is_file():
             write_result(path, make())
         return read_result(path)
+
+
+def check_scenes(scenes: Sequence[str]) -> None:
+    """Refuse unknown scenes, one that is there twice, and an empty list."""
+    if not scenes:
+        raise TensorsimError("scenes: got none, expected at least one")
+    for scene in scenes:
+        check_choice(scene, SCENES, "scenes")
+    check_distinct(scenes, "scenes")
 
 
 def counted(count: int, noun: str) -> str:

@@ -1,5 +1,6 @@
 """The recipe of the activity classifiers: cross-entropy on stored pictures, with new noise at every use."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tensorsim.config import ACTIVITIES
-from tensorsim.errors import TensorsimError, check_choice
+from tensorsim.errors import TensorsimError, check_choice, check_distinct
 from tensorsim.recognition.map_image import scaled
 from tensorsim.recognition.spgnet import SPGNet
 from tensorsim.recognition.spnet import SPNet
@@ -56,6 +57,20 @@ def check_drawn(
         raise TensorsimError(f"{snr_name}: got {low:g} {high:g}, expected the lower one first")
     if not all(0 <= part <= 1 for part in masks):
         raise TensorsimError(f"{masks_name}: got {masks}, expected parts of a picture from 0 to 1")
+
+
+def check_ratios(snr_db: Sequence[float], name: str = "snr_db") -> None:
+    """Refuse a list of ratios that is empty, has one twice, or has what is no number of decibels.
+
+    Raises:
+        TensorsimError: it calls them by this name.
+    """
+    if len(snr_db) == 0:
+        raise TensorsimError(f"{name}: got no ratios, expected at least one")
+    for ratio in snr_db:
+        if not math.isfinite(ratio):
+            raise TensorsimError(f"{name}: got {ratio:g}, expected finite numbers of dB")
+    check_distinct(snr_db, name)
 
 
 def clips_of(

@@ -123,7 +123,9 @@ def test_denoisers_of_one_name_are_two_rows(tmp_path: Path, capsys: pytest.Captu
     ("options", "message"),
     [
         ({"clips": 0}, "--clips: got 0"),
-        ({"snr": ()}, "--snr: got 0"),
+        ({"snr": ()}, "--snr: got no ratios"),
+        ({"snr": (10.0, float("nan"))}, "--snr: got nan, expected finite numbers of dB"),
+        ({"scenes": ("free-space", "free-space")}, "--scenes: got 'free-space' twice"),
         ({"scenes": ()}, "--scenes: got 0"),
         ({"seed": -1}, "--seed: got -1"),
         ({"out": Path("nowhere/table.csv")}, "--out: got nowhere/table.csv"),
