@@ -34,7 +34,9 @@ class Experiment:
 def _paper(config: paper.PaperConfig, work: Work) -> Report:
     experiments = {name: e for name, e in EXPERIMENTS.items() if name != "paper"}
     settings = {name: _settings_in_paper(name, config) for name in experiments}
-    if not config.data and not config.films:
+    if config.data or config.films:
+        settings["real"].check(work)
+    else:
         del settings["real"]
     return paper.paper_report(settings, work, experiments)
 

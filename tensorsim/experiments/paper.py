@@ -40,6 +40,10 @@ class PaperConfig:
             )
         if self.settings and self.quick:
             raise TensorsimError("--settings: got a folder and --quick, expected one of them")
+        if self.maps and not self.films:
+            raise TensorsimError(
+                "--maps: got it without --films, which are labelled by networks that learnt it"
+            )
 
 
 def paper_report(settings: Mapping[str, Any], work: Work, experiments: Mapping[str, Experiment]) -> Report:

@@ -77,6 +77,12 @@ class RealConfig:
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
             check_count(count, what, least)
+        if len(self.group_clips) != 2:
+            raise TensorsimError(
+                f"group_clips: got {list(self.group_clips)}, expected two numbers: of clips as the pipeline finds "
+                "them, and of the motion itself"
+            )
+        EverydaySettings(filmed=self.group_clips[0], true=self.group_clips[1])
         if self.size < 32 or self.size % 16:
             raise TensorsimError(f"size: got {self.size}, expected a multiple of 16, at least 32")
         if self.films and self.size not in (32, 64):
@@ -102,9 +108,29 @@ class RealConfig:
             )
         return found
 
+    def everyday(self, work: Work) -> EverydayTraining:
+        """The trainings for films."""
+        filmed, true = self.group_clips
+        made = EverydaySettings(filmed=filmed, true=true)
+        maps = Path(self.maps) if self.maps else work.cache / f"everyday-maps-{digest(made)}"
+        return EverydayTraining(maps, self.groups, self.size, self.film_steps, made, work.quiet)
+
+    def check(self, work: Work) -> None:
+        """Refuse folders that do not hold what they should, before trainings of hours.
+
+        Raises:
+            TensorsimError: it says what a folder has and what was expected.
+        """
+        for measured in self.sets():
+            measured.load(Path(self.data))
+        if self.films:
+            read_labels(Path(self.films))
+            _ = self.everyday(work).settings
+
 
 def real_report(config: RealConfig, work: Work) -> Report:
     """Accuracy on measured clips, by set, of networks that have seen none, and on real films."""
+    config.check(work)
     sets = config.sets()
     reports = [_on_measured(config, sets, work)] if sets else []
     if config.films:
@@ -158,10 +184,7 @@ def _on_films(config: RealConfig, work: Work) -> Report:
         (*described(film), film.accept)
         for film in read_labels(Path(config.films))[: config.film_count or None]
     ]
-    filmed, true = config.group_clips
-    made = EverydaySettings(filmed=filmed, true=true)
-    maps = Path(config.maps) if config.maps else work.cache / f"everyday-maps-{digest(made)}"
-    training = EverydayTraining(maps, config.groups, config.size, config.film_steps, made, work.quiet)
+    training = config.everyday(work)
     jobs = [(name, seed) for seed in range(config.film_seeds) for name in config.networks]
     results: dict[str, list[dict[str, float]]] = {name: [] for name in config.networks}
     for name, seed in tqdm(jobs, desc="films", unit="training", disable=work.quiet):

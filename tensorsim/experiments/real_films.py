@@ -1,6 +1,5 @@
 """Recognisers trained on simulated maps of everyday motion and asked about real films of known activity."""
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from tensorsim.config.documents import digest
 from tensorsim.errors import TensorsimError, collected_warnings
 from tensorsim.evaluation.labelled_films import FilmReader, LabelledFilm, Scene, read_labels
 from tensorsim.experiments.work import Work
-from tensorsim.files import complete_file, sha256_of_arrays
+from tensorsim.files import check_folder, complete_file, sha256_of_arrays
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.recognition.networks import find_classifier
@@ -71,13 +70,25 @@ class EverydayTraining:
 
     @cached_property
     def store(self) -> EverydayStore:
-        """The maps, read once for all trainings; with the settings of those that are there."""
-        described = self.maps / "settings.json"
-        settings = self.made
-        if described.is_file():
-            settings = EverydaySettings(**json.loads(described.read_text(encoding="utf-8")))
-        build_everyday(self.maps, self.groups, settings, quiet=self.quiet)
+        """The maps, read once for all trainings."""
+        build_everyday(self.maps, self.groups, self.settings, quiet=self.quiet)
         return EverydayStore(self.maps, range(self.groups))
+
+    @property
+    def settings(self) -> EverydaySettings:
+        """Contents of the maps: of those that are there, else of what is made.
+
+        Raises:
+            TensorsimError: the folder has maps of another kind, or in pictures that are no multiple of ``size``.
+        """
+        check_folder(self.maps, "--maps")
+        there = (self.maps / "settings.json").is_file()
+        settings = EverydaySettings.read(self.maps) if there else self.made
+        if settings.size % self.size:
+            raise TensorsimError(
+                f"size: got {self.size}, expected a divisor of the {settings.size} of the maps in {self.maps}"
+            )
+        return settings
 
     @cached_property
     def digest(self) -> str:

@@ -4,7 +4,6 @@ Free space comes from :class:`~tensorsim.training.expected_map.ExpectedMap`, the
 form, each with one of three bodies, and with sway and vital signs in half of the clips. Noise is added in training.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from tqdm import tqdm
 from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.motions import Draw
-from tensorsim.files import complete_file, keep_settings
+from tensorsim.files import complete_file, keep_settings, read_settings
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.body_scatterers import BodyScatterers
 from tensorsim.motion.limb_scatterers import LimbScatterers
@@ -75,6 +74,23 @@ class EverydaySettings:
     def __post_init__(self) -> None:
         if self.size < 1 or not self.speed_m_s > 0 or min(self.filmed, self.true) < 0 or self.clips < 1:
             raise TensorsimError(f"EverydaySettings: got {self}, expected positive numbers")
+
+    @classmethod
+    def read(cls, folder: Path) -> "EverydaySettings":
+        """Those of the store in a folder.
+
+        Raises:
+            TensorsimError: no store there, or one of another kind.
+        """
+        if not (folder / "settings.json").is_file():
+            raise TensorsimError(f"{folder}: no settings.json, expected a store of everyday maps")
+        stated = read_settings(folder)
+        try:
+            return cls(**stated)
+        except TypeError:
+            raise TensorsimError(
+                f"{folder}: got the settings {stated}, expected those of a store of everyday maps"
+            ) from None
 
     @property
     def clips(self) -> int:
@@ -267,16 +283,13 @@ class EverydayStore:
         group: (N,) int64, number of the group; every fifth is held out for validation.
 
     Raises:
-        TensorsimError: no store there, or a group that is missing.
+        TensorsimError: no store of everyday maps there, or a group that is missing.
     """
 
     def __init__(self, folder: Path, groups: Sequence[int] | None = None) -> None:
         from safetensors.torch import load_file
 
-        described = folder / "settings.json"
-        if not described.is_file():
-            raise TensorsimError(f"{folder}: no settings.json, expected a store of everyday maps")
-        self.settings = EverydaySettings(**json.loads(described.read_text(encoding="utf-8")))
+        self.settings = EverydaySettings.read(folder)
         there = sorted(folder.glob("everyday-?????.safetensors"))
         if groups is not None:
             there = [folder / f"everyday-{index:05d}.safetensors" for index in groups]

@@ -162,6 +162,43 @@ def test_real_says_what_is_missing(tmp_path: Path) -> None:
         replace(real.quick_real(), data=str(tmp_path)).sets()
 
 
+def test_folders_are_looked_at_before_anything_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Measured sets that are good do not hide films or maps that are not there."""
+    monkeypatch.setattr(MeasuredSet, "load", lambda *_: (torch.zeros(1), torch.zeros(1)))
+    monkeypatch.setattr(real, "_on_measured", None)
+    others = {name: replace(entry, run=None) for name, entry in EXPERIMENTS.items() if name != "real"}
+    monkeypatch.setattr(catalogue, "EXPERIMENTS", others | {"real": EXPERIMENTS["real"]})
+    data, films, maps = (tmp_path / name for name in ("data", "films", "maps"))
+    (data / SETS[0].name).mkdir(parents=True)
+    films.mkdir()
+    asked = {"data": str(data), "films": str(films)}
+    for change, message in (
+        ({"films": "nowhere"}, "nowhere: got no labels.json"),
+        ({}, "films: got no labels.json"),
+        (
+            {"maps": str(maps)},
+            r"maps: got the settings \{'frames': 3\}, expected those of a store of everyday",
+        ),
+    ):
+        if "maps" in change:
+            monkeypatch.setattr(real, "read_labels", lambda _: [])
+            maps.mkdir()
+            (maps / "settings.json").write_text('{"frames": 3}')
+        with pytest.raises(TensorsimError, match=message):
+            real.real_report(replace(real.quick_real(), **(asked | change)), Work(tmp_path / "work"))
+        config = paper.PaperConfig(quick=True, **(asked | change))
+        with pytest.raises(TensorsimError, match=message):
+            catalogue._paper(config, Work(tmp_path / "work"))
+    (maps / "settings.json").write_text(json.dumps(asdict(EverydaySettings(size=48))))
+    with pytest.raises(TensorsimError, match="size: got 32, expected a divisor of the 48 of the maps in"):
+        real.real_report(
+            replace(real.quick_real(), **asked, maps=str(maps)),
+            Work(tmp_path / "work"),  # type: ignore[arg-type]
+        )
+
+
 @pytest.mark.slow
 def test_real_runs_and_goes_on(tmp_path: Path, shared_data: Path) -> None:
     data = tmp_path / "data"
