@@ -54,6 +54,10 @@ class EvaluateMeasured:
 
         if self.quick and self.ablation:
             raise TensorsimError("--quick cannot be combined with --ablation, which trains networks")
+        for name in ("clips", "steps", "seed"):
+            value, usual = getattr(self, name), getattr(EvaluateMeasured, name)
+            if self.quick and value != usual:
+                raise TensorsimError(f"--{name}: got {value} with --quick, which trains nothing")
         if self.repeats > 1 and not self.ablation:
             raise TensorsimError(f"--repeats: got {self.repeats} without --ablation, expected 1")
 

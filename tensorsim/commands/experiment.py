@@ -71,7 +71,7 @@ class RunExperiment:
     seed: Option[int] = None
     """Random seed of people, motion and noise."""
     jobs: int = 1
-    """Number of processes."""
+    """Number of processes, in `networks`, `snr`, `inputs` and `paper`."""
     settings: Option[str] = None
     """Folder with the NAME.yaml of earlier runs, for `paper`: the sizes of its experiments."""
     quiet: bool = False

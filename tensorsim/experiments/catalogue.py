@@ -23,12 +23,14 @@ class Experiment:
         config: its settings; the defaults are the size of the paper, as far as it says.
         run: (settings, work) -> report.
         quick: settings that finish within three minutes.
+        parallel: whether it takes several processes.
     """
 
     title: str
     config: type
     run: Callable[[Any, Work], Report]
     quick: Callable[[], Any]
+    parallel: bool = False
 
 
 def _paper(config: paper.PaperConfig, work: Work) -> Report:
@@ -76,17 +78,32 @@ EXPERIMENTS: dict[str, Experiment] = {
         networks.NetworksConfig,
         networks.networks_report,
         networks.quick_networks,
+        parallel=True,
     ),
     "snr": Experiment(
-        "Recognisers against noise", networks.NetworksConfig, networks.snr_report, networks.quick_networks
+        "Recognisers against noise",
+        networks.NetworksConfig,
+        networks.snr_report,
+        networks.quick_networks,
+        parallel=True,
     ),
     "inputs": Experiment(
-        "Recognisers by input", networks.InputsConfig, networks.inputs_report, networks.quick_inputs
+        "Recognisers by input",
+        networks.InputsConfig,
+        networks.inputs_report,
+        networks.quick_inputs,
+        parallel=True,
     ),
     "real": Experiment(
         "Recognisers on measured radar and real films", real.RealConfig, real.real_report, real.quick_real
     ),
-    "paper": Experiment("All experiments", paper.PaperConfig, _paper, lambda: paper.PaperConfig(quick=True)),
+    "paper": Experiment(
+        "All experiments",
+        paper.PaperConfig,
+        _paper,
+        lambda: paper.PaperConfig(quick=True),
+        parallel=True,
+    ),
 }
 
 
@@ -106,6 +123,8 @@ def configuration(name: str, quick: bool, file: Path | None, options: dict[str, 
         TensorsimError: unknown names, options that this experiment does not have, values that it refuses.
     """
     experiment = find_experiment(name)
+    if quick and file is not None:
+        raise TensorsimError("--quick, --config: got both, expected one of them")
     document: dict[str, Any] = to_document(experiment.quick() if quick else experiment.config())
     if file is not None:
         read = read_yaml(file)
@@ -118,7 +137,11 @@ def configuration(name: str, quick: bool, file: Path | None, options: dict[str, 
             flag = f"--{option.replace('_', '-')}"
             raise TensorsimError(f"{flag}: {name} has no such setting, expected {', '.join(known)}")
         document[option] = list(value) if isinstance(value, tuple) else value
-    return from_document(name, experiment.config, document)
+    config = from_document(name, experiment.config, document)
+    for option, needed in config.unused().items() if isinstance(config, real.RealConfig) else ():
+        if options.get(option, "") != "":
+            raise TensorsimError(f"--{option.replace('_', '-')}: got it without {needed}, which it is for")
+    return config
 
 
 def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
@@ -129,6 +152,9 @@ def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
     from tensorsim.plot.figure import save_figure
 
     experiment = find_experiment(name)
+    if work.jobs > 1 and not experiment.parallel:
+        names = ", ".join(name for name, entry in EXPERIMENTS.items() if entry.parallel)
+        raise TensorsimError(f"--jobs: got {work.jobs}, expected 1: only {names} take several processes")
     report = experiment.run(config, work)
     with complete_or_nothing(out) as new:
         write_text(new / f"{name}.md", report.markdown(experiment.title))

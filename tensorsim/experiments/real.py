@@ -25,7 +25,7 @@ from tensorsim.experiments.real_films import (
     film_pictures,
     titled,
 )
-from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, check_seed, counted, mean_and_spread
 from tensorsim.files import complete_file, sha256_of
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.registry import shipped_weights
@@ -77,6 +77,7 @@ class RealConfig:
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
             check_count(count, what, least)
+        check_seed(self.seed)
         if len(self.group_clips) != 2:
             raise TensorsimError(
                 f"group_clips: got {list(self.group_clips)}, expected two numbers: of clips as the pipeline finds "
@@ -107,6 +108,16 @@ class RealConfig:
                 f"--data: {self.data} has none of the measured sets, expected some of {names}"
             )
         return found
+
+    def unused(self) -> dict[str, str]:
+        """Settings that count for nothing, and the folder that each is for."""
+        of = {
+            "data": ("clips", "steps", "seeds", "seed"),
+            "films": ("maps", "groups", "group_clips", "film_count", "film_steps", "film_seeds"),
+        }
+        return {
+            name: f"--{folder}" for folder, names in of.items() if not getattr(self, folder) for name in names
+        }
 
     def everyday(self, work: Work) -> EverydayTraining:
         """The trainings for films."""

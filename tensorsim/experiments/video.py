@@ -17,7 +17,7 @@ from tensorsim.evaluation.settings import Pipelines, Setting
 from tensorsim.evaluation.truth import pose_errors
 from tensorsim.experiments import figures
 from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
-from tensorsim.experiments.work import Report, Table, Work, check_scenes
+from tensorsim.experiments.work import Report, Table, Work, check_scenes, check_seed
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import VideoToPose, pretrained_pose
 from tensorsim.radar.presets import PRESETS
@@ -63,6 +63,7 @@ class VideoConfig:
         for name in self.activities:
             activity_index(name)
         check_scenes(self.scenes)
+        check_seed(self.seed)
         if self.clips < 1 or not 0.5 <= self.length_s <= 60:
             raise TensorsimError(
                 f"clips, length_s: got {self.clips} and {self.length_s}, expected at least 1 and from 0.5 to 60 s"

@@ -189,6 +189,8 @@ def test_without_a_test_folder_the_last_clips_of_each_class_are_tested(folders, 
         (("--clips", "0"), "--clips: got 0"),
         (("--quick", "--ablation"), "got both"),
         (("--repeats", "2"), "--repeats: got 2 without --ablation"),
+        (("--quick", "--clips", "20"), "--clips: got 20 with --quick, which trains nothing"),
+        (("--quick", "--seed", "1"), "--seed: got 1 with --quick"),
         (("--train", "nowhere"), "nowhere: no such folder"),
     ],
 )

@@ -176,6 +176,6 @@ def test_an_experiment_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[
         "-trainings.csv",
     ):
         assert (out / f"networks{suffix}").stat().st_size > 0
-    main([*arguments[:4], "--config", str(out / "networks.yaml"), "--out", str(out)])
+    main([*arguments[:2], "--quiet", "--config", str(out / "networks.yaml"), "--out", str(out)])
     assert (out / "networks.md").read_text(encoding="utf-8") == report
     assert "Accuracy on new people at 50 dB" in capsys.readouterr().out

@@ -103,14 +103,28 @@ def test_settings_of_file_and_options(tmp_path: Path) -> None:
         ("real", {"group_clips": (6,)}, r"group_clips: got \[6\], expected two numbers"),
         ("real", {"group_clips": (0, 0)}, "expected positive numbers"),
         ("paper", {"maps": "maps"}, "--maps: got it without --films"),
+        ("real", {"films": "films", "steps": 3}, "--steps: got it without --data, which it is for"),
+        ("real", {"data": "data", "film_seeds": 3}, "--film-seeds: got it without --films"),
+        *(
+            (name, {"seed": seed}, f"seed: got {seed}, expected an integer from 0 to 4294967295")
+            for name in ("video-ablation", "echo-ablation", "denoiser-ablation", "real")
+            for seed in (-1, 10**30)
+        ),
         ("inputs", {"inputs": ()}, "inputs: got none"),
         ("video-ablation", {"scenes": ()}, "scenes: got none"),
         ("real", {"size": 40}, "size: got 40, expected a multiple of 16"),
     ):
         with pytest.raises(TensorsimError, match=message):
             configuration(name, False, None, options)
+    with pytest.raises(TensorsimError, match="--quick, --config: got both"):
+        configuration("networks", True, file, {})
     with pytest.raises(TensorsimError, match="settings of another experiment"):
         configuration("snr", False, file, {})
+
+
+def test_several_processes_are_for_those_that_take_them(tmp_path: Path) -> None:
+    with pytest.raises(TensorsimError, match="--jobs: got 2, expected 1: only networks, snr, inputs, paper"):
+        run_experiment("echo-ablation", tmp_path / "out", EchoConfig(), Work(tmp_path, jobs=2))
 
 
 def test_report_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
