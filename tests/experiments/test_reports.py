@@ -226,7 +226,7 @@ def test_another_version_simulates_anew(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(MeasuredSet, "simulate", simulate)
     monkeypatch.setattr(real_films.EverydayTraining, "digest", property(films))
-    monkeypatch.setattr(real, "film_pictures", lambda *_: [real_films.FilmPictures((), {})])
+    monkeypatch.setattr(real, "film_pictures", lambda *_: [real_films.FilmPictures(("S8 Walking",), {})])
     monkeypatch.setattr(real, "read_labels", lambda _: [])
     monkeypatch.setattr(real, "film_accuracy", lambda *_: dict.fromkeys(SHARES, 0.5))
     config, work = replace(real.quick_real(), films="films", networks=("ccln",)), Work(tmp_path, quiet=True)
@@ -236,6 +236,26 @@ def test_another_version_simulates_anew(tmp_path: Path, monkeypatch: pytest.Monk
         real.real_report(config, work)
     clips, maps = [x for x in made if x == "4 0"], [x for x in made if x != "4 0"]
     assert (len(clips), len(maps), len(set(maps))) == (2, 3, 2)
+
+
+def test_reports_say_what_the_best_constant_answer_would_get(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kicks, falls, both = ("S3 Kicking",), ("S12 Walking to Falling",), ("S3 Kicking", "S8 Walking")
+    assert real.best_constant([kicks, falls, kicks, both]) == ("S3 Kicking", 0.75)
+    labels = torch.tensor([0] + [2] * 3)
+    monkeypatch.setattr(MeasuredSet, "load", lambda *_: (torch.zeros(4, 1, 8, 8), labels))
+    monkeypatch.setattr(real, "_trained_and_tested", lambda *_: {"accuracy": 0.5})
+    monkeypatch.setattr(real, "film_pictures", lambda *_: [real_films.FilmPictures(both, {})] * 4)
+    monkeypatch.setattr(real, "read_labels", lambda _: [])
+    monkeypatch.setattr(real_films.EverydayTraining, "digest", "digest")
+    monkeypatch.setattr(real, "film_accuracy", lambda *_: dict.fromkeys(SHARES, 0.5))
+    (tmp_path / SETS[2].name).mkdir()
+    config = replace(real.quick_real(), data=str(tmp_path), films="films", networks=("ccln",))
+    measured, filmed = real.real_report(config, Work(tmp_path / "work", quiet=True)).notes
+    assert f"radhar_points 20 % and 75 % ({SETS[2].classes[2]})" in measured
+    assert "development figures" in measured
+    assert "at random is right in 17 %, and always S3 Kicking, the best constant answer, in 100.0 %" in filmed
 
 
 def everyday_store(folder: Path, groups: int) -> None:
@@ -429,6 +449,7 @@ def test_the_paper_takes_the_settings_of_earlier_runs(
 
     entries = {name: recorded(name) if name != "paper" else EXPERIMENTS[name] for name in EXPERIMENTS}
     monkeypatch.setattr(catalogue, "EXPERIMENTS", entries)
+    monkeypatch.setattr(real.RealConfig, "check", lambda *_: None)
     (tmp_path / "echo-ablation.yaml").write_text("experiment: echo-ablation\nclips: 3\nseed: 0\n")
     (tmp_path / "real.yaml").write_text("experiment: real\ndata: elsewhere\nmaps: elsewhere\nclips: 7\n")
     config = paper.PaperConfig(settings=str(tmp_path), data="measured")
