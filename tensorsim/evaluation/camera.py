@@ -12,7 +12,7 @@ from tensorsim.config import CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.camera import camera_to_world
 from tensorsim.motion.activities import ActivityGenerator
-from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate
+from tensorsim.vision.calibration.calibrator import CameraCalibrator, CameraEstimate, with_reserve
 from tensorsim.vision.calibration.camera_fit import camera_axes, place_upright
 from tensorsim.vision.calibration.upright import STANDING, WALKING, ends_of_body, is_upright, walking_share
 
@@ -111,13 +111,18 @@ def _seen_by(camera: CameraConfig, joints: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def estimate(walk: Walk, noise_px: float, known_height: bool, seed: int = 0) -> CameraEstimate:
-    """The camera told from the key points of a walk with normal errors of ``noise_px``."""
+    """The camera told from the key points of a walk with normal errors of ``noise_px``, before :func:`used`."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(walk.keypoints.shape, generator=generator, dtype=torch.float64)
     keypoints = walk.keypoints + noise_px * noise
     calibrator = CameraCalibrator((walk.height_m,), 0.02) if known_height else CameraCalibrator()
     valid = walk.scores.any(dim=-1)
     return calibrator(keypoints[None], walk.scores[None], valid[None], HEIGHT, WIDTH, FPS)
+
+
+def used(told: CameraEstimate) -> CameraEstimate:
+    """What the pipeline takes of an estimate: less of a tilt that is uncertain."""
+    return with_reserve(told, HEIGHT, WIDTH)
 
 
 def errors_of(found: CameraEstimate, camera: CameraConfig, walk: Walk) -> CameraErrors:
