@@ -4,7 +4,6 @@
 happens, and the activities that count as right (``accept``).
 """
 
-import hashlib
 import json
 import math
 from collections import Counter
@@ -18,10 +17,11 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import ACTIVITIES, RadarConfig
+from tensorsim.config.documents import digest
 from tensorsim.data.video import VideoReader
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.film_variants import Observed, over_variants
-from tensorsim.files import complete_file
+from tensorsim.files import complete_file, sha256_of, sha256_of_arrays
 from tensorsim.pipeline import PoseToDoppler, VideoToPose, warn_of_empty_clips
 from tensorsim.recognition import ActivityRecognizer
 from tensorsim.streaming import (
@@ -152,7 +152,7 @@ class FilmReader:
     """Finds the people of films; what the networks gave is kept in a folder and used again.
 
     Detections are kept by film, cut and detector, key points by these, the tracks and the pose network, networks by
-    their file and what runs them; tracking, lifting and smoothing run anew.
+    their file and what runs them, and all by the version of this package; tracking, lifting and smoothing run anew.
 
     Args:
         stage: with the networks.
@@ -173,7 +173,7 @@ class FilmReader:
         self.stage, self.cache, self.stride, self.calibrate = stage, cache, stride, calibrate
         # The names of their parts say what runs the networks, and whether the pose network sees mirror images.
         self.detector, self.pose = (
-            _digest(path.read_bytes(), repr(network).encode())
+            digest([sha256_of(path), repr(network)])
             for path, network in zip(networks, (stage.detector, stage.pose), strict=True)
         )
 
@@ -200,7 +200,7 @@ class FilmReader:
         """
         stage = self.stage
         cut = f"{film.start_s} {film.end_s} {self.stride} {stage.interval_at(reader.fps)} with times"
-        key = _digest(film.path.read_bytes(), cut.encode(), self.detector.encode())
+        key = digest([sha256_of(film.path), cut, self.detector])
 
         def detect() -> tuple[Tensor, ...]:
             found, looked = detections_of_film(stage, reader, device, quiet)
@@ -210,8 +210,7 @@ class FilmReader:
         *detections, observed, times_s = self._kept(f"detections-{key}", detect)
         reader.uneven_times_s = times_s if times_s.numel() else None
         tracks = stage.follow(Detections(*(part.to(device) for part in detections)), observed.to(device))
-        boxes = tracks.boxes.cpu().numpy().tobytes()
-        key = _digest(key.encode(), self.pose.encode(), boxes)
+        key = digest([key, self.pose, sha256_of_arrays(tracks.boxes.cpu().numpy())])
 
         def estimate() -> tuple[Tensor, ...]:
             background = BackgroundMotion(reader.fps)
@@ -261,10 +260,6 @@ class FilmReader:
         with complete_file(path) as scratch, scratch.open("wb") as file:
             np.savez(file, *(tensor.numpy() for tensor in made))
         return made
-
-
-def _digest(*parts: bytes) -> str:
-    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:20]
 
 
 def judged(

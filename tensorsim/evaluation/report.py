@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tensorsim.config import ACTIVITIES
 from tensorsim.evaluation.scores import FIGURES, MAPS
 from tensorsim.evaluation.settings import SOURCES
 from tensorsim.files import complete_file
@@ -21,6 +22,15 @@ HEADINGS = {
     "nmse": "NMSE",
     "envelope_m_s": "envelope RMSE m/s",
 }
+#: Errors of the joints of a cell, with their names in the tables.
+POSE = {
+    "followed": "frames followed, share",
+    "root": "hips, rms m",
+    "joints": "joints about the hips, mean m",
+    "range": "of these along y, rms m",
+}
+#: The row with nobody in it: what is exactly right there has an infinite PSNR, and what is not has any.
+EMPTY = ACTIVITIES[0]
 Cells = list[dict[str, Any]]
 
 
@@ -39,15 +49,18 @@ def figure_of(cells: Cells, scene: str, name: str, figure: str) -> float:
 
 
 def write_csv(path: Path, cells: Cells) -> None:
-    """One line per clip, setting, scene and map."""
+    """One line per clip, setting, scene and map; the errors of the joints are those of all its scenes and maps."""
     with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["row", "clip", "setting", "scene", "map", *FIGURES])
+        errors = ("people", *POSE)
+        writer.writerow(["row", "clip", "setting", "scene", "map", *FIGURES, *errors])
         for cell in cells:
+            posed = [cell["pose"].get(error, math.nan) for error in errors]
             for scene, maps in cell["scores"].items():
                 for name, figures in maps.items():
                     values = [figures.get(f, math.nan) for f in FIGURES]
-                    writer.writerow([cell["row"], cell["clip"], cell["setting"], scene, name, *values])
+                    place = [cell["row"], cell["clip"], cell["setting"], scene, name]
+                    writer.writerow([*place, *values, *posed])
 
 
 def _text(value: float, figure: str) -> str:
@@ -64,7 +77,7 @@ def _table(heads: list[str], lines: list[list[str]]) -> list[str]:
 
 
 def markdown(cells: Cells) -> str:
-    """Tables for whole pipelines, for pipelines with one true stage, and for the errors of joints."""
+    """Tables for whole pipelines, pipelines with one true stage, errors of joints, and people who are not there."""
     rows = list(dict.fromkeys(c["row"] for c in cells))
     names = list(dict.fromkeys(c["setting"] for c in cells))
     scenes = list(dict.fromkeys(scene for c in cells for scene in c["scores"]))
@@ -75,16 +88,15 @@ def markdown(cells: Cells) -> str:
         return [c for c in cells if c["setting"] == setting and (row is None or c["row"] == row)]
 
     def overall(setting: str, scene: str, name: str, figure: str) -> float:
-        """Mean of the rows' means, so that rows have equal weight; without rows that are exactly right."""
-        unequal = [row for row in rows if figure_of(chosen(setting, row), scene, name, "psnr") < math.inf]
-        return mean(figure_of(chosen(setting, row), scene, name, figure) for row in unequal)
+        """Mean of the means of the rows with somebody in them, so that rows have equal weight."""
+        return mean(figure_of(chosen(setting, row), scene, name, figure) for row in rows if row != EMPTY)
 
     text = ["# Truth loop", ""]
     text += ["Settings: " + "; ".join(f"**{k}** {v}" for k, v in SOURCES.items()) + ".", ""]
     text += [
         "Each map is scaled by its own peak and compared with that of the true motion at every pulse, without noise, "
-        "shift or fit. Rows whose maps are equal (nobody there, nobody found) are not part of means, nor is an "
-        "infinite NMSE (somebody found where nobody is).",
+        f"shift or fit. {EMPTY} is not part of means, for any setting; people who are found in it are counted. Nor is "
+        "the infinite PSNR of a map that is exactly right.",
         "",
         *_left_out(cells, names, scenes),
     ]
@@ -121,9 +133,17 @@ def markdown(cells: Cells) -> str:
     posed = [n for n in names if any(c["pose"].get("root") is not None for c in chosen(n))]
     if posed:
         text += [
-            "## Errors of the joints at the frame rate, mean of rows",
+            "## Errors of the joints at the frame rate, in the frames in which somebody is followed, mean of rows",
             "",
             *_pose_table(cells, rows, posed),
+        ]
+    ghosts = {n: mean(c["pose"].get("people", math.nan) for c in chosen(n, EMPTY)) for n in names}
+    if EMPTY in rows:
+        found = {n: f"{people:.2f}" for n, people in ghosts.items() if not math.isnan(people)}
+        text += [
+            f"## People found per clip of {EMPTY}",
+            "",
+            *_table(["", *found], [["people", *found.values()]]),
         ]
     return "\n".join(text)
 
@@ -148,19 +168,13 @@ def _left_out(cells: Cells, names: list[str], scenes: list[str]) -> list[str]:
 
 
 def _pose_table(cells: Cells, rows: list[str], settings: list[str]) -> list[str]:
-    keys = {
-        "root": "hips, rms m",
-        "joints": "joints about the hips, mean m",
-        "range": "of these along y, rms m",
-    }
-
     def pose_mean(setting: str, key: str) -> float:
         return mean(
             mean(c["pose"].get(key, math.nan) for c in cells if c["setting"] == setting and c["row"] == row)
             for row in rows
         )
 
-    lines = [[label, *(f"{pose_mean(n, key):.3f}" for n in settings)] for key, label in keys.items()]
+    lines = [[label, *(f"{pose_mean(n, key):.3f}" for n in settings)] for key, label in POSE.items()]
     return _table(["error", *settings], lines)
 
 

@@ -12,12 +12,15 @@ from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import Clip
 from tensorsim.evaluation.films import CAMERA, FPS, Filmed, Observed, project, true_keypoints
 from tensorsim.evaluation.scores import Maps
+from tensorsim.model_files import manifest
 from tensorsim.motion.scatterers import visibility_fade
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.pipeline.networks import pretrained_lifter
+from tensorsim.registry import shipped_weights
 from tensorsim.types import Lifted
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.pose_library import SHIPPED_LIBRARY
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
@@ -58,6 +61,12 @@ class Setting:
             + ("-paper" if self.paper else "")
             + (f"+{self.true_stage}" if self.true_stage else "")
         )
+
+
+def lifting_files() -> dict[str, str]:
+    """Digests of the shipped files by which key points are lifted: weights, and the poses of nearest matching."""
+    poses = {entry["name"]: entry["sha256"] for entry in manifest() if entry["file"] == SHIPPED_LIBRARY}
+    return shipped_weights("TemporalLifter") | poses
 
 
 def true_lifting(clip: Clip) -> Lifted:

@@ -1,6 +1,5 @@
 """The truth loop: maps of every setting against those of the true motion, clip by clip, resumable."""
 
-import hashlib
 import json
 import time
 import warnings
@@ -23,11 +22,10 @@ from tensorsim.errors import TensorsimError, TensorsimWarning, check_count
 from tensorsim.evaluation.clips import CapturedClip, Clip, activity_clips, captured_clips
 from tensorsim.evaluation.films import FPS, Filmed, filmed
 from tensorsim.evaluation.scores import Maps, compare, mean_maps
-from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting
+from tensorsim.evaluation.settings import SOURCES, STAGES, Pipelines, Setting, lifting_files
 from tensorsim.files import write_text
 from tensorsim.process import end_with_parent
 from tensorsim.radar.presets import PRESETS
-from tensorsim.registry import shipped_weights
 
 #: Trivial guesses as a baseline: an empty map; the mean of the row's other clips; another clip of the row.
 GUESSES = ("empty", "mean", "shuffled")
@@ -155,7 +153,7 @@ class TruthLoop:
         if setting in GUESSES:  # made of the other clips
             options |= {"clips": self.clips, "seed": self.seed}
         else:
-            options |= {"lifter": self.lifter, "weights": shipped_weights("TemporalLifter")}
+            options |= {"lifter": self.lifter, "weights": lifting_files()}
         if isinstance(clip, CapturedClip):
             options |= {"source": clip.source}
         if setting.startswith("c"):
@@ -165,7 +163,7 @@ class TruthLoop:
     def film(self, clip: Clip) -> Path:
         """File of the results of the networks on a clip."""
         source = clip.source if isinstance(clip, CapturedClip) else ""
-        key = _key([source, self._networks()])
+        key = digest([source, self._networks()])
         return self.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{key}.npz"
 
     def _networks(self) -> list[tuple[str, int]]:
@@ -176,10 +174,6 @@ class TruthLoop:
     def read_cells(self) -> list[dict[str, Any]]:
         """All existing cells, each a dictionary of row, clip, setting, scores by scene, pose errors."""
         return [json.loads(path.read_text("utf-8")) for path in self._cell_paths() if path.is_file()]
-
-
-def _key(options: Any) -> str:
-    return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _plain(name: str) -> str:
@@ -304,19 +298,24 @@ class _Truths:
 
 
 def pose_errors(joints: Tensor, valid: Tensor, clip: Clip) -> dict[str, float]:
-    """Errors of joints (P, T, 14, 3) in metres, for the person followed longest.
+    """Errors of joints (P, T, 14, 3) in metres, for the person followed longest, in the frames in which they are.
 
-    ``root`` is the rms distance of the middle of the hips, ``joints`` the mean distance of the joints after aligning
-    the hips, ``range`` the rms error along y of the joints after that; ``people`` the number of people.
+    ``followed`` is the share of these frames, ``root`` the rms distance of the middle of the hips, ``joints`` the mean
+    distance of the joints after aligning the hips, ``range`` the rms error along y of the joints after that; ``people``
+    the number of people. Where nobody is followed there are no errors.
     """
     errors = {"people": float(joints.shape[0])}
-    if joints.shape[0] == 0 or not clip.present:
+    if not clip.present:
         return errors
+    if not bool(valid.any()):
+        return errors | {"followed": 0.0}
     one = int(valid.sum(dim=-1).argmax())
-    found, truth = joints[one].double(), clip.joints(FPS)
+    there = valid[one]
+    found, truth = joints[one, there].double(), clip.joints(FPS)[there]
     root = (mid_hips(found) - mid_hips(truth)).norm(dim=-1)
     local = (found - mid_hips(found)[:, None]) - (truth - mid_hips(truth)[:, None])
     return errors | {
+        "followed": float(there.double().mean()),
         "root": float(root.square().mean().sqrt()),
         "joints": float(local.norm(dim=-1).mean()),
         "range": float(local[..., 1].square().mean().sqrt()),

@@ -12,8 +12,9 @@ from tqdm import tqdm
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.evaluation.clips import ActivityClip, activity_clips
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Observed
+from tensorsim.evaluation.report import EMPTY
 from tensorsim.evaluation.scores import MAPS, Maps, compare
-from tensorsim.evaluation.settings import Pipelines, Setting
+from tensorsim.evaluation.settings import Pipelines, Setting, lifting_files
 from tensorsim.evaluation.truth import pose_errors
 from tensorsim.experiments import figures
 from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
@@ -156,7 +157,7 @@ def video_report(config: VideoConfig, work: Work) -> Report:
     pipelines = Pipelines({scene: PRESETS[scene] for scene in config.scenes})
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
     jobs = [(row, k) for row in rows for k in range(config.clips)]
-    weights = shipped_weights("RTMDet", "HRNet", "AcfDetector", "CPM", "VideoPose3D", "TemporalLifter")
+    weights = shipped_weights("RTMDet", "HRNet", "AcfDetector", "CPM", "VideoPose3D") | lifting_files()
     for row, k in tqdm(jobs, desc="films", unit="film", disable=work.quiet):
         clip, other = rows[row][k], rows[row][k + 1]
 
@@ -221,8 +222,9 @@ def _report(
         return mean([c["scores"][scene][view]["psnr"] for c in cells.get((row, name), ())])
 
     keys = [(scene, view) for scene in config.scenes for view in MAPS]
+    somebody = [row for row in rows if row != EMPTY]
     means = {
-        (name, s, view): mean([psnr(row, name, s, view) for row in rows])
+        (name, s, view): mean([psnr(row, name, s, view) for row in somebody])
         for name in names
         for s, view in keys
     }
@@ -239,11 +241,12 @@ def _report(
     errors = []
     for name in watcher.chains:
         poses = [c["pose"] for row in rows for c in cells.get((row, name), ())]
-        errors.append([name, *(mean([pose.get(key, nan) for pose in poses]) for key in _ERRORS)])
+        ghosts = mean([c["pose"]["people"] for c in cells.get((EMPTY, name), ())])
+        errors.append([name, *(mean([pose.get(key, nan) for pose in poses]) for key in _ERRORS), ghosts])
     tables.append(
         Table(
-            "Errors of the joints in metres, and people found",
-            ["chain", *_ERRORS.values()],
+            "Errors of the joints in metres where somebody is followed, and people found",
+            ["chain", *_ERRORS.values(), f"people found in {EMPTY}"],
             errors,
             3,
             "joints",
@@ -255,7 +258,8 @@ def _report(
         "HRNet learnt from, but for a tenth as long, VideoPose3D from the motion that the TemporalLifter learnt from "
         "(their cards have the figures). The paper films real people and compares with measured maps; its "
         "films and maps are not published.",
-        "Where a chain finds motion that is too fast for the pulse rate of a scene, its map counts as empty.",
+        f"{EMPTY} is not part of means, for any chain; the last table has the people found in it. Where a chain finds "
+        "motion that is too fast for the pulse rate of a scene, its map counts as empty.",
         *(f"Left out: **{row}** ({why})." for row, why in watcher.missing.items()),
         NORMALISATION,
     ]
@@ -269,6 +273,7 @@ _ERRORS = {
     "root": "hips, rms",
     "joints": "joints about the hips, mean",
     "range": "of these along y, rms",
+    "followed": "frames followed, share",
     "people": "people",
 }
 

@@ -237,6 +237,24 @@ def test_guesses_fit_the_clip_they_are_compared_with() -> None:
 # ---- the loop --------------------------------------------------------------------------------------------
 
 
+def test_errors_of_joints_are_those_of_the_frames_in_which_somebody_is_followed() -> None:
+    clip = walk()
+    found = clip.joints(FPS)[None].clone()
+    found[0, :20, :, 0] += 0.1
+    found[0, 20:] += 5.0  # what the smoother makes of frames without a person
+    valid = torch.ones(1, 30, dtype=torch.bool)
+    valid[0, 20:] = False
+    errors = truth.pose_errors(found, valid, clip)
+    assert errors["followed"] == pytest.approx(2 / 3)
+    assert errors["root"] == pytest.approx(0.1)
+    assert errors["joints"] == pytest.approx(0.0, abs=1e-9)
+    nobody = truth.pose_errors(found[:0], valid[:0], clip)
+    assert nobody == truth.pose_errors(found, valid & False, clip) | {"people": 0.0}
+    assert nobody == {"people": 0.0, "followed": 0.0}
+    empty = ActivityClip("S1 Empty", "0", 0, 1.0)
+    assert truth.pose_errors(found, valid, empty) == {"people": 1.0}
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[truth.TruthLoop, list[dict[str, object]]]:
     out = tmp_path_factory.mktemp("loop")
@@ -303,19 +321,33 @@ def test_tables_say_what_the_cells_say(
     assert "## b with one stage replaced by the truth" in text
 
 
-def test_tables_count_what_is_left_out_and_show_the_worst_as_it_is() -> None:
-    """Somebody found in an empty room has an infinite NMSE, which is not that of equal maps."""
-    figures = dict.fromkeys(FIGURES, 1.0)
-    ghost = {name: figures | {"nmse": math.inf} for name in MAPS}
+def test_tables_count_what_is_left_out_and_leave_empty_scenes_out_for_everybody(tmp_path: Path) -> None:
+    """Somebody found in an empty room does not raise the mean of a setting above that of one that is right there."""
+
+    def cell(row: str, clip: str, setting: str, psnr: float | None, people: float) -> dict[str, object]:
+        figures = dict.fromkeys(FIGURES, 1.0) | {"psnr": psnr}
+        scores = {} if psnr is None else {SCENE: dict.fromkeys(MAPS, figures)}
+        return {"row": row, "clip": clip, "setting": setting, "scores": scores, "pose": {"people": people}}
+
     cells = [
-        {"row": "S1 Empty", "clip": "0", "setting": "a", "scores": {SCENE: ghost}, "pose": {}},
-        {"row": "S1 Empty", "clip": "0", "setting": "b", "scores": {}, "pose": {}},
-        {"row": "S1 Empty", "clip": "1", "setting": "b", "scores": {SCENE: ghost}, "pose": {}},
+        cell("S1 Empty", "0", "a", math.inf, 0.0),
+        cell("S1 Empty", "0", "b", 60.0, 1.0),
+        cell("S1 Empty", "1", "b", math.inf, 0.0),
+        cell("S8 Walking", "0", "a", 20.0, 1.0),
+        cell("S8 Walking", "0", "b", 20.0, 1.0),
+        cell("S8 Walking", "1", "b", None, 1.0),
     ]
     text = report.markdown(cells)
-    assert "equal |" not in text
-    assert "| NMSE | inf | inf |" in text
-    assert f"Clips left out, whose motion the radar cannot follow: b, {SCENE}: 1 of 2." in text
+    assert "| S1 Empty | equal | 60.0 |" in text
+    assert "| **mean** | 20.0 | 20.0 |" in text
+    assert "## People found per clip of S1 Empty" in text
+    assert "| people | 0.00 | 0.50 |" in text
+    report.write_csv(tmp_path / "truth.csv", cells)
+    with (tmp_path / "truth.csv").open() as file:
+        assert [line["people"] for line in csv.DictReader(file) if line["map"] == "range_time"] == [
+            "0.0", "1.0", "0.0", "1.0", "1.0",
+        ]  # fmt: skip
+    assert f"Clips left out, whose motion the radar cannot follow: b, {SCENE}: 1 of 4." in text
 
 
 def test_the_picture_shows_truth_and_guess_side_by_side(
@@ -415,8 +447,11 @@ def test_files_of_cells_and_films_tell_networks_and_frame_rates_apart(tmp_path: 
 def test_cells_of_other_lifter_weights_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loop, clip = truth.TruthLoop(tmp_path), walk()
     before = loop.cell("row", clip, "b")
-    monkeypatch.setattr(truth, "shipped_weights", lambda *_: {"temporal_lifter_small": "0"})
-    assert loop.cell("row", clip, "b") != before
+    files = settings.lifting_files()
+    assert "pose_library_small" in files
+    for name in files:
+        monkeypatch.setattr(truth, "lifting_files", lambda name=name: files | {name: "0"})
+        assert loop.cell("row", clip, "b") != before
 
 
 def test_cells_of_another_version_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -424,6 +459,13 @@ def test_cells_of_another_version_are_made_anew(tmp_path: Path, monkeypatch: pyt
     before = [loop.cell("row", clip, name) for name in ("b", "mean")]
     monkeypatch.setattr("tensorsim.config.documents.version", lambda _: "99.0")
     assert not {loop.cell("row", clip, name) for name in ("b", "mean")} & set(before)
+
+
+def test_films_of_another_version_are_watched_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, clip = truth.TruthLoop(tmp_path), walk()
+    before = loop.film(clip)
+    monkeypatch.setattr("tensorsim.config.documents.version", lambda _: "99.0")
+    assert loop.film(clip) != before
 
 
 def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
