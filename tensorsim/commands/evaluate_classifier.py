@@ -1,16 +1,17 @@
 """``tensorsim evaluate classifier``: accuracy on generated people, against noise, and on poses from films."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
-from tensorsim.files import write_text
+from tensorsim.exceptions import TensorsimError, check_count, check_distinct
+from tensorsim.files import check_folder, write_text
 
 if TYPE_CHECKING:
+    from tensorsim.recognition import ActivityRecognizer
     from tensorsim.training.film_maps import LabelledPose
 
 
@@ -19,9 +20,9 @@ class EvaluateClassifier:
     """Print accuracy against signal-to-noise ratio, and confusion matrices at the lowest and highest ratio."""
 
     weights: Path
-    """Weights of SPNet or SPGNet (.safetensors)."""
+    """Weights of SPNet or SPGNet (.safetensors); both ways round are averaged where they state so."""
     maps: Option[Path] = None
-    """Folder of maps; missing ones are made first."""
+    """Folder of maps; missing ones are made first, in 224 pixels or the size of the network's pictures."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Scenes to evaluate on."""
     people: int = 40
@@ -47,60 +48,87 @@ class EvaluateClassifier:
             raise TensorsimError(
                 "evaluate classifier: got nothing to classify, expected --maps, --films or --poses"
             )
-        if len(self.snr) == 0:
-            raise TensorsimError("--snr: got no ratios, expected at least one")
         check_seed(self.maps_seed, "--maps-seed")
+        check_count(self.people, "--people", 5 if self.held_out else 1)
+        check_count(len(self.scenes), "--scenes")
+        check_distinct(self.scenes, "--scenes")
+        if self.maps is not None:
+            check_folder(self.maps, "--maps")
+        if self.out is not None:
+            check_folder(self.out)
+        from tensorsim.training.classifier import check_ratios
         from tensorsim.training.film_maps import film_poses, labelled_poses
 
+        check_ratios(self.snr, "--snr")
+        recognizer = self._recognizer()
         if self.maps is not None:
-            self._on_maps()
+            self._on_maps(recognizer)
         if self.films is not None:
             self._on_films(film_poses(self.films))
         if self.poses is not None:
             self._on_films(labelled_poses(self.poses))
 
-    def _on_maps(self) -> None:
+    def _recognizer(self) -> "ActivityRecognizer":
+        """The network with what its file states of its pictures, which must be those of the maps."""
+        from tensorsim.config import ACTIVITIES, RadarConfig
+        from tensorsim.recognition import ActivityRecognizer
+        from tensorsim.training.classifier import RANGE_DB
+        from tensorsim.training.maps import MapSettings
+
+        found = ActivityRecognizer.from_pretrained(RadarConfig(), self.weights)
+        needed: dict[str, Any] = {"class_names": ACTIVITIES}
+        if self.maps is not None:
+            needed |= {"inputs": "doppler", "speed_m_s": MapSettings().speed_m_s, "range_db": RANGE_DB}
+        for name, expected in needed.items():
+            if getattr(found, name) != expected:
+                raise TensorsimError(
+                    f"{self.weights}: {name}: got {getattr(found, name)}, expected {expected}"
+                )
+        return found
+
+    def _on_maps(self, recognizer: "ActivityRecognizer") -> None:
         import torch
 
         from tensorsim import plot
         from tensorsim.config import ACTIVITIES
         from tensorsim.recognition.confusion import confusion
-        from tensorsim.recognition.recognizer import stored_classifier
         from tensorsim.training.classifier import clips_of, logits_of
         from tensorsim.training.maps import MapSettings, MapStore, build_maps
 
         assert self.maps is not None
-        network, stated = stored_classifier(self.weights)
-        size = int(stated["size"])
+        network, size, either_way = recognizer.network, recognizer.size, recognizer.either_way
         settings = MapSettings(seed=self.maps_seed)
+        if settings.size % size:
+            settings = replace(settings, size=size)
         build_maps(self.maps, self.people, self.scenes, settings, quiet=self.quiet)
         store = MapStore(self.maps)
-        print(f"{'scene':14s}" + "".join(f"{ratio:8.0f} dB" for ratio in self.snr) + "   clips")
+        print(f"{'scene':14s}" + "".join(f"{ratio:8g} dB" for ratio in self.snr) + "   clips")
         matrices = {}
         for scene in self.scenes:
             clips = clips_of(store, (scene,), self.people, validation=True if self.held_out else None)
             row, labels = [], torch.tensor([clip.activity for clip in clips])
             for ratio in self.snr:
-                counts = confusion(logits_of(network, store, clips, (ratio, ratio), size), labels)
+                logits = logits_of(network, store, clips, (ratio, ratio), size, either_way=either_way)
+                counts = confusion(logits, labels)
                 row.append(float(counts.diagonal().sum()) / len(clips))
                 matrices[scene, ratio] = counts.numpy()
             print(f"{scene:14s}" + "".join(f"{100 * a:9.1f} %" for a in row) + f"{len(clips):8d}", flush=True)
         names = [name.split(" ")[0] for name in ACTIVITIES]
         for (scene, ratio), matrix in matrices.items():
             if ratio in (min(self.snr), max(self.snr)):
-                print(f"\n{scene}, {ratio:.0f} dB: true class in rows, predicted in columns")
+                print(f"\n{scene}, {ratio:g} dB: true class in rows, predicted in columns")
                 print("     " + "".join(f"{name:>5s}" for name in names))
                 for name, numbers in zip(names, matrix, strict=True):
                     print(f"{name:5s}" + "".join(f"{n:5d}" for n in numbers))
             if self.out is not None:
-                stem = self.out / f"confusion_{scene}_{ratio:.0f}dB"
+                stem = f"confusion_{scene}_{ratio:g}dB"
                 lines = [",".join(["", *names])]
                 lines += [
                     ",".join([name, *map(str, numbers)]) for name, numbers in zip(names, matrix, strict=True)
                 ]
-                write_text(stem.with_suffix(".csv"), "\n".join(lines) + "\n")
-                figure = plot.confusion_figure(matrix, names, f"{scene}, {ratio:.0f} dB")
-                plot.save_figure(figure, stem.with_suffix(".png"))
+                write_text(self.out / f"{stem}.csv", "\n".join(lines) + "\n")
+                figure = plot.confusion_figure(matrix, names, f"{scene}, {ratio:g} dB")
+                plot.save_figure(figure, self.out / f"{stem}.png")
 
     def _on_films(self, poses: "list[LabelledPose]") -> None:
         from tensorsim.training.film_maps import classify_poses

@@ -256,8 +256,12 @@ def logits_of(
     snr_db: tuple[float, float],
     size: int,
     batch: int = 64,
+    either_way: bool = False,
 ) -> Tensor:
-    """Logits (N, classes) of N clips, on the CPU. Clip k has the k-th draw of the ratios for every network."""
+    """Logits (N, classes) of N clips, on the CPU. Clip k has the k-th draw of the ratios for every network.
+
+    ``either_way`` takes the mean over both ways round, as :class:`~tensorsim.recognition.ActivityRecognizer` does.
+    """
     parameter = next(net.parameters())
     found = []
     for first in range(0, len(clips), batch):
@@ -266,5 +270,6 @@ def logits_of(
             for k, clip in enumerate(clips[first : first + batch])
         ]
         x = torch.stack(pictures).to(parameter, memory_format=torch.channels_last)
-        found.append(net(x).float().cpu())
+        logits = 0.5 * (net(x) + net(x.flip(-2))) if either_way else net(x)
+        found.append(logits.float().cpu())
     return torch.cat(found)

@@ -16,9 +16,12 @@ from tensorsim.enhance.dncnn import DnCNN
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.recognition.spgnet import SPGNet
+from tensorsim.registry import locate
+from tensorsim.training import classifier
+from tensorsim.training.classifier import clips_of, logits_of
 from tensorsim.training.denoiser_scores import COLUMNS
 from tensorsim.training.film_maps import classify_poses, labelled_poses
-from tensorsim.training.maps import MapSettings
+from tensorsim.training.maps import MapSettings, MapStore
 from tensorsim.weights import save_weights
 
 
@@ -63,6 +66,144 @@ def test_classifier_on_maps(weights: Path, tmp_path: Path, capsys: pytest.Captur
         assert rows[0][1:] == [f"S{k}" for k in range(1, 13)]
         assert all([int(n) for n in row[1:]] == [0] * 8 + [2] + [0] * 3 for row in rows[1:])
         assert (tmp_path / "out" / f"confusion_through-wall_{ratio}dB.png").stat().st_size > 1000
+
+
+def small_store(folder: Path, size: int, people: int = 1) -> None:
+    """Pictures in which everybody comes: their upper half, of positive speeds, is bright."""
+    folder.mkdir()
+    (folder / "settings.json").write_text(json.dumps(asdict(MapSettings(seed=1, size=size))))
+    signal = torch.zeros(12, size, size, dtype=torch.uint8)
+    signal[:, size // 2 :] = 255
+    for person in range(people):
+        content = {
+            "signal": signal,
+            "cross": torch.zeros(12, size, size, dtype=torch.int8),
+            "noise": torch.full((size, size), 255, dtype=torch.uint8),
+            "gain_db": torch.zeros(12),
+        }
+        save_file(content, folder / f"through-wall-{person:05d}.safetensors")
+
+
+def test_a_store_has_the_size_that_the_weights_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shipped SPNet takes 64 pixels, of which 224 is no multiple."""
+    from tensorsim.training import maps
+
+    made: list[MapSettings] = []
+
+    def build(folder: Path, people: int, scenes: object, settings: MapSettings, quiet: bool) -> None:
+        made.append(settings)
+        small_store(folder, settings.size)
+
+    monkeypatch.setattr(maps, "build_maps", build)
+    EvaluateClassifier(
+        locate("spnet-activities"), tmp_path / "maps", ("through-wall",), people=1, snr=(50.0,), quiet=True
+    ).run()
+    assert [settings.size for settings in made] == [64]
+    assert capsys.readouterr().out.splitlines()[1].endswith(" 12")
+
+
+def test_both_ways_round_are_averaged_where_the_weights_state_it(tmp_path: Path) -> None:
+    small_store(tmp_path / "maps", 32)
+    store, seen = MapStore(tmp_path / "maps"), []
+
+    class Upper(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.ones(()))
+
+        def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+            seen.append(pictures)
+            return pictures[:, :, 16:].mean((1, 2, 3))[:, None] * self.weight
+
+    clips = clips_of(store, ("through-wall",), 1, None)
+    one = logits_of(Upper(), store, clips, (50.0, 50.0), 32)
+    both = logits_of(Upper(), store, clips, (50.0, 50.0), 32, either_way=True)
+    torch.testing.assert_close(seen[2], seen[0].flip(-2))
+    other = seen[2][:, :, 16:].mean((1, 2, 3))[:, None]
+    torch.testing.assert_close(both, 0.5 * (one + other))
+    assert float((both - one).abs().max()) > 0.1
+
+
+def test_what_the_weights_state_of_averaging_is_followed(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def logits(net: object, store: object, clips: list[object], *_: object, either_way: bool) -> torch.Tensor:
+        asked.append(either_way)
+        return torch.zeros(len(clips), 12)
+
+    monkeypatch.setattr(classifier, "logits_of", logits)
+    small_store(tmp_path / "maps", 224)
+    for stated in ("0", "1"):
+        save_weights(SPGNet(12), weights, {"network": "SPGNet", "size": "32", "either_way": stated})
+        EvaluateClassifier(
+            weights, tmp_path / "maps", ("through-wall",), people=1, snr=(50.0,), quiet=True
+        ).run()
+    assert asked == [False, True]
+
+
+def test_ratios_that_differ_by_less_than_a_decibel_have_files_of_their_own(
+    weights: Path, tmp_path: Path
+) -> None:
+    small_store(tmp_path / "maps", 224)
+    EvaluateClassifier(
+        weights,
+        tmp_path / "maps",
+        ("through-wall",),
+        people=1,
+        snr=(10.2, 10.4),
+        out=tmp_path / "out",
+        quiet=True,
+    ).run()
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.csv")) == [
+        "confusion_through-wall_10.2dB.csv",
+        "confusion_through-wall_10.4dB.csv",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("classes", "stated", "message"),
+    [
+        (12, {"inputs": "ridges"}, "inputs: got ridges, expected doppler"),
+        (12, {"speed_m_s": "6.0"}, "speed_m_s: got 6.0, expected 3.8"),
+        (12, {"range_db": "30.0"}, "range_db: got 30.0, expected 40.0"),
+        (
+            3,
+            {"class_names": json.dumps(["a", "b", "c"])},
+            r"class_names: got \('a', 'b', 'c'\), expected \('S1 Empty'",
+        ),
+        (3, {}, "got a network of 3 classes, expected 12"),
+    ],
+)
+def test_networks_of_other_pictures_are_refused_before_maps_are_made(
+    classes: int, stated: dict[str, str], message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(SPGNet(classes), path, {"network": "SPGNet", "size": "32"} | stated)
+    with pytest.raises(TensorsimError, match=message):
+        EvaluateClassifier(path, tmp_path / "maps", people=1, quiet=True).run()
+    assert not (tmp_path / "maps").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"people": -5}, "--people: got -5, expected an integer of at least 1"),
+        ({"people": 4, "held_out": True}, "--people: got 4, expected an integer of at least 5"),
+        ({"snr": ()}, "--snr: got no ratios"),
+        ({"snr": (float("nan"),)}, "--snr: got nan"),
+        ({"scenes": ()}, "--scenes: got 0"),
+    ],
+)
+def test_bad_options_of_classifiers_are_refused_before_maps_are_made(
+    weights: Path, options: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TensorsimError, match=message):
+        EvaluateClassifier(weights, tmp_path / "maps", **options).run()  # type: ignore[arg-type]
+    assert not (tmp_path / "maps").exists()
 
 
 def write_pose(folder: Path, activity: int) -> None:
