@@ -32,7 +32,7 @@ def contact_sheet(
     threshold: float,
     scenes: list[tuple[Verdict, RadarMaps | None, Axes | None]],
 ) -> "Figure":
-    """Draw the sheet.
+    """Draw the sheet; all times are those of the film.
 
     Args:
         film: what is known of the film.
@@ -59,8 +59,8 @@ def contact_sheet(
     width = 12 // (len(scenes) + 1)
     for place, (verdict, maps, map_axes) in enumerate(scenes):
         axes = figure.add_subplot(grid[_ROWS, place * width : (place + 1) * width])
-        _draw_map(axes, verdict, maps, map_axes)
-    _draw_places(figure.add_subplot(grid[_ROWS, len(scenes) * width :]), pose, reader.fps)
+        _draw_map(axes, verdict, maps, map_axes, film.start_s)
+    _draw_places(figure.add_subplot(grid[_ROWS, len(scenes) * width :]), pose, reader.fps, film.start_s)
     figure.suptitle(f"{film.file}: {' or '.join(film.accept)}{_said_of(camera)}", parse_math=False)
     return figure
 
@@ -128,7 +128,11 @@ def _small(frame: Tensor, width: int = 640) -> np.ndarray:
 
 
 def _draw_map(
-    axes: "matplotlib.axes.Axes", verdict: Verdict, maps: RadarMaps | None, map_axes: Axes | None
+    axes: "matplotlib.axes.Axes",
+    verdict: Verdict,
+    maps: RadarMaps | None,
+    map_axes: Axes | None,
+    start_s: float,
 ) -> None:
     said = "no map" if verdict.label is None else f"{verdict.label} {verdict.probability:.2f}"
     axes.set_title(f"{verdict.scene}: {said}", fontsize=10, color="tab:green" if verdict.right else "tab:red")
@@ -139,15 +143,16 @@ def _draw_map(
         return
     speed = map_axes.doppler_hz * map_axes.speed_per_hz
     level = plot.decibels(maps.doppler_time.numpy(), 40.0)
-    extent = (map_axes.time_s[0], map_axes.time_s[-1], speed[0], speed[-1])
+    time_s = map_axes.time_s + start_s
+    extent = (time_s[0], time_s[-1], speed[0], speed[-1])
     axes.imshow(level, origin="lower", aspect="auto", cmap="turbo", extent=extent, vmin=-40, vmax=0)
     span = min(6.0, float(speed[-1]))
-    axes.set(ylim=(-span, span), xlabel="time in s", ylabel="radial speed in m/s")
+    axes.set(ylim=(-span, span), xlabel="time of the film in s", ylabel="radial speed in m/s")
 
 
-def _draw_places(axes: "matplotlib.axes.Axes", pose: Pose, fps: float) -> None:
+def _draw_places(axes: "matplotlib.axes.Axes", pose: Pose, fps: float, start_s: float) -> None:
     """Range and height of the hips and height of the head of every person over time."""
-    time_s = np.arange(pose.valid.shape[2]) / fps
+    time_s = start_s + np.arange(pose.valid.shape[2]) / fps
     for person in range(pose.valid.shape[1]):
         there = pose.valid[0, person].numpy()
         joints = pose.joints[0, person].numpy()
@@ -158,7 +163,7 @@ def _draw_places(axes: "matplotlib.axes.Axes", pose: Pose, fps: float) -> None:
         axes.plot(time_s, np.where(there, joints[:, 0, 2], np.nan), ":", color=colour)
         axes.plot(time_s, np.where(there, hips[:, 2], np.nan), "--", color=colour)
     axes.set_title("range (line), height of head (dots) and hips (dashes)", fontsize=10)
-    axes.set(xlabel="time in s", ylabel="m", ylim=(-0.5, 10.0))
+    axes.set(xlabel="time of the film in s", ylabel="m", ylim=(-0.5, 10.0))
     axes.grid(visible=True, alpha=0.3)
     if pose.valid.shape[1]:
         axes.legend(fontsize=7, loc="upper right")

@@ -17,10 +17,12 @@ from tensorsim.commands import evaluate_films
 from tensorsim.config import ACTIVITIES, RadarConfig
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
+from tensorsim.evaluation import film_sheet
 from tensorsim.evaluation.labelled_films import (
     FilmReader,
     LabelledFilm,
     Scene,
+    Verdict,
     followed,
     judged,
     markdown,
@@ -28,6 +30,7 @@ from tensorsim.evaluation.labelled_films import (
 )
 from tensorsim.pipeline import PoseToDoppler, VideoToPose
 from tensorsim.radar.simulator import RadarSimulator
+from tensorsim.results import Axes
 from tensorsim.streaming import Found
 from tensorsim.types import Detections, Pose, RadarMaps
 from tensorsim.vision.onnx_engine import OnnxEngine
@@ -194,6 +197,21 @@ def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -
         assert torch.equal(first, second)
 
 
+def test_another_version_watches_films_anew(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = read_labels(data)[0]
+    (tmp_path / "w.onnx").write_text("")
+    stage, kept = VideoToPose(CountingDetector(), StandingPose()).eval(), []
+    for version in ("1", "1", "2"):
+        monkeypatch.setattr("tensorsim.config.documents.version", lambda _, version=version: version)
+        reader = FilmReader(stage, (tmp_path / "w.onnx",) * 2, tmp_path / "cache")
+        with torch.inference_mode():
+            reader.observed(known, reader.open(known), torch.device("cpu"), quiet=True)
+        kept.append(len(list((tmp_path / "cache").glob("[dk]e*"))))
+    assert kept == [2, 2, 4]
+
+
 @pytest.mark.parametrize("part", ["detector", "pose"])
 def test_what_networks_found_is_kept_for_each_engine(data: Path, tmp_path: Path, part: str) -> None:
     """The same weights in integers find something else."""
@@ -315,6 +333,19 @@ def test_a_verdict_is_right_where_the_label_is_accepted() -> None:
     assert maps is None
     assert not verdict.right
     assert "radial speed" in (verdict.error or "")
+
+
+def test_the_sheet_of_a_cut_has_the_times_of_the_film() -> None:
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots(1, 2)
+    film_sheet._draw_places(axes[0], somebody(1.0), FPS, 12.5)
+    assert [line.get_xdata()[0] for line in axes[0].get_lines()] == [12.5] * 3
+    maps = RadarMaps(*(torch.rand(8, 5) for _ in RadarMaps._fields))
+    doppler, time_s = np.linspace(-4, 4, 8), np.linspace(0.1, 1.9, 5)
+    verdict = Verdict("through-wall", ACTIVITIES[7], 0.5, True)
+    film_sheet._draw_map(axes[1], verdict, maps, Axes(np.arange(3), doppler, time_s, 30.0, 1.0), 12.5)
+    assert axes[1].get_images()[0].get_extent()[:2] == pytest.approx([12.6, 14.4])
 
 
 def test_who_was_followed_for_how_long() -> None:
