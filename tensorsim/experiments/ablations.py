@@ -1,16 +1,15 @@
 """Ablations of the radar module: what the wall and its paths, and each denoiser, do to the maps of known motion."""
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from tensorsim.config import ACTIVITIES, SceneConfig, SimulationConfig
+from tensorsim.config import SceneConfig, SimulationConfig
 from tensorsim.enhance.choice import DENOISERS, map_denoiser
 from tensorsim.errors import TensorsimError, TensorsimWarning, check_count, check_distinct
 from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
@@ -21,11 +20,9 @@ from tensorsim.experiments.work import Report, Table, Work, check_scenes, check_
 from tensorsim.files import sha256_of
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
-from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.registry import shipped_weights
 from tensorsim.training.classifier import check_ratios
-from tensorsim.training.denoiser import simulate_pair
-from tensorsim.training.denoiser_scores import COLUMNS, scores
+from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, scores_of_clip
 from tensorsim.training.maps import SCENES
 
 #: Echo models of the through-wall scene by name.
@@ -202,9 +199,7 @@ class DenoiserConfig:
 
 def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
     """Each denoiser's maps against those of the same echo at 50 dB."""
-    denoisers: dict[str, Callable[[Tensor], Tensor] | None] = {
-        name: map_denoiser(name) for name in config.denoisers
-    }
+    denoisers: Denoisers = {name: map_denoiser(name) for name in config.denoisers}
     # A file is told by its content.
     identities = {name: sha256_of(Path(name)) if Path(name).is_file() else "" for name in config.denoisers}
     found: dict[tuple[str, str, float, str], list[list[float]]] = {}
@@ -219,7 +214,7 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
         def make(
             scene: str = scene, ratio: float = ratio, clip: int = clip
         ) -> dict[str, dict[str, list[float]]]:
-            return _denoised(denoisers, scene, ratio, clip, config)
+            return scores_of_clip(denoisers, scene, ratio, clip, config.seed, config.columns, guesses=True)
 
         settings = {
             "scene": scene, "ratio": ratio, "clip": clip, "seed": config.seed, "denoisers": identities,
@@ -245,35 +240,6 @@ def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
     ]
     drawn = {"psnr": figures.bars(shown, "PSNR, dB", "PSNR of denoised maps")}
     return Report(notes, [Table("Denoisers", columns, rows, digits=2)], drawn)
-
-
-@torch.no_grad()
-def _denoised(
-    denoisers: dict[str, Callable[[Tensor], Tensor] | None],
-    scene: str,
-    ratio: float,
-    clip: int,
-    config: DenoiserConfig,
-) -> dict[str, dict[str, list[float]]]:
-    """Figures by map and denoiser, and of the two guesses, for one clip."""
-    people = len(ACTIVITIES) - 1
-    activity = 1 + clip % people
-    # Another person of the same activity.
-    pairs = [
-        simulate_pair(scene, activity, config.seed * 1_000_003 + n, ratio)
-        for n in (clip, clip + 1000 * people)
-    ]
-    radar = PRESETS[scene].radar
-    speed = DopplerFrames(radar).doppler_hz * radar.doppler_wavelength_m / 2
-    result: dict[str, dict[str, list[float]]] = {}
-    for view, axis in (("range_time_mti", None), ("doppler_time", speed)):
-        whole = [getattr(maps, view).float() for maps in (*pairs[0], pairs[1][1])]
-        first = max(0, (whole[0].shape[1] - config.columns) // 2)
-        noisy, clean, other = (x[:, first : first + config.columns] for x in whole)
-        maps = {name: noisy if denoise is None else denoise(noisy) for name, denoise in denoisers.items()}
-        maps |= {"empty map": torch.zeros_like(clean), "another clip": other}
-        result[view] = {name: scores(x, clean, axis) for name, x in maps.items()}
-    return result
 
 
 def quick_echo() -> EchoConfig:

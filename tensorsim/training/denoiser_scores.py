@@ -16,7 +16,7 @@ from tensorsim.training.denoiser import simulate_pair
 #: PSNR of magnitudes over their peak; of decibels cut off 40 dB below it; speed errors of Doppler-time maps.
 COLUMNS = ("PSNR dB", "PSNR of dB map", "envelope m/s", "ridges m/s")
 #: Range-time maps are cut to this many columns: the slow rivals take minutes for all 32 767 of free space.
-_COLUMNS_AT_MOST = 1024
+COLUMNS_AT_MOST = 1024
 Key = tuple[str, str, float, str]
 #: By name; None does nothing.
 Denoisers = dict[str, Callable[[Tensor], Tensor] | None]
@@ -44,6 +44,46 @@ def scores(found: Tensor, clean: Tensor, speed_m_s: Tensor | None) -> list[float
 
 
 @torch.no_grad()
+def scores_of_clip(
+    denoisers: Denoisers,
+    scene: str,
+    ratio: float,
+    clip: int,
+    seed: int,
+    columns: int = COLUMNS_AT_MOST,
+    guesses: bool = False,
+) -> dict[str, dict[str, list[float]]]:
+    """Figures by map and denoiser of one clip with a person in it, against the same echo at 50 dB.
+
+    Args:
+        denoisers: by name.
+        scene: name of a radar preset.
+        ratio: signal-to-noise ratio in dB.
+        clip: number; the activities from S2 on in turn.
+        seed: of people, motion and noise.
+        columns: of each map at most, from its middle.
+        guesses: also of an empty map and of the clean map of another person of the same activity.
+    """
+    people = len(ACTIVITIES) - 1
+    activity = 1 + clip % people
+    pair = simulate_pair(scene, activity, seed * 1_000_003 + clip, ratio)
+    other = (
+        simulate_pair(scene, activity, seed * 1_000_003 + clip + 1000 * people, ratio) if guesses else pair
+    )
+    radar = PRESETS[scene].radar
+    speed = DopplerFrames(radar).doppler_hz * radar.doppler_wavelength_m / 2
+    result = {}
+    for view, axis in (("range_time_mti", None), ("doppler_time", speed)):
+        whole = [getattr(maps, view).float() for maps in (*pair, other[1])]
+        first = max(0, (whole[0].shape[1] - columns) // 2)
+        noisy, clean, another = (x[:, first : first + columns] for x in whole)
+        maps = {name: noisy if denoise is None else denoise(noisy) for name, denoise in denoisers.items()}
+        if guesses:
+            maps |= {"empty map": torch.zeros_like(clean), "another clip": another}
+        result[view] = {name: scores(x, clean, axis) for name, x in maps.items()}
+    return result
+
+
 def compare(
     denoisers: Denoisers,
     scenes: Sequence[str],
@@ -56,15 +96,7 @@ def compare(
     found: dict[Key, list[list[float]]] = {}
     jobs = [(scene, ratio, clip) for scene in scenes for ratio in ratios for clip in range(clips)]
     for scene, ratio, clip in tqdm(jobs, desc="maps", unit="clip", disable=quiet):
-        activity = 1 + clip % (len(ACTIVITIES) - 1)
-        pair = simulate_pair(scene, activity, seed * 1_000_003 + clip, ratio)
-        radar = PRESETS[scene].radar
-        speed = DopplerFrames(radar).doppler_hz * radar.doppler_wavelength_m / 2
-        for view, axis in (("range_time_mti", None), ("doppler_time", speed)):
-            whole = [getattr(maps, view).float() for maps in pair]
-            first = max(0, (whole[0].shape[1] - _COLUMNS_AT_MOST) // 2)
-            noisy, clean = (x[:, first : first + _COLUMNS_AT_MOST] for x in whole)
-            for name, denoise in denoisers.items():
-                cleaned = noisy if denoise is None else denoise(noisy)
-                found.setdefault((scene, view, ratio, name), []).append(scores(cleaned, clean, axis))
+        for view, of_view in scores_of_clip(denoisers, scene, ratio, clip, seed).items():
+            for name, figures in of_view.items():
+                found.setdefault((scene, view, ratio, name), []).append(figures)
     return {key: torch.tensor(figures).nanmean(0).tolist() for key, figures in found.items()}

@@ -14,6 +14,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.clips import ActivityClip
 from tensorsim.evaluation.labelled_films import LabelledFilm
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
+from tensorsim.evaluation.scores import MAPS
 from tensorsim.experiments import ablations, catalogue, networks, paper, real, real_films, video
 from tensorsim.experiments.catalogue import EXPERIMENTS, Experiment
 from tensorsim.experiments.stored import RESULTS, stored_names, stored_table
@@ -129,12 +130,12 @@ def test_denoisers_stand_beside_an_empty_map(tmp_path: Path, monkeypatch: pytest
 def test_a_file_of_a_denoiser_is_told_by_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
-    def denoised(*_: Any) -> dict[str, Any]:
+    def denoised(*_: Any, **__: Any) -> dict[str, Any]:
         made.append(1)
         return {"doppler_time": {str(path): [1.0] * len(ablations.COLUMNS)}}
 
     monkeypatch.setattr(ablations, "map_denoiser", lambda name: None)
-    monkeypatch.setattr(ablations, "_denoised", denoised)
+    monkeypatch.setattr(ablations, "scores_of_clip", denoised)
     path = tmp_path / "own.safetensors"
     config = ablations.DenoiserConfig((str(path),), ("through-wall",), 1, (10.0,))
     for content in (b"a", b"a", b"b"):
@@ -420,7 +421,30 @@ def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.M
     assert "**TCN** (no weights)" in report.notes[2]
     errors = {row[0]: row for row in report.tables[-1].rows}
     assert errors["truth"][1] == pytest.approx(0.0, abs=1e-6)
-    assert (errors["truth"][4], errors["nobody"][4]) == (1.0, 0.0)
+    assert errors["truth"][4:6] == [1.0, 1.0], "followed, people"
+    assert errors["nobody"][4:6] == [0.0, 0.0]
+
+
+def test_an_empty_scene_is_in_the_mean_of_no_chain(tmp_path: Path) -> None:
+    """Somebody found in it would raise the mean of a chain above that of one that is right there."""
+
+    class Watcher:
+        missing: dict[str, str] = {}  # noqa: RUF012
+        chains = dict.fromkeys(("right", "ghost"))
+
+    def cell(psnr: float, people: float) -> dict[str, Any]:
+        scores = {"through-wall": {name: {"psnr": psnr} for name in MAPS}}
+        return {"scores": scores, "pose": {"people": people}}
+
+    walking, empty, inf = "S8 Walking", "S1 Empty", float("inf")
+    cells = {(row, guess): [cell(20.0, 0.0)] for row in (walking, empty) for guess in ablations.GUESSES}
+    cells |= {(walking, "right"): [cell(20.0, 1.0)], (empty, "right"): [cell(inf, 0.0)]}
+    cells |= {(walking, "ghost"): [cell(20.0, 1.0)], (empty, "ghost"): [cell(60.0, 2.0)]}
+    config = replace(video.quick_video(), scenes=("through-wall",))
+    report = video._report(config, {empty: [], walking: []}, Watcher(), cells)  # type: ignore[arg-type]
+    means = {row[0]: row[1:] for row in report.tables[0].rows}
+    assert means["right"] == means["ghost"] == [20.0] * 3
+    assert {row[0]: row[-1] for row in report.tables[-1].rows} == {"right": 0.0, "ghost": 2.0}
 
 
 def test_the_paper_joins_all_reports(tmp_path: Path) -> None:
