@@ -147,7 +147,8 @@ def configuration(name: str, quick: bool, file: Path | None, options: dict[str, 
 def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
     """Run an experiment and write its report: ``NAME.md``, ``NAME*.csv``, ``NAME-*.png`` and ``.svg``, ``NAME.yaml``.
 
-    Files appear once all of them are complete. What was computed stays in the cache of ``work``.
+    Files appear once all of them are complete, and tables and figures of an earlier run that this one does not have are
+    removed. What was computed stays in the cache of ``work``.
     """
     from tensorsim.plot.figure import save_figure
 
@@ -166,4 +167,9 @@ def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
         for figure_name, figure in report.figures.items():
             for suffix in ("png", "svg"):
                 save_figure(figure, new / f"{name}-{figure_name}.{suffix}")
+        written = {file.name for file in new.iterdir()}
+    for pattern in (f"{name}.csv", f"{name}-*.csv", f"{name}-*.png", f"{name}-*.svg"):
+        for file in out.glob(pattern):
+            if file.name not in written:
+                file.unlink()
     return report

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -144,6 +145,18 @@ def test_report_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
     assert names == ["own-bars.png", "own-bars.svg", "own-more.csv", "own.csv", "own.md", "own.yaml"]
     assert configuration("own", False, out / "own.yaml", {}) == EchoConfig(clips=3)
     assert "# Title\n\nNote.\n\n## One" in (out / "own.md").read_text()
+
+    # Another run has no second table and no figure; other files stay.
+    others = [out / name for name in ("own-notes.txt", "owner-more.csv", "more.csv")]
+    for path in others:
+        path.write_text("kept")
+    monkeypatch.setitem(
+        catalogue.EXPERIMENTS, "own", replace(entry, run=lambda *_: Report(["Note."], tables[:1]))
+    )
+    run_experiment("own", out, EchoConfig(clips=3), Work(out / "work"))
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        ["own.csv", "own.md", "own.yaml", *(path.name for path in others)]
+    )
 
     broken = catalogue.Experiment(
         "Title", EchoConfig, lambda c, w: Report([], tables, {"no": None}), EchoConfig

@@ -57,7 +57,13 @@ def table(results: dict[str, dict[str, Any]], errors: dict[str, float]) -> str:
 
 
 def write(out: Path, name: str, measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> float:
-    """Confusion matrices and calibration of a set as CSV; returns the calibration error of simulation alone."""
+    """Confusion matrices and calibration of a set as CSV; returns the calibration error of simulation alone.
+
+    Matrices of settings that were not run are removed: they are of an earlier run.
+    """
+    for setting in SETTINGS:
+        if setting not in logits:
+            (out / f"confusion_{name}_{setting}.csv").unlink(missing_ok=True)
     rows: list[list[Any]] = [["setting", "confidence_from", "clips", "confidence", "accuracy"]]
     first_error = 0.0
     for setting, values in logits.items():
