@@ -23,7 +23,8 @@ class EvaluateMeasured:
     """Output folder."""
     test: Option[Path] = None
     """Folder of measured sets to test on, with the same layout. Default: the last 30 % of each class of --train, in the
-    order of the files; then only the rest is trained on."""
+    order of the files; then only the rest is trained on. With --quick and --ablation, which learn nothing from --train,
+    it may be the same folder."""
     quick: bool = False
     """Use the shipped weights, trained on simulation alone, and train nothing."""
     ablation: bool = False
@@ -73,11 +74,17 @@ class EvaluateMeasured:
             raise TensorsimError(
                 f"{', '.join(map(str, folders))}: no data set is present in every folder, expected some of {names}"
             )
-        results, errors = {}, {}
-        for measured in chosen:
-            experiment = Experiment(
+        experiments = [
+            Experiment(
                 measured, self.train, self.test, self.out, self.clips, self.steps, self.seed, self.quiet
             )
+            for measured in chosen
+        ]
+        if not (self.quick or self.ablation):
+            for experiment in experiments:
+                experiment.check_full()
+        results, errors = {}, {}
+        for measured, experiment in zip(chosen, experiments, strict=True):
             if self.ablation:
                 rows = ablation_table(experiment, ablation(experiment, self.repeats))
                 write_text(self.out / f"ablation_{measured.name}.md", rows + "\n")

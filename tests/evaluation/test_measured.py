@@ -201,6 +201,32 @@ def test_bad_requests_are_refused(folders, tmp_path, capsys, more, message):
     assert message in capsys.readouterr().err
 
 
+def test_clips_to_learn_from_are_not_tested(folders, tmp_path, monkeypatch, capsys):
+    """The same folder may be given where nothing is learnt from it; otherwise it is refused before any simulation."""
+    same = (folders[0], folders[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            run.Experiment, "quick", lambda self: {"simulation_only": torch.zeros(len(self.test), 5)}
+        )
+        cli.main(words(same, tmp_path, "--quick", "--sets", "radhar_points"))
+    monkeypatch.setattr(run.Experiment, "full", None)
+    with pytest.raises(SystemExit):
+        cli.main(words(same, tmp_path, "--sets", "radhar_points"))
+    assert "radhar_points: got the same clips to learn from and to test on" in capsys.readouterr().err
+
+
+def test_matrices_of_an_earlier_run_are_removed(tmp_path):
+    labels, logits = torch.arange(5), torch.eye(5)
+    report.write(tmp_path, "radhar_points", SETS[2], dict.fromkeys(SETTINGS, logits), labels)
+    (tmp_path / "confusion_radhar_points_own.csv").write_text("")
+    report.write(tmp_path, "radhar_points", SETS[2], {"simulation_only": logits}, labels)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "calibration_radhar_points.csv",
+        "confusion_radhar_points_own.csv",
+        "confusion_radhar_points_simulation_only.csv",
+    ]
+
+
 def test_damaged_folders_are_refused(tmp_path):
     (tmp_path / "radhar_points").mkdir()
     with pytest.raises(TensorsimError, match=r"maps\.npz: no such file"):

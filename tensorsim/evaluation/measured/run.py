@@ -114,16 +114,29 @@ class Experiment:
         net = DIATRadHARNet.from_pretrained(self.measured.weights)
         return {"simulation_only": self._tested(net)}
 
-    def full(self) -> dict[str, Tensor]:
-        """Logits (N, classes) of the test clips in each of ``SETTINGS``.
+    def check_full(self) -> None:
+        """Refuse what :meth:`full` cannot learn from, or be tested on.
 
         Raises:
-            TensorsimError: clips to learn from of one class alone.
+            TensorsimError: clips to learn from of one class alone, or the same clips to learn from and to test on.
         """
         if len(self.train_labels.unique()) < 2:
             raise TensorsimError(
                 f"{self.measured.name}: got clips of one class to learn from, expected at least two classes"
             )
+        if torch.equal(self.train, self.test) and torch.equal(self.train_labels, self.test_labels):
+            raise TensorsimError(
+                f"{self.measured.name}: got the same clips to learn from and to test on, expected others; without a "
+                "folder to test on the last 30 % of each class are kept for the test"
+            )
+
+    def full(self) -> dict[str, Tensor]:
+        """Logits (N, classes) of the test clips in each of ``SETTINGS``.
+
+        Raises:
+            TensorsimError: see :meth:`check_full`.
+        """
+        self.check_full()
         simulated, labels = self.measured.simulate(self.clips, self.seed, self.quiet)
         net = self._simulation_trained(simulated, labels, self.seed)
         path = self.out / f"{self.measured.weights.replace('-', '_')}.safetensors"
