@@ -201,7 +201,7 @@ def entries() -> tuple[ModelEntry, ...]:
 
 
 def cache_dir() -> Path:
-    """Folder of downloaded weights: ``tensorsim`` in torch's cache (``$TORCH_HOME``, else ``~/.cache/torch``)."""
+    """Folder of downloaded weights: ``hub/tensorsim`` in torch's cache (``$TORCH_HOME``, else ``~/.cache/torch``)."""
     import torch
 
     return Path(torch.hub.get_dir()) / "tensorsim"
