@@ -484,7 +484,7 @@ def test_a_scene_that_no_row_can_be_shown_in_has_no_picture(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"detector": "x.onnx"}, "without setting c"),
+        ({"detector": "x.onnx"}, "apply to --settings c only"),
         ({"motion_fps": 30.0}, "--motion-fps needs --motion"),
         ({"seed": -1}, "--seed: got -1"),
     ],
