@@ -187,7 +187,7 @@ def test_without_a_test_folder_the_last_clips_of_each_class_are_tested(folders, 
     ("more", "message"),
     [
         (("--clips", "0"), "--clips: got 0"),
-        (("--quick", "--ablation"), "got both"),
+        (("--quick", "--ablation"), "cannot be combined"),
         (("--repeats", "2"), "--repeats: got 2 without --ablation"),
         (("--quick", "--clips", "20"), "--clips: got 20 with --quick, which trains nothing"),
         (("--quick", "--seed", "1"), "--seed: got 1 with --quick"),
