@@ -309,7 +309,7 @@ def test_a_track_that_shows_no_joint_is_nobody() -> None:
 
 def test_a_graph_does_not_estimate_the_camera_and_says_so() -> None:
     config = ts.SimulationConfig().replace(pose__calibrate=True)
-    with pytest.warns(TensorsimWarning, match=r"pose\.calibrate: a graph does not estimate the camera"):
+    with pytest.warns(TensorsimWarning, match=r"pose\.calibrate is ignored here"):
         VideoToDoppler.from_config(config, RectangleDetector(), StandingPose())
 
 

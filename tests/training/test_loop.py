@@ -119,7 +119,7 @@ def test_logs_are_there(tmp_path: Path) -> None:
 
 def test_without_tensorboard_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(TensorsimError, match=r"install tensorsim\[train\]"):
+    with pytest.raises(TensorsimError, match=r'pip install "tensorsim\[train\]"'):
         fit(Line(), config(tmp_path / "out"))
     assert list((tmp_path / "out").glob("*")) == []
 

@@ -335,7 +335,7 @@ def test_sources_left_out(tmp_path: Path) -> None:
     full = recipe(tmp_path)
     only = PoseRecipe(full.net, PosePeople(full.groups[0], [], []), {})  # type: ignore[arg-type]
     assert all(only.sample(n)["sided"] for n in range(10))
-    with pytest.raises(TensorsimError, match="nobody"):
+    with pytest.raises(TensorsimError, match="got no people to train on"):
         PoseRecipe(full.net, PosePeople([], [], []), {})  # type: ignore[arg-type]
 
 
