@@ -121,7 +121,7 @@ class DatasetVerify:
             print(f"WRONG {name}: {reason}")
         if wrong:
             raise TensorsimError(
-                f"dataset verify: {len(wrong)} of {count} files of {self.folder} are not in order; `dataset build` "
+                f"dataset verify: {len(wrong)} of {count} files of {self.folder} failed verification; `dataset build` "
                 "makes missing ones again"
             )
         print(f"ok    {self.folder}: {count} files")
