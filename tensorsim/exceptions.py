@@ -45,6 +45,11 @@ def check_count(value: object, name: str, least: int = 1, most: float = math.inf
     return count
 
 
+def check_seed(seed: object, name: str) -> int:
+    """The seed as Python's own integer; one that some generator would not take is refused."""
+    return check_count(seed, name, 0, 2**32 - 1)
+
+
 def check_choice(value: object, choices: Collection[str], name: str) -> None:
     """Refuse anything but one of these names."""
     if not isinstance(value, str) or value not in choices:

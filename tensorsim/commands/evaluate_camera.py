@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import TYPE_CHECKING
 
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, check_count
+from tensorsim.exceptions import TensorsimError, check_count, check_seed
 
 if TYPE_CHECKING:
     from tensorsim.evaluation.camera import CameraErrors
@@ -42,7 +41,7 @@ class EvaluateCamera:
 
     def run(self) -> None:
         """Do it."""
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         if not (self.tilts and self.heights and self.fovs):
             raise TensorsimError(
                 "evaluate camera: got no tilt, height or field of view, expected at least one each"

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tensorsim.commands.arguments import Option
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, check_count, check_distinct
+from tensorsim.exceptions import TensorsimError, check_count, check_distinct, check_seed
 from tensorsim.files import check_folder, write_text
 
 if TYPE_CHECKING:

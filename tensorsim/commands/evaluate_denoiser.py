@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.arguments import Option, Several
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, check_count, check_distinct
+from tensorsim.exceptions import TensorsimError, check_count, check_distinct, check_seed
 from tensorsim.files import write_text
 
 
@@ -41,7 +40,7 @@ class EvaluateDenoiser:
         from tensorsim.training.classifier import check_ratios
         from tensorsim.training.denoiser_scores import COLUMNS, Denoisers, compare
 
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         check_count(self.clips, "--clips")
         check_count(len(self.scenes), "--scenes")
         check_distinct(self.scenes, "--scenes")

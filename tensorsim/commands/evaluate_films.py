@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
-from tensorsim.commands.options import RadarOptions, at_display_rate, check_seed, load_recognizer
-from tensorsim.exceptions import TensorsimError, check_count, collected_warnings, print_warnings
+from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer
+from tensorsim.exceptions import TensorsimError, check_count, check_seed, collected_warnings, print_warnings
 from tensorsim.files import check_folder, complete_file, write_text
 
 
@@ -55,7 +55,7 @@ class EvaluateFilms(NetworkOptions):
 
     def run(self) -> None:
         """Do it."""
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         check_folder(self.out)
         check_count(self.stride, "--stride")
         if len(self.scenes) == 0:

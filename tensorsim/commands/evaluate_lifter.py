@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tensorsim.commands.arguments import Option, Several
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_seed
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class EvaluateLifter:
 
     def run(self) -> None:
         """Do it."""
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         if self.motions < 100:
             raise TensorsimError(f"--motions: got {self.motions}, expected at least 100")
         if self.films is not None and not self.films.is_dir():

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.arguments import Option, Several
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, check_count
+from tensorsim.exceptions import TensorsimError, check_count, check_seed
 from tensorsim.files import check_folder, write_json, write_text
 
 
@@ -44,7 +43,7 @@ class EvaluateMeasured:
 
     def run(self) -> None:
         """Do it."""
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         for name, count in (("--clips", self.clips), ("--steps", self.steps), ("--repeats", self.repeats)):
             check_count(count, name)
         check_folder(self.out)

@@ -6,8 +6,7 @@ from typing import Literal
 
 from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.networks import default_networks
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.exceptions import TensorsimError, check_seed, collected_warnings, print_warnings
 from tensorsim.files import check_folder, write_text
 
 
@@ -51,7 +50,7 @@ class EvaluateTruth:
     def run(self) -> None:
         """Do it."""
         check_folder(self.out)
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         if self.motion_fps is not None and not self.motion:
             raise TensorsimError("--motion-fps needs --motion")
         detector = pose = None

@@ -7,8 +7,7 @@ from typing import Annotated
 import tyro
 
 from tensorsim.commands.arguments import Option, Several
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError, check_count
+from tensorsim.exceptions import TensorsimError, check_count, check_seed
 
 #: What motion files are called.
 SUFFIXES = (".bvh", ".npz")
@@ -42,7 +41,7 @@ class BuildLibrary:
         files = _files(self.sources)
         if not files and self.generate == 0:
             raise TensorsimError("library build: got nothing to build from, expected SOURCES or --generate N")
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         if self.generate < 0:
             raise TensorsimError(f"--generate: got {self.generate}, expected a number of poses")
         if self.most is not None:

@@ -13,7 +13,7 @@ import tyro
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.panel import PANEL_FIELDS, PanelOptions
 from tensorsim.commands.receiver import RECEIVER_FIELDS, ReceiverOptions
-from tensorsim.exceptions import TensorsimError, TensorsimWarning, check_count
+from tensorsim.exceptions import TensorsimError, TensorsimWarning, check_seed
 from tensorsim.files import check_folder
 
 if TYPE_CHECKING:
@@ -66,11 +66,6 @@ _NEEDED: dict[str, tuple[str, Callable[["SceneConfig"], bool]]] = {
 }
 
 
-def check_seed(seed: int, option: str = "--seed") -> None:
-    """Refuse a seed that some generator would not take."""
-    check_count(seed, option, 0, 2**32 - 1)
-
-
 @dataclass(frozen=True, kw_only=True)
 class RadarOptions(PanelOptions, ReceiverOptions):
     """How people's joints become maps, and how these look. Options that are not given keep the configured value."""
@@ -120,7 +115,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
         if self.seed is not None:
-            check_seed(self.seed)
+            check_seed(self.seed, "--seed")
         if self.snr is not None and not math.isfinite(self.snr):
             raise TensorsimError(f"--snr: got {self.snr}, expected a finite number of dB")
         if not (math.isfinite(self.dynamic_range) and self.dynamic_range > 0):

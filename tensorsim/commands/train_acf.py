@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tensorsim.commands.options import check_seed
+from tensorsim.exceptions import check_seed
 from tensorsim.files import check_folder
 
 
@@ -32,7 +32,7 @@ class TrainAcf:
         from tensorsim.training.acf import AcfSettings, AcfTrainer
         from tensorsim.weights import save_weights
 
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         check_folder(self.out)
         settings = AcfSettings(self.rounds, self.positives, self.negatives, seed=self.seed)
         trainer = AcfTrainer(self.data, settings, self.quiet)

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.arguments import Option, Several
-from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions, check_size
-from tensorsim.exceptions import TensorsimError, check_positive
+from tensorsim.exceptions import TensorsimError, check_positive, check_seed
 
 #: Options that count for ``maps`` only.
 _OF_MAPS = ("scenes", "people", "snr", "films", "film_maps", "film_people", "maps_seed", "film_seed")

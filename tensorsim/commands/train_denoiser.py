@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_seed
 
 
 @dataclass(frozen=True)

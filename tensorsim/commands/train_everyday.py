@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.arguments import Option
-from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions, check_size
-from tensorsim.exceptions import TensorsimError, check_positive
+from tensorsim.exceptions import TensorsimError, check_positive, check_seed
 
 
 @dataclass(frozen=True, kw_only=True)

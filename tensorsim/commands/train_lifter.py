@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from tensorsim.commands.arguments import Several
-from tensorsim.commands.options import check_seed
 from tensorsim.commands.training import TrainOptions
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_seed
 
 
 @dataclass(frozen=True)

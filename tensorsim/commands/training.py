@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tensorsim.commands.arguments import Option
-from tensorsim.commands.options import check_seed
-from tensorsim.exceptions import TensorsimError
+from tensorsim.exceptions import TensorsimError, check_seed
 
 if TYPE_CHECKING:
     from torch import nn
@@ -39,7 +38,7 @@ class TrainOptions:
         from tensorsim.device import multiplies_bfloat16, usable_device
         from tensorsim.training.loop import LoopConfig
 
-        check_seed(self.seed)
+        check_seed(self.seed, "--seed")
         device, precision = usable_device(self.device), self.precision
         if precision == "auto":
             precision = "bfloat16" if multiplies_bfloat16(device) else "float32"

@@ -11,12 +11,12 @@ from tqdm import tqdm
 
 from tensorsim.config import SceneConfig, SimulationConfig
 from tensorsim.enhance.choice import DENOISERS, map_denoiser
-from tensorsim.errors import TensorsimError, TensorsimWarning, check_count, check_distinct
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_count, check_distinct, check_seed
 from tensorsim.evaluation.clips import CLIP_S, Clip, activity_clips
 from tensorsim.evaluation.films import FPS
 from tensorsim.evaluation.scores import MAPS, Maps, compare
 from tensorsim.experiments import figures
-from tensorsim.experiments.work import Report, Table, Work, check_scenes, check_seed, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, check_scenes, counted, mean_and_spread
 from tensorsim.files import sha256_of
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.presets import PRESETS
@@ -57,7 +57,7 @@ class EchoConfig:
     def __post_init__(self) -> None:
         if self.clips < 2:
             raise TensorsimError(f"clips: got {self.clips}, expected at least 2 to compare with each other")
-        check_seed(self.seed)
+        check_seed(self.seed, "seed")
 
 
 class _Echoes:
@@ -189,7 +189,7 @@ class DenoiserConfig:
 
     def __post_init__(self) -> None:
         check_scenes(self.scenes)
-        check_seed(self.seed)
+        check_seed(self.seed, "seed")
         check_ratios(self.snr_db)
         check_distinct(self.denoisers, "denoisers")
         counts = {"denoisers": len(self.denoisers), "clips": self.clips, "columns": self.columns}

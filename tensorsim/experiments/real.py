@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from tensorsim.config import ACTIVITIES
 from tensorsim.config.documents import digest
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.errors import TensorsimError, check_count, check_seed
 from tensorsim.evaluation.labelled_films import read_labels
 from tensorsim.evaluation.measured.sets import SETS, MeasuredSet
 from tensorsim.evaluation.measured.training import fit_pictures, predict, square
@@ -28,7 +28,7 @@ from tensorsim.experiments.real_films import (
     film_pictures,
     titled,
 )
-from tensorsim.experiments.work import Report, Table, Work, check_seed, counted, mean_and_spread
+from tensorsim.experiments.work import Report, Table, Work, counted, mean_and_spread
 from tensorsim.files import complete_file, sha256_of
 from tensorsim.recognition.networks import find_classifier
 from tensorsim.registry import shipped_weights
@@ -80,7 +80,7 @@ class RealConfig:
             ("film_steps", self.film_steps, 1), ("film_count", self.film_count, 0),
         ):  # fmt: skip
             check_count(count, what, least)
-        check_seed(self.seed)
+        check_seed(self.seed, "seed")
         if len(self.group_clips) != 2:
             raise TensorsimError(
                 f"group_clips: got {list(self.group_clips)}, expected two numbers: of clips as the pipeline finds "

@@ -23,7 +23,7 @@ from tensorsim.recognition.networks import find_classifier
 from tensorsim.recognition.timeline import windows_of
 from tensorsim.registry import locate, shipped_weights
 from tensorsim.streaming import maps_of_pose, within_reach
-from tensorsim.training.classifier import RANGE_DB
+from tensorsim.training.classifier import RANGE_DB, mean_both_ways
 from tensorsim.training.everyday_classifier import EverydayRecipe
 from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
 from tensorsim.training.loop import LoopConfig, fit
@@ -206,7 +206,7 @@ def right_share(net: nn.Module, films: list[FilmPictures], scene: str) -> float:
         windows = film.windows[scene]
         if len(windows) == 0:
             continue
-        logits = 0.5 * (net(windows) + net(windows.flip(-2)))
+        logits = mean_both_ways(net, windows)
         right += ACTIVITIES[int(logits.softmax(-1).mean(0).argmax())] in film.accept
     return right / len(films)
 

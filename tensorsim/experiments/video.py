@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_seed
 from tensorsim.evaluation.clips import ActivityClip, activity_clips
 from tensorsim.evaluation.films import CAMERA, FPS, HEIGHT, WIDTH, Observed
 from tensorsim.evaluation.report import EMPTY
@@ -18,7 +18,7 @@ from tensorsim.evaluation.settings import Pipelines, Setting, lifting_files
 from tensorsim.evaluation.truth import pose_errors
 from tensorsim.experiments import figures
 from tensorsim.experiments.ablations import GUESSES, NORMALISATION, SHORT
-from tensorsim.experiments.work import Report, Table, Work, check_scenes, check_seed
+from tensorsim.experiments.work import Report, Table, Work, check_scenes
 from tensorsim.motion.activities import activity_index
 from tensorsim.pipeline import VideoToPose, pretrained_pose
 from tensorsim.radar.presets import PRESETS
@@ -64,7 +64,7 @@ class VideoConfig:
         for name in self.activities:
             activity_index(name)
         check_scenes(self.scenes)
-        check_seed(self.seed)
+        check_seed(self.seed, "seed")
         if self.clips < 1 or not 0.5 <= self.length_s <= 60:
             raise TensorsimError(
                 f"clips, length_s: got {self.clips} and {self.length_s}, expected at least 1 and from 0.5 to 60 s"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensorsim.config.documents import digest
-from tensorsim.errors import TensorsimError, check_choice, check_count, check_distinct
+from tensorsim.errors import TensorsimError, check_choice, check_distinct
 from tensorsim.files import write_text
 from tensorsim.training.maps import SCENES
 
@@ -50,11 +50,6 @@ def check_scenes(scenes: Sequence[str]) -> None:
     for scene in scenes:
         check_choice(scene, SCENES, "scenes")
     check_distinct(scenes, "scenes")
-
-
-def check_seed(seed: int) -> None:
-    """Refuse a seed that some generator would not take."""
-    check_count(seed, "seed", 0, 2**32 - 1)
 
 
 def counted(count: int, noun: str) -> str:

@@ -248,6 +248,12 @@ class ClassifierRecipe(Recipe):
         return {"score": -loss, "loss": loss} | figures
 
 
+def mean_both_ways(net: nn.Module, pictures: Tensor) -> Tensor:
+    """Mean logits (N, classes) of pictures (N, C, H, W) and of the same with approach and retreat exchanged."""
+    logits: Tensor = 0.5 * (net(pictures) + net(pictures.flip(-2)))
+    return logits
+
+
 @torch.no_grad()
 def logits_of(
     net: nn.Module,
@@ -270,6 +276,6 @@ def logits_of(
             for k, clip in enumerate(clips[first : first + batch])
         ]
         x = torch.stack(pictures).to(parameter, memory_format=torch.channels_last)
-        logits = 0.5 * (net(x) + net(x.flip(-2))) if either_way else net(x)
+        logits = mean_both_ways(net, x) if either_way else net(x)
         found.append(logits.float().cpu())
     return torch.cat(found)
