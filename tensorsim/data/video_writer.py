@@ -68,7 +68,8 @@ class VideoWriter:
             self._shape = frame.shape
             _open_writer(self._writer, self._partial, self.fps, (width + width % 2, height + height % 2))
         bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-        bgr = cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        if height % 2 or width % 2:
+            bgr = cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         self.count += 1  # an interrupt, which comes after the write, must not leave the frame uncounted
         with silent_log():  # a full disk shows at the end
             self._writer.write(bgr)

@@ -177,14 +177,20 @@ def non_maximum_suppression(
     found = torch.zeros((batch, max_detections), dtype=torch.bool, device=scores.device)
     if count == 0:
         return picked, found
-    boxes, nothing = boxes.detach(), -float("inf")
-    left = scores.detach().masked_fill(~valid, nothing)
+    order = torch.arange(count, device=scores.device).expand(batch, -1)
+    if not is_exporting():
+        # Few boxes exist; only they, in their order, are compared.
+        first = valid.to(torch.uint8).sort(dim=1, descending=True, stable=True).indices
+        order = first[:, : max(1, int(valid.sum(1).max()))]
+    boxes, nothing = boxes.detach().gather(1, order.unsqueeze(-1).expand(-1, -1, 4)), -float("inf")
+    labels = labels.gather(1, order)
+    left = scores.detach().masked_fill(~valid, nothing).gather(1, order)
     for k in range(max_detections):
         best, index = left.max(1, keepdim=True)
         exists = best > nothing
         if not is_exporting() and not bool(exists.any()):
             break
-        picked[:, k : k + 1] = index
+        picked[:, k : k + 1] = order.gather(1, index)
         found[:, k : k + 1] = exists
         box = boxes.gather(1, index.unsqueeze(-1).expand(-1, -1, 4))
         dropped = (box_iou(box, boxes) > iou_threshold) & (labels == labels.gather(1, index))

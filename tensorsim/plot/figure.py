@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 #: Suffixes that :func:`save_figure` writes.
 FIGURE_FORMATS = ("png", "pdf", "svg")
+PNG_DPI = 120
 
 
 def new_figure(width: float = 9.0, height: float = 5.0) -> Figure:
@@ -32,6 +33,8 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         TensorsimError: another suffix, or a file that cannot be written.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in FIGURE_FORMATS:
         expected = ", ".join(f".{name}" for name in FIGURE_FORMATS)
@@ -41,4 +44,9 @@ def save_figure(figure: Figure, path: Path) -> None:
     with warnings.catch_warnings(), complete_file(path) as scratch:
         # Names of films may have letters that the font lacks: a box is drawn in their place.
         warnings.filterwarnings("ignore", "Glyph .* missing from")
-        figure.savefig(scratch, format=suffix, dpi=120, metadata=dated.get(suffix))
+        if suffix == "png":
+            # `savefig` draws twice, first for the layout alone, which drawing once settles as well.
+            figure.set_dpi(PNG_DPI)
+            FigureCanvasAgg(figure).print_png(scratch)
+        else:
+            figure.savefig(scratch, format=suffix, metadata=dated[suffix])

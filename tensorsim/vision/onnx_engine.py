@@ -131,10 +131,10 @@ class OnnxDetector(nn.Module):
             return self.detector.preprocess(images)
         side = self.detector.input_size
         height, width = letterbox_size(images.shape[-2], images.shape[-1], side)
-        squares = np.full((len(images), side, side, 3), LETTERBOX_GREY, np.uint8)
+        squares = np.full((len(images), 3, side, side), LETTERBOX_GREY, np.uint8)
         for square, image in zip(squares, images.permute(0, 2, 3, 1).numpy(), strict=True):
-            square[:height, :width] = cv2.resize(image, (width, height))
-        return self.detector.normalise(torch.from_numpy(squares).permute(0, 3, 1, 2))
+            square[:, :height, :width] = cv2.split(cv2.resize(image, (width, height)))
+        return self.detector.normalise(torch.from_numpy(squares))
 
 
 class _Dense(nn.Module):

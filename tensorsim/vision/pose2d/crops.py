@@ -77,18 +77,21 @@ def sample_bilinear(images: Tensor, index: Tensor, u: Tensor, v: Tensor) -> Tens
             first = int(left[n].min().clamp(0, width - 1))
             last = int((left[n].max() + 1).clamp(0, width - 1))
             part = pixels[int(index[n]), :, first : last + 1]
+        # Pixels and channels as one dimension: torch is slow where the last one has three numbers.
         lines = torch.zeros(1, dtype=u.dtype, device=u.device)
         for down in range(2):
             row = top[n] + down
             weight = (1 - (v[n] - row).abs()) * ((row >= 0) & (row < height))
-            line = part.index_select(0, row.clamp(0, height - 1).long())
-            lines = lines + weight[:, None, None] * line
+            line = part.index_select(0, row.clamp(0, height - 1).long()).flatten(1).to(u.dtype)
+            lines = torch.addcmul(lines, line, weight[:, None])
+        lines = lines.view(v.shape[1], -1, images.shape[1])
         crop = torch.zeros(1, dtype=u.dtype, device=u.device)
         for right in range(2):
             column = left[n] + right
             weight = (1 - (u[n] - column).abs()) * ((column >= 0) & (column < width))
-            crop = crop + weight[:, None] * lines.index_select(1, column.clamp(0, width - 1).long() - first)
-        crops.append(crop.unsqueeze(0))
+            chosen = lines.index_select(1, column.clamp(0, width - 1).long() - first).flatten(1)
+            crop = torch.addcmul(crop, chosen, weight.repeat_interleave(images.shape[1]))
+        crops.append(crop.view(1, v.shape[1], -1, images.shape[1]))
     return torch.cat(crops).permute(0, 3, 1, 2)
 
 
