@@ -143,7 +143,10 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     z = torch.lerp(above_floor[..., :1], above_floor[..., 1:], 0.8) - height[..., None, None, None]
     right, left = torch.cat([middle - half, z], dim=-1), torch.cat([middle + half, z], dim=-1)
     sides = projected(axes, focal, torch.stack([right, left], dim=-2))
-    across = (sides[..., 1, :] - sides[..., 0, :] - bodies.across) / bodies.across_noise[..., None]
+    # Networks take left for right, and people walk backwards: it counts how broad they look, not which side is left.
+    broad = sides[..., 1, :] - sides[..., 0, :]
+    broad = torch.where((broad * bodies.across).sum(dim=-1, keepdim=True) < 0, -broad, broad)
+    across = (broad - bodies.across) / bodies.across_noise[..., None]
 
     # Whoever walks nobody knows where to leans nobody knows where to, by about twice the noise.
     lost = 1.0 + bodies.walking * (~known).to(spot.dtype)

@@ -441,10 +441,14 @@ def test_whoever_walks_faces_where_the_way_goes(way: tuple[float, float]) -> Non
     bodies = seen([(way[0] * t - 0.5, 4.0 + way[1] * t) for t in range(12)], 1.5, 1.0)
     _, across, _ = misfit(parameters(1.5, 1.0, 1.0, 1.0), bodies, 10.0)
     torch.testing.assert_close(across, torch.zeros_like(across), atol=1e-9, rtol=0)
-    # Somebody who faces the other way looks mirrored.
+    # Whoever walks backwards, or whose sides are exchanged, looks mirrored, and as broad.
     turned = bodies._replace(across=-bodies.across)
     _, across, _ = misfit(parameters(1.5, 1.0, 1.0, 1.0), turned, 10.0)
-    torch.testing.assert_close(across, 2 * bodies.across / 0.01, atol=1e-9, rtol=0)
+    torch.testing.assert_close(across, torch.zeros_like(across), atol=1e-9, rtol=0)
+    # Who looks broader or narrower does not fit.
+    broader = bodies._replace(across=1.5 * bodies.across)
+    _, across, _ = misfit(parameters(1.5, 1.0, 1.0, 1.0), broader, 10.0)
+    torch.testing.assert_close(across, -0.5 * bodies.across / 0.01, atol=1e-9, rtol=0)
 
 
 def test_loss_and_weights_are_those_of_cauchy() -> None:
