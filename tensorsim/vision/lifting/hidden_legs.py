@@ -23,9 +23,10 @@ class HiddenLegs(nn.Module):
 
     A lifter knows nothing of the phase of legs beyond the picture, and gives them the mean of all phases: they hang
     without a swing, and the radar would see somebody glide. Where neither knees nor ankles are seen and the hips of an
-    upright body move forwards or backwards, thighs and shanks turn as in the gait of Boulic, Magnenat-Thalmann and
-    Thalmann (1990, :func:`tensorsim.body.gait.boulic_gait`), whose cadence follows from the speed; the phase is
-    arbitrary. Bones keep their lengths but for half a second at both ends, where old and new legs are blended.
+    upright body move along, thighs and shanks turn in the direction of travel as in the gait of Boulic,
+    Magnenat-Thalmann and Thalmann (1990, :func:`tensorsim.body.gait.boulic_gait`), whose cadence follows from the
+    speed; the phase is arbitrary. Which way a body without legs faces is known badly, so it matters only where it is
+    clearly backwards. Bones keep their lengths but for half a second at both ends, where old and new legs are blended.
 
     Args:
         slow_m_s, walking_m_s: speeds of the hips below which nothing is changed and from which all is a gait.
@@ -81,13 +82,13 @@ class HiddenLegs(nn.Module):
         hidden = valid & ~(seen[..., 9:11].any(dim=-1) | seen[..., 12:14].any(dim=-1))
         share = hidden.to(joints.dtype)
         share = share * ((speed - self.slow_m_s) / (self.walking_m_s - self.slow_m_s)).clamp(0.0, 1.0)
-        # Whoever moves sideways, bends down or lies does not walk.
+        # Whoever bends down or lies does not walk. Where forwards becomes backwards nothing steps, as legs would jump.
         share = (
-            share * ((forwards.abs() - 0.4) / 0.3).clamp(0.0, 1.0) * ((upright - 0.7) / 0.15).clamp(0.0, 1.0)
+            share * ((upright - 0.7) / 0.15).clamp(0.0, 1.0) * ((forwards + 0.7).abs() / 0.15).clamp(0.0, 1.0)
         )
         share = self._blended(share, fps)[..., None]
 
-        way = torch.where(forwards < 0, -1.0, 1.0).to(joints.dtype)
+        way = torch.where(forwards < -0.7, -1.0, 1.0).to(joints.dtype)
         ahead = F.pad(velocity / speed[..., None] * way[..., None], [0, 1])
         down = torch.tensor([0.0, 0.0, -1.0], dtype=joints.dtype, device=joints.device)
         upper = joints[..., 8:13:3, :] - joints[..., 9:14:3, :]  # hips to knees, right and left
