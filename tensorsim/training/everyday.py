@@ -28,12 +28,14 @@ from tensorsim.motion.timing import bell, segment
 
 #: Bodies and manners: untrained people, in every heading.
 PEOPLE = PeopleConfig(
-    height_m=(1.5, 1.95), speed_m_s=(0.6, 1.5), heading_rad=math.pi, variation=0.18, tempo=(0.55, 1.05)
+    height_m=(1.5, 1.95), speed_m_s=(0.6, 1.7), heading_rad=math.pi, variation=0.18, tempo=(0.55, 1.05)
 )
 #: Where the middle of a path is: x to either side, and nearest and farthest y, in metres.
 SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
-#: Shares of those who walk in curves and of those who walk round corners.
-_STROLLING, _CORNERING = 0.3, 0.25
+#: Shares of those who walk in curves, of those who walk round corners, and of those who go round and round.
+_STROLLING, _CORNERING, _ROUND = 0.2, 0.15, 0.35
+#: Shortest and longest sides of the ways of those who go round and round, in metres.
+_ROOM_M = ((0.8, 3.5), (0.5, 2.5))
 #: Slowest and fastest clock of falls: gravity does not let them go faster.
 _FALLING = (0.8, 1.05)
 #: Steps per second of those who step about while they do something.
@@ -141,6 +143,25 @@ def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
     return along(scripts.walk, heading, pace, people)
 
 
+def _round_and_round(time: Tensor, people: People, draw: Draw) -> Tensor:
+    """Joints (N, K, 14, 3) of people who walk round in a room, most along its walls, which the radar faces squarely."""
+    corners = 12
+    side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0)
+    turns_s = draw(0.4, 1.1)
+    walks_s = [torch.maximum(draw(*long_m) / people.speed_m_s[:, None], turns_s) for long_m in _ROOM_M]
+    slower = draw(0.0, 0.4)
+    along_walls = torch.round(draw(0.0, 4.0)) * (math.pi / 2) + draw(-0.3, 0.3) - people.heading_rad[:, None]
+    heading = torch.where(draw(0.0, 1.0) < 0.7, along_walls, 0.0) + torch.zeros_like(time)
+    pace = torch.ones_like(time)
+    middle = -draw(0.0, 1.0) * (walks_s[0] + walks_s[1])
+    for c in range(corners):
+        first, last = middle - turns_s / 2, middle + turns_s / 2
+        heading = heading + segment(time, first, last) * side * (math.pi / 2)
+        pace = pace - bell(time, first, last) * slower
+        middle = middle + walks_s[c % 2]
+    return along(scripts.walk, heading, pace, people)
+
+
 def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:
     """Clocks (N, K) of which half run unevenly: the person now and then slows down or holds still."""
     band = draw(0.2, 0.5)
@@ -153,13 +174,14 @@ def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:
 def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, draw: Draw) -> Tensor:
     """Joints (N, K, 14, 3) at ``KNOT_HZ`` about the origin, turned to the people's headings."""
     if variant.script is scripts.walk:
-        # Half of those who do not stroll go straight on, half turn round within some metres.
+        # Half of those who keep a straight line go on, half turn round within some metres.
         long = torch.where(draw(0.0, 1.0) < 0.5, 20.0, draw(1.5, 4.5))
         first = torch.where(long > 10, 0.0 * long, draw(0.0, 1.0) * long)
         straight = to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
         way = draw(0.0, 1.0)[..., None, None]
         bent = torch.where(way < _STROLLING, _stroll(time, people, draw), _round_corners(time, people, draw))
-        return torch.where(way < _STROLLING + _CORNERING, bent, straight)
+        bent = torch.where(way < _STROLLING + _CORNERING, bent, _round_and_round(time, people, draw))
+        return torch.where(way < _STROLLING + _CORNERING + _ROUND, bent, straight)
     rate = draw(*variant.rate)
     began = _began(variant, duration_s, rate, draw)
     clock = (time - began) * rate + variant.first_s
