@@ -183,6 +183,25 @@ def test_those_who_walk_round_corners_walk_straight_between_them():
     assert float(turned.amax()) < 2.4
 
 
+def test_those_who_walk_round_a_room_come_round_one_way_mostly_along_its_walls():
+    generator = torch.Generator().manual_seed(0)
+    people = draw_people(60, everyday.PEOPLE, generator)
+    time = torch.arange(12 * 120, dtype=torch.float64).expand(60, -1) / KNOT_HZ
+    joints = everyday._round_and_round(time, people, Draw(60, generator))
+    hips = joints[:, :, (8, 11), :2].mean(2)
+    way, turned = way_and_turns(hips, 60)
+    # Who turns left goes on turning left, by more than half a turn in 12 s; hips sway a little the other way.
+    one_way = turned.sum(1).abs()
+    assert float(one_way.min()) > math.pi
+    assert float((one_way / turned.abs().sum(1)).min()) > 0.5
+    # Seven of ten walk nearly along or across the line of sight between their turns.
+    straight = turned.abs() < 0.1
+    angle = torch.atan2(way[:, 1:, 0], way[:, 1:, 1])
+    off = (torch.remainder(angle + math.pi / 4, math.pi / 2) - math.pi / 4).abs()
+    square = ((off * straight).sum(1) / straight.sum(1).clamp(min=1)) < 0.4
+    assert 0.6 < float(square[straight.any(1)].double().mean()) < 0.95
+
+
 def test_cameras_have_people_in_view_and_are_known_to_some_degrees(standing):
     hips = (standing[:, 8] + standing[:, 11]) / 2
     wrong = []
