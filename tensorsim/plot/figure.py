@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 #: Suffixes that :func:`save_figure` writes.
 FIGURE_FORMATS = ("png", "pdf", "svg")
-PNG_DPI = 120
+_DPI = 120
 
 
 def new_figure(width: float = 9.0, height: float = 5.0) -> Figure:
@@ -46,7 +46,7 @@ def save_figure(figure: Figure, path: Path) -> None:
         warnings.filterwarnings("ignore", "Glyph .* missing from")
         if suffix == "png":
             # `savefig` draws twice, first for the layout alone, which drawing once settles as well.
-            figure.set_dpi(PNG_DPI)
+            figure.set_dpi(_DPI)
             FigureCanvasAgg(figure).print_png(scratch)
         else:
-            figure.savefig(scratch, format=suffix, metadata=dated[suffix])
+            figure.savefig(scratch, format=suffix, dpi=_DPI, metadata=dated[suffix])

@@ -123,6 +123,34 @@ def _stroll(time: Tensor, people: People, draw: Draw) -> Tensor:
     return along(scripts.walk, heading, pace, people)
 
 
+def _with_turns(
+    time: Tensor,
+    people: People,
+    heading: Tensor | float,
+    start: Tensor,
+    lasts: Tensor,
+    angle: Tensor,
+    slower: Tensor,
+) -> Tensor:
+    """Joints (N, K, 14, 3) of people who walk straight and turn C times.
+
+    Args:
+        time: (N, K) seconds.
+        people: N people.
+        heading: (N, 1) at first, besides their own, in radians.
+        start, lasts: (N, C) seconds.
+        angle: (N, C) radians, counter-clockwise.
+        slower: (N, C) share of the speed that is lost in the middle of a turn.
+    """
+    headings, pace = heading + torch.zeros_like(time), torch.ones_like(time)
+    for c in range(start.shape[1]):
+        first = start[:, c, None]
+        last = first + lasts[:, c, None]
+        headings = headings + segment(time, first, last) * angle[:, c, None]
+        pace = pace - bell(time, first, last) * slower[:, c, None]
+    return along(scripts.walk, headings, pace, people)
+
+
 def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
     """Joints (N, K, 14, 3) of people who walk straight and turn at corners, as round a table or from room to room."""
     corners = 5
@@ -133,33 +161,22 @@ def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
         draw(0.0, 1.0, corners) < 0.8, 1.0, -1.0
     )
     angle = side * draw(0.6, 2.2, corners)
-    slower = draw(0.0, 0.45, corners)
-    heading, pace = torch.zeros_like(time), torch.ones_like(time)
-    for c in range(corners):
-        first = start[:, c, None]
-        last = first + lasts[:, c, None]
-        heading = heading + segment(time, first, last) * angle[:, c, None]
-        pace = pace - bell(time, first, last) * slower[:, c, None]
-    return along(scripts.walk, heading, pace, people)
+    return _with_turns(time, people, 0.0, start, lasts, angle, draw(0.0, 0.45, corners))
 
 
 def _round_and_round(time: Tensor, people: People, draw: Draw) -> Tensor:
     """Joints (N, K, 14, 3) of people who walk round in a room, most along its walls, which the radar faces squarely."""
     corners = 12
-    side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0)
+    side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0).double()
     turns_s = draw(0.4, 1.1)
     walks_s = [torch.maximum(draw(*long_m) / people.speed_m_s[:, None], turns_s) for long_m in _ROOM_M]
     slower = draw(0.0, 0.4)
     along_walls = torch.round(draw(0.0, 4.0)) * (math.pi / 2) + draw(-0.3, 0.3) - people.heading_rad[:, None]
-    heading = torch.where(draw(0.0, 1.0) < 0.7, along_walls, 0.0) + torch.zeros_like(time)
-    pace = torch.ones_like(time)
-    middle = -draw(0.0, 1.0) * (walks_s[0] + walks_s[1])
-    for c in range(corners):
-        first, last = middle - turns_s / 2, middle + turns_s / 2
-        heading = heading + segment(time, first, last) * side * (math.pi / 2)
-        pace = pace - bell(time, first, last) * slower
-        middle = middle + walks_s[c % 2]
-    return along(scripts.walk, heading, pace, people)
+    heading = torch.where(draw(0.0, 1.0) < 0.7, along_walls, 0.0)
+    first = -draw(0.0, 1.0) * (walks_s[0] + walks_s[1])
+    middles = torch.cumsum(torch.cat([first, *(walks_s[c % 2] for c in range(corners - 1))], dim=1), dim=1)
+    turns_s, angle, slower = (x.expand(-1, corners) for x in (turns_s, side * (math.pi / 2), slower))
+    return _with_turns(time, people, heading, middles - turns_s / 2, turns_s, angle, slower)
 
 
 def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:

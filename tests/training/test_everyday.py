@@ -1,20 +1,22 @@
 """Everyday motion as films show it: in every heading, with errors of networks, and what the pipeline makes of it."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
+from torch import Tensor
 
 from tensorsim.config import ACTIVITIES, CameraConfig
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.measured.motions import KNOT_HZ, Draw
-from tensorsim.motion.people import draw_people
+from tensorsim.motion.people import People, draw_people
 from tensorsim.training import everyday
 from tensorsim.training.everyday import at_rate, bystander, everyday_motion
 from tensorsim.training.key_point_errors import FilmedMotion, Filming, draw_camera, find_key_points
 
 
-def motion(activity: int, count: int = 6, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def motion(activity: int, count: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     return everyday_motion(activity, count, torch.full((count,), 4.0), generator)
 
@@ -56,11 +58,16 @@ def way_and_turns(hips, step):
     return way, torch.remainder(heading.diff(dim=1) + math.pi, 2 * math.pi) - math.pi
 
 
-def test_those_who_stroll_walk_in_curves_and_go_where_they_face():
+def walkers(walk: Callable[[Tensor, People, Draw], Tensor], count: int, seconds: int) -> Tensor:
+    """Joints (N, K, 14, 3) of people who go one of the ways of everyday walks."""
     generator = torch.Generator().manual_seed(0)
-    people = draw_people(12, everyday.PEOPLE, generator)
-    time = torch.arange(4 * 120, dtype=torch.float64).expand(12, -1) / KNOT_HZ
-    joints = everyday._stroll(time, people, Draw(12, generator))
+    people = draw_people(count, everyday.PEOPLE, generator)
+    time = torch.arange(seconds * 120, dtype=torch.float64).expand(count, -1) / KNOT_HZ
+    return walk(time, people, Draw(count, generator))
+
+
+def test_those_who_stroll_walk_in_curves_and_go_where_they_face():
+    joints = walkers(everyday._stroll, 12, 4)
     hips = joints[:, :, (8, 11), :2].mean(2)
     # Over a second, so that the hips' own to and fro is left out.
     way, turned = way_and_turns(hips, 120)
@@ -128,7 +135,7 @@ def test_refuses_the_empty_scene():
 
 
 @pytest.fixture(scope="module")
-def standing() -> torch.Tensor:
+def standing() -> Tensor:
     """Joints (80, 14, 3) of somebody who rotates, at 20 frames a second."""
     return at_rate(motion(6, 1)[0][0], 80, 20.0)
 
@@ -172,11 +179,7 @@ def test_limbs_jump_for_a_moment_and_their_scores_hardly_fall(standing):
 
 
 def test_those_who_walk_round_corners_walk_straight_between_them():
-    generator = torch.Generator().manual_seed(0)
-    people = draw_people(40, everyday.PEOPLE, generator)
-    time = torch.arange(5 * 120, dtype=torch.float64).expand(40, -1) / KNOT_HZ
-    joints = everyday._round_corners(time, people, Draw(40, generator))
-    hips = joints[:, :, (8, 11), :2].mean(2)
+    hips = walkers(everyday._round_corners, 40, 5)[:, :, (8, 11), :2].mean(2)
     turned = way_and_turns(hips, 60)[1].abs()
     assert 0.2 < float((turned < 0.15).double().mean()) < 0.8
     assert float(turned.amax(1).median()) > 0.5
@@ -184,11 +187,7 @@ def test_those_who_walk_round_corners_walk_straight_between_them():
 
 
 def test_those_who_walk_round_a_room_come_round_one_way_mostly_along_its_walls():
-    generator = torch.Generator().manual_seed(0)
-    people = draw_people(60, everyday.PEOPLE, generator)
-    time = torch.arange(12 * 120, dtype=torch.float64).expand(60, -1) / KNOT_HZ
-    joints = everyday._round_and_round(time, people, Draw(60, generator))
-    hips = joints[:, :, (8, 11), :2].mean(2)
+    hips = walkers(everyday._round_and_round, 60, 12)[:, :, (8, 11), :2].mean(2)
     way, turned = way_and_turns(hips, 60)
     # Who turns left goes on turning left, by more than half a turn in 12 s; hips sway a little the other way.
     one_way = turned.sum(1).abs()

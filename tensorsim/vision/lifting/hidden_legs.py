@@ -25,8 +25,9 @@ class HiddenLegs(nn.Module):
     without a swing, and the radar would see somebody glide. Where neither knees nor ankles are seen and the hips of an
     upright body move along, thighs and shanks turn in the direction of travel as in the gait of Boulic,
     Magnenat-Thalmann and Thalmann (1990, :func:`tensorsim.body.gait.boulic_gait`), whose cadence follows from the
-    speed; the phase is arbitrary. Which way a body without legs faces is known badly, so it matters only where it is
-    clearly backwards. Bones keep their lengths but for half a second at both ends, where old and new legs are blended.
+    speed; the phase is arbitrary. Which way a body with hidden legs faces is known badly, so it matters only where the
+    person clearly walks backwards. Bones keep their lengths but for half a second at both ends, where old and new legs
+    are blended.
 
     Args:
         slow_m_s, walking_m_s: speeds of the hips below which nothing is changed and from which all is a gait.
@@ -82,7 +83,7 @@ class HiddenLegs(nn.Module):
         hidden = valid & ~(seen[..., 9:11].any(dim=-1) | seen[..., 12:14].any(dim=-1))
         share = hidden.to(joints.dtype)
         share = share * ((speed - self.slow_m_s) / (self.walking_m_s - self.slow_m_s)).clamp(0.0, 1.0)
-        # Whoever bends down or lies does not walk. Where forwards becomes backwards nothing steps, as legs would jump.
+        # Whoever bends down or lies does not walk. No legs step where forwards turns into backwards: they would jump.
         share = (
             share * ((upright - 0.7) / 0.15).clamp(0.0, 1.0) * ((forwards + 0.7).abs() / 0.15).clamp(0.0, 1.0)
         )
