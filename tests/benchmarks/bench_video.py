@@ -10,6 +10,12 @@ The peer is ONNX Runtime running the same networks on every frame, one by one: d
 mirror test in the boxes that were tracked.
 """
 
+# isort: off
+from tensorsim import process
+
+process.prepare()  # as the command does, before torch is loaded: threads that spin take time from the others
+
+# isort: on
 import argparse
 import functools
 import statistics
