@@ -18,14 +18,11 @@ from tensorsim.errors import (
 from tensorsim.ops import of_person
 from tensorsim.vision.calibration.camera_fit import Bodies, fit_camera
 from tensorsim.vision.calibration.upright import (
-    BREADTH,
-    BREADTH_SPREAD,
     LEAN,
     LEAN_SPREAD,
     PACE,
     PACE_SPREAD,
     STANDING,
-    TURNED,
     WALK_RATIO,
     WALK_RATIO_SPREAD,
     WALKING,
@@ -179,8 +176,6 @@ class CameraCalibrator(nn.Module):
         self.most_frames = most_frames
         degree = math.pi / 180
         self.lean, self.lean_spread = LEAN, LEAN_SPREAD
-        self.breadth, self.breadth_spread = BREADTH, BREADTH_SPREAD
-        self.turned = TURNED * BREADTH / (STANDING[1] - STANDING[0])
         self.pace, self.pace_spread = PACE, PACE_SPREAD
         self.walk_ratio, self.walk_ratio_spread = WALK_RATIO, WALK_RATIO_SPREAD
         self.least_rhythm = 0.4  # share of a sinusoid in the steps from which a cadence is believed
@@ -263,11 +258,8 @@ class CameraCalibrator(nn.Module):
             for axis in range(2):
                 smooth.append(local_linear(ends[:, :, end, axis], weights, sigma))
         ends = torch.stack(smooth, dim=-1).unflatten(-1, [2, 2])
-        line = (keypoints[:, :, 5] - keypoints[:, :, 6] + keypoints[:, :, 11] - keypoints[:, :, 12]) / 2
-        across = torch.stack([local_linear(line[..., axis], weights, sigma) for axis in range(2)], dim=-1)
         chosen, apart, every = self._looked_at(upright, fps)
         ends, upright, walking = ends[:, chosen], upright[:, chosen] & ~apart, walking[:, chosen]
-        across = across[:, chosen]
         independent = self._independent(ends, upright, every / fps)
         # Each person has parameters of their own, and time and memory grow with the square of their number.
         told = independent[:, 0, 0] * upright.sum(dim=-1)
@@ -275,32 +267,25 @@ class CameraCalibrator(nn.Module):
 
         stature = of_person(self.stature, torch.arange(people, device=valid.device))
         ends, upright, walking, independent = ends[most], upright[most], walking[most], independent[most]
-        stature, cycles_hz, rhythm, across = stature[most], cycles_hz[most], rhythm[most], across[most]
+        stature, cycles_hz, rhythm = stature[most], cycles_hz[most], rhythm[most]
         middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64, device=valid.device)
         image = torch.where(upright[..., None, None], (ends - middle) / (width / 2), 0.1)
         size = torch.linalg.vector_norm(image[..., 0, :] - image[..., 1, :], dim=-1)
-        noise = ((0.02 * size).square() + (2.0 / (width / 2)) ** 2).sqrt()
         bodies = Bodies(
             image,
-            torch.where(upright[..., None], across / (width / 2), 0.0),
             upright,
             stature[:, None, None] * (self.standing + walking[..., None] * (self.walking - self.standing)),
             walking,
-            noise,
-            (noise.square() + (self.turned * size).square()).sqrt(),
+            ((0.02 * size).square() + (2.0 / (width / 2)) ** 2).sqrt(),
         )
         nothing = torch.zeros_like(stature)
         stepping = rhythm >= self.least_rhythm
         pace = (torch.where(stepping, self.walk_ratio * cycles_hz.square(), self.pace) * stature).log()
         of_camera, camera_sd = self._expected(height, width)
-        of_people = torch.cat([nothing, pace, self.lean * stature, (self.breadth * stature).log()])
-        mean = torch.cat([of_camera, of_people])
+        mean = torch.cat([of_camera, nothing, pace, self.lean * stature])
         pace_sd = torch.where(stepping, self.walk_ratio_spread, nothing + self.pace_spread)
-        own_sd = torch.cat(
-            [self.height_sd_m / stature, pace_sd, self.lean_spread * stature, nothing + self.breadth_spread]
-        )
-        deviation = torch.cat([camera_sd, own_sd])
-        rest = of_people.expand(self.starts.shape[0], -1)
+        deviation = torch.cat([camera_sd, self.height_sd_m / stature, pace_sd, self.lean_spread * stature])
+        rest = torch.cat([nothing, pace, self.lean * stature]).expand(self.starts.shape[0], -1)
         at, covariance, cost = fit_camera(
             torch.cat([_across(self.starts, height, width), rest], dim=-1),
             mean,

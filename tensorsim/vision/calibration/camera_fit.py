@@ -3,8 +3,8 @@
 An upright body is a few points above each other at known heights (Lv, Zhao, Nevatia, "Camera calibration from video
 of a walking human", 2006, use feet and head). For a camera of given tilt, roll, height and field of view the spot
 on the floor that places them best in the image is linear least squares; what is left over tells the camera: sizes at
-several places the horizon, the lean of bodies beside the middle the nadir, both together the focal length. So do people
-who walk: at a speed that their cadence tells, and where their trunk faces.
+several places the horizon, the lean of bodies beside the middle the nadir, both together the focal length. How broad
+trunks look tells nothing: people who walk past a camera turn them towards it, by up to 40 degrees.
 """
 
 import math
@@ -60,13 +60,8 @@ def place_upright(
     y = (normal[..., 0, 0] * right[..., 1] - normal[..., 1, 0] * right[..., 0]) / det
     spot = torch.stack([x, y], dim=-1)
     points = torch.cat([spot[..., None, :] + beside, z[..., None]], dim=-1)
-    return spot, projected(axes, focal, points)
-
-
-def projected(axes: Tensor, focal: Tensor, points: Tensor) -> Tensor:
-    """Images (..., P, T, K, 2) of points (..., P, T, K, 3) seen from the camera; axes and focal (...)."""
     local = torch.matmul(points, axes[..., None, None, :, :].transpose(-1, -2))
-    return focal[..., None, None, None, None] * local[..., :2] / local[..., 2:].clamp(min=0.1)
+    return spot, f * local[..., :2] / local[..., 2:].clamp(min=0.1)
 
 
 class Bodies(NamedTuple):
@@ -74,48 +69,38 @@ class Bodies(NamedTuple):
 
     Attributes:
         image: (P, T, 2, 2) ankles and shoulders in half widths of the picture, from its middle.
-        across: (P, T, 2) from right to left, the mean of shoulders and hips, in half widths.
         upright: (P, T) bool, the frames that count.
         above_floor: (P, T, 2) metres.
         walking: (P, T) from 0, standing, to 1, walking.
         noise: (P, T) standard deviation of a point in half widths.
-        across_noise: (P, T) standard deviation of ``across`` in half widths.
     """
 
     image: Tensor
-    across: Tensor
     upright: Tensor
     above_floor: Tensor
     walking: Tensor
     noise: Tensor
-    across_noise: Tensor
 
 
-def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals of upright bodies, of how broad they look and of their walking speeds, in standard deviations.
-
-    Whoever walks goes where the trunk faces. How broad it looks tells at which angle to the line of sight that is, and
-    so how a way in depth compares with one across the picture: the focal length.
+def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tensor]:
+    """Residuals of upright bodies and of their walking speeds, in standard deviations.
 
     Args:
-        parameters: (..., 4 + 4 P): pitch, roll, logarithm of the height of the camera in m, horizontal field of view,
-            then for all people the logarithms of the factor on the body height and of the walking speed in m/s, by
-            how many metres the shoulders are ahead of the ankles in a walk, and the logarithm of the breadth of
-            the trunk in m.
+        parameters: (..., 4 + 3 P): pitch, roll, logarithm of the height of the camera in m, horizontal field of view,
+            then for all people the logarithms of the factor on the body height and of the walking speed in m/s, and by
+            how many metres the shoulders are ahead of the ankles in a walk.
         bodies: what is seen.
         fps: frames per second.
 
     Returns:
-        (..., P, T, 4) of ankles and shoulders, (..., P, T, 2) of how broad the trunk looks and (..., P, T) of the
-        speeds; zeros where nothing is known.
+        (..., P, T, 4) of ankles and shoulders, (..., P, T) of the speeds; zeros where nothing is known.
     """
     people, frames = bodies.upright.shape[0], bodies.upright.shape[1]
     axes = camera_axes(parameters[..., 0], parameters[..., 1])
     focal = 1.0 / torch.tan(parameters[..., 3] / 2)
     height = parameters[..., 2].exp()
-    own = parameters[..., 4:].unflatten(-1, [4, people])
+    own = parameters[..., 4:].unflatten(-1, [3, people])
     factor, pace, lean = own[..., 0, :].exp(), own[..., 1, :].exp(), own[..., 2, :]
-    breadth = own[..., 3, :].exp()
     above_floor = bodies.above_floor * factor[..., None, None]
     nowhere = torch.zeros_like(bodies.image)
     spot, _ = place_upright(axes, height, focal, bodies.image, above_floor, nowhere)
@@ -133,43 +118,32 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     path = torch.linalg.vector_norm(between - start, dim=-1) + torch.linalg.vector_norm(end - between, dim=-1)
     known = bodies.upright.index_select(-1, after) & bodies.upright.index_select(-1, before) & bodies.upright
     moves = bodies.walking * known.to(spot.dtype)
-    along = way / distance.clamp(min=0.3)[..., None]
-    ahead = along * (moves * lean[..., None])[..., None]
+    ahead = way / distance.clamp(min=0.3)[..., None] * (moves * lean[..., None])[..., None]
     beside = torch.stack([torch.zeros_like(ahead), ahead], dim=-2)
-    spot, seen = place_upright(axes, height, focal, bodies.image, above_floor, beside)
-    # The middle between shoulders and hips is at 0.8 of the way from the ankles to the shoulders.
-    half = torch.stack([-along[..., 1], along[..., 0]], dim=-1) * (breadth / 2)[..., None, None]
-    middle = spot + 0.8 * ahead
-    z = torch.lerp(above_floor[..., :1], above_floor[..., 1:], 0.8) - height[..., None, None, None]
-    right, left = torch.cat([middle - half, z], dim=-1), torch.cat([middle + half, z], dim=-1)
-    sides = projected(axes, focal, torch.stack([right, left], dim=-2))
-    # Networks take left for right, and people walk backwards: it counts how broad they look, not which side is left.
-    broad = sides[..., 1, :] - sides[..., 0, :]
-    broad = torch.where((broad * bodies.across).sum(dim=-1, keepdim=True) < 0, -broad, broad)
-    across = (broad - bodies.across) / bodies.across_noise[..., None]
+    _, seen = place_upright(axes, height, focal, bodies.image, above_floor, beside)
 
     # Whoever walks nobody knows where to leans nobody knows where to, by about twice the noise.
     lost = 1.0 + bodies.walking * (~known).to(spot.dtype)
     away = (seen - bodies.image) / (lost * bodies.noise)[..., None, None]
     away = torch.where(bodies.upright[..., None, None], away, 0.0).flatten(-2)
     speed = path / (span / fps)
-    return away, moves[..., None] * across, moves * (speed / pace[..., None] - 1.0) / 0.1
+    return away, moves * (speed / pace[..., None] - 1.0) / 0.1
 
 
 def residuals(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
-    """All kinds of :func:`misfit` together, (..., P, T, 7)."""
-    away, across, speed = misfit(parameters, bodies, fps)
-    return torch.cat([away, across, speed[..., None]], dim=-1)
+    """Both kinds of :func:`misfit` together, (..., P, T, 5)."""
+    away, speed = misfit(parameters, bodies, fps)
+    return torch.cat([away, speed[..., None]], dim=-1)
 
 
 def jacobian(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
-    """Derivative (..., P, T, 7, 4 + 4 P) of :func:`residuals` by the parameters, by central differences."""
+    """Derivative (..., P, T, 5, 4 + 3 P) of :func:`residuals` by the parameters, by central differences."""
     people, step = bodies.upright.shape[0], 1e-5
     columns: list[Tensor] = []
     each = torch.eye(people, dtype=parameters.dtype, device=parameters.device)[:, None, None, :]
-    for i in range(4 + 4):
+    for i in range(4 + 3):
         # One of the camera, or one of all people at once: each body depends on those of its own person only.
-        moved = torch.zeros(4 + 4 * people, dtype=parameters.dtype, device=parameters.device)
+        moved = torch.zeros(4 + 3 * people, dtype=parameters.dtype, device=parameters.device)
         if i < 4:
             moved[i] = step
         else:
@@ -181,12 +155,11 @@ def jacobian(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
 
 
 def robust(residual: Tensor, outlier: float) -> tuple[Tensor, Tensor]:
-    """Cauchy's loss (..., P, T, 3) of the three kinds of residuals (..., P, T, 7), and its weights (..., P, T, 7)."""
-    squared = residual.square() / outlier**2
-    kinds = [squared[..., :4].sum(dim=-1), squared[..., 4:6].sum(dim=-1), squared[..., 6]]
-    loss = 0.5 * outlier**2 * torch.log1p(torch.stack(kinds, dim=-1))
-    each = torch.stack([kinds[kind] for kind in [0, 0, 0, 0, 1, 1, 2]], dim=-1)
-    return loss, 1.0 / (1.0 + each)
+    """Cauchy's loss (..., P, T, 2) of bodies and of speeds (..., P, T, 5), and the weights that it gives."""
+    squared = (
+        torch.stack([residual[..., :4].square().sum(dim=-1), residual[..., 4].square()], dim=-1) / outlier**2
+    )
+    return 0.5 * outlier**2 * torch.log1p(squared), 1.0 / (1.0 + squared)
 
 
 def fit_camera(
@@ -206,8 +179,8 @@ def fit_camera(
     Most starts come to the same end, so after a few steps only the best go on, until they hardly move.
 
     Args:
-        start: (S, 4 + 4 P) parameters, see :func:`misfit`.
-        mean, deviation: (4 + 4 P,) of the priors.
+        start: (S, 4 + 3 P) parameters, see :func:`misfit`.
+        mean, deviation: (4 + 3 P,) of the priors.
         bodies, fps: see :func:`misfit`.
         share: (P, 1, 1) how much each frame of a person counts; successive frames are not independent.
         rounds: steps at most.
@@ -216,7 +189,7 @@ def fit_camera(
         outlier: residual in standard deviations beyond which a body or a speed is doubted.
 
     Returns:
-        Parameters (K, 4 + 4 P), their covariance (K, 4 + 4 P, 4 + 4 P) and cost (K,).
+        Parameters (K, 4 + 3 P), their covariance (K, 4 + 3 P, 4 + 3 P) and cost (K,).
     """
     at, residual = start, residuals(start, bodies, fps)
     cost = _cost(at, residual, mean, deviation, share, outlier)
@@ -228,6 +201,7 @@ def fit_camera(
             best = cost.argsort()[:kept]
             at, residual, cost, damping = at[best], residual[best], cost[best], damping[best]
         trust = share * robust(residual, outlier)[1]
+        trust = torch.cat([trust[..., :1].expand(-1, -1, -1, 4), trust[..., 1:]], dim=-1)
         slope = jacobian(at, bodies, fps)
         weighted = (slope * trust[..., None]).flatten(1, 3)
         hessian = torch.matmul(weighted.transpose(-1, -2), slope.flatten(1, 3)) + precision

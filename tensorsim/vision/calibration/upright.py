@@ -15,12 +15,6 @@ WALKING = (0.075, 0.798)
 #: How far the shoulders are ahead of the ankles in a walk over the standing height (0.01 to 0.06), and its standard
 #: deviation.
 LEAN, LEAN_SPREAD = 0.035, 0.02
-#: Mean distance between the key points of shoulders and of hips over the standing height, and the standard deviation of
-#: its logarithm (captured walkers 0.16 and 0.185).
-BREADTH, BREADTH_SPREAD = 0.165, 0.1
-#: Standard deviation in radians of the angle between where somebody goes within a second and where the trunk faces
-#: (captured walks 0 to 5 degrees).
-TURNED = 0.07
 #: Walking speed in standing heights per second, and the standard deviation of its logarithm.
 PACE, PACE_SPREAD = 0.7, 0.2
 #: Walking speed in standing heights per second over the square of the cycles per second, and the standard deviation of
