@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from tensorsim.config import ProcessingConfig, RadarConfig, SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, check_scene, is_exporting
-from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.options import configured, echo_of, refuse_conflicts
 from tensorsim.radar.processing.ambiguity import SpeedCheck, check_unambiguous
 from tensorsim.radar.processing.columns import Columns, block_rms, join_pulses
@@ -370,7 +370,7 @@ class RadarSimulator(nn.Module):
         magnitude = profiles.transpose(1, 2).abs()
         if self.channels == 1:
             return magnitude
-        return magnitude.unflatten(1, [self.channels, -1]).square().mean(1).sqrt()
+        return safe_sqrt(magnitude.unflatten(1, [self.channels, -1]).square().mean(1))
 
     def _piece(self, fresh: Tensor, positions: Tensor, rcs: Tensor, pending: Pending) -> Piece:
         """Maps of the next pulses, after those of which ``pending`` is left.

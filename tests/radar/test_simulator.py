@@ -328,6 +328,21 @@ def test_display_rate_keeps_the_doppler_map():
     assert torch.equal(short.doppler_time, full.doppler_time)
 
 
+@pytest.mark.parametrize(
+    "simulator",
+    [
+        RadarSimulator(SMALL, snr_db=None, display_rate_hz=32.0),
+        RadarSimulator(replace(SMALL, rx_m=((0.1, 0.0, 1.5), (0.2, 0.0, 1.5))), snr_db=None),
+    ],
+    ids=["display rate", "array"],
+)
+def test_the_gradient_is_zero_where_somebody_stands_still(simulator):
+    p = torch.tensor([0.0, 3.0, 1.5]).repeat(40, 2, 1).requires_grad_(True)
+    maps = simulator(p, torch.ones(2))
+    assert float(maps.range_time_mti.detach().max()) == 0
+    assert torch.equal(torch.autograd.grad(maps.range_time_mti.sum(), p)[0], torch.zeros_like(p))
+
+
 def mover(speed, prf_hz, scatterers=4):
     t = torch.arange(40).double() / prf_hz
     return torch.stack((0 * t, 4 + speed * t, 0 * t + 1.5), -1)[:, None].repeat(1, scatterers, 1)

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from tensorsim.ops import safe_sqrt
+
 
 def block_rms(magnitude: Tensor, block: int) -> Tensor:
     """Root mean square of every ``block`` columns: (..., R, M) -> (..., R, ceil(M / block)).
@@ -17,7 +19,7 @@ def block_rms(magnitude: Tensor, block: int) -> Tensor:
     mean = power[..., :whole].unflatten(-1, (whole // block, block)).mean(-1)
     if whole < columns:
         mean = torch.cat((mean, power[..., whole:].mean(-1, keepdim=True)), -1)
-    return mean.sqrt()
+    return safe_sqrt(mean)
 
 
 def join_pulses(earlier: Tensor, later: Tensor) -> Tensor:
