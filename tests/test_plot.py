@@ -3,6 +3,7 @@
 import itertools
 import os
 from pathlib import Path
+from typing import Any
 
 import matplotlib.colors
 import numpy as np
@@ -167,6 +168,36 @@ def test_noise_of_an_empty_scene_is_drawn_below_the_echo_of_a_person() -> None:
     assert (figure.axes[0].images[0].get_array() == -50).all()
     assert figure.axes[0].texts[0].get_text() == "no person in the scene"
     assert figure.axes[1].get_ylabel() == "dB below the echo of a person"
+
+
+RADARS: dict[str, tuple[ts.RadarConfig, dict[str, Any]]] = {
+    "beside": (ts.RadarConfig.through_wall(tx_m=(2.9, 1.0, 1.5), rx_m=(3.1, 1.0, 1.5)), {}),
+    "behind": (ts.RadarConfig.through_wall(tx_m=(-0.1, 3.0, 1.5), rx_m=(0.1, 3.0, 1.5)), {}),
+    "long window": (ts.RadarConfig.through_wall(), {"window_s": 1.7}),
+    "far gate": (ts.RadarConfig.through_wall(), {"range_gate_m": (3.0, 6.0)}),
+}
+
+
+@pytest.mark.parametrize(("radar", "options"), RADARS.values(), ids=RADARS)
+def test_the_echo_of_a_person_is_that_of_one_at_3_m(
+    radar: ts.RadarConfig, options: dict[str, Any], recwarn: pytest.WarningsRecorder
+) -> None:
+    usual = plot.person_peaks(ts.radar.RadarSimulator(ts.RadarConfig.through_wall()))["range_time"]
+    peak = plot.person_peaks(ts.radar.RadarSimulator(radar, **options))["range_time"]
+    assert not recwarn.list
+    assert peak == pytest.approx(usual, rel=0.25 if options == {} else 1.0)
+
+
+def test_the_echo_of_a_person_before_a_slow_radar() -> None:
+    """Half of its unambiguous speed, 0.24 m/s; at 1 m/s the map would be refused."""
+    simulator = ts.radar.RadarSimulator(ts.RadarConfig(prf_hz=500.0))
+    doppler_time = plot.person_peaks(simulator)["doppler_time"]
+    assert doppler_time > 0
+
+
+def test_a_map_of_one_row_is_drawn() -> None:
+    figure = plot.map_figure(np.ones((1, 20)), np.arange(20.0), np.zeros(1), "map", "range in m")
+    assert figure.axes[0].get_ylim() == (-0.5, 0.5)
 
 
 def test_caption_names_film_radar_and_label() -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.plot.figure import new_figure
 
 if TYPE_CHECKING:
@@ -80,6 +81,9 @@ def decibels(magnitude: np.ndarray, dynamic_range_db: float, peak: float | None 
 def person_peaks(simulator: RadarSimulator) -> dict[str, float]:
     """Peaks of the maps of a target of 1 m^2 at 3 m that approaches at 1 m/s: about those of one person.
 
+    It is nearer or farther where the range bins do not reach to 3 m, and slower where 1 m/s is more than half of the
+    unambiguous speed or more than 1 m of way.
+
     An empty scene has no echo of its own to refer to; drawn relative to these peaks, its noise is seen as weak as
     it is. The random generator is left as it was.
 
@@ -88,13 +92,15 @@ def person_peaks(simulator: RadarSimulator) -> dict[str, float]:
     """
     import torch
 
-    like = simulator.range_profile.range_m
-    time_s = torch.arange(2 * simulator.min_pulses, device=like.device) / simulator.radar.prf_hz
-    positions = torch.zeros(time_s.shape[0], 1, 3, device=like.device)
-    positions[:, 0, 1] = 3.0 - time_s
-    positions[:, 0, 2] = simulator.radar.tx_positions_m[0][2]
-    with torch.random.fork_rng(), torch.no_grad():
-        maps = simulator(positions, torch.ones(1, device=like.device))
+    radar, bins = simulator.radar, simulator.range_profile.range_m
+    time_s = torch.arange(2 * simulator.min_pulses, device=bins.device) / radar.prf_hz
+    distance_m = min(max(3.0, float(bins[0])), float(bins[-1]) + radar.range_resolution_m / 2)
+    speed_m_s = min(1.0, radar.unambiguous_speed_m_s / 2, 1.0 / float(time_s[-1]))
+    positions = bins.new_tensor(radar.middle_m, dtype=torch.float32).repeat(time_s.shape[0], 1, 1)
+    positions[:, 0, 1] += distance_m - speed_m_s * time_s
+    with torch.random.fork_rng(), torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", TensorsimWarning)  # of a target that nobody put there
+        maps = simulator(positions, torch.ones(1, device=bins.device))
     return {
         name: float(getattr(maps, name).max()) for name in ("range_time", "range_time_mti", "doppler_time")
     }
@@ -165,7 +171,7 @@ def map_figure(
         ]
     figure = new_figure(width=9.0 if reference is None else 15.0)
     row = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
-    step = float(axis[1] - axis[0])
+    step = float(axis[1] - axis[0]) if len(axis) > 1 else 1.0
     span_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 else 1.0
     low, high = float(axis[0]) - step / 2, float(axis[-1]) + step / 2
     extent = (float(time_s[0]) - span_s / 2, float(time_s[-1]) + span_s / 2, low, high)
