@@ -51,6 +51,7 @@ def window_starts(duration_s: float, window_s: float = WINDOW_S, step_s: float =
     return [*(start for start in starts if last - start >= step_s / 2), last]
 
 
+@torch.no_grad()
 def label_windows(
     recognizer: ActivityRecognizer,
     maps: RadarMaps,

@@ -131,6 +131,14 @@ def test_the_other_way_round_counts_as_much() -> None:
         ts.recognition.ActivityRecognizer(RADAR, BrightHalf(), "merged", either_way=True)
 
 
+def test_labels_need_no_graph() -> None:
+    """The weights of `from_pretrained` are trainable: each number of a graph would be a warning of torch."""
+    asked, graphs = recognizer(), []
+    asked.network.register_forward_hook(lambda *_: graphs.append(torch.is_grad_enabled()))
+    label_windows(asked, maps(1000, 500), 10.0)
+    assert graphs == [False] * 7
+
+
 def test_bad_input_is_refused() -> None:
     with pytest.raises(TensorsimError, match="temperature: got 0"):
         recognizer(0.0)
