@@ -62,11 +62,15 @@ def connect(peaks: Ridges, orders: Tensor, bins: int) -> Ridges:
     frames, count = index.shape[-2], index.shape[-1]
     jump = (index[..., 1:, None, :] - index[..., :-1, :, None]).abs()  # (..., K - 1, from, to)
     jump = torch.minimum(jump, bins - jump)
-    rows = torch.arange(count, device=index.device)
-    cells = (rows * count + orders).flatten()
-    cost = jump.flatten(-2).index_select(-1, cells).unflatten(-1, orders.shape).sum(-1)
-    start = rows.expand(index[..., :1, :].shape)
-    order = torch.cat((start, orders[cost.argmin(-1)]), -2)  # (..., K, C): row -> peak, frame to frame
+    parts = [torch.arange(count, device=index.device).expand(index[..., :1, :].shape)]
+    # Blocks of frames: six ridges have 720 permutations, whose costs would be larger than the map.
+    clips = max(1, index[..., 0, 0].numel())
+    for block in jump.split(max(1, (1 << 18) // (clips * orders.numel())), -3):
+        cost = block[..., 0, :].index_select(-1, orders[:, 0])
+        for row in range(1, count):
+            cost = cost + block[..., row, :].index_select(-1, orders[:, row])
+        parts.append(orders[cost.argmin(-1)])
+    order = torch.cat(parts, -2)  # (..., K, C): row -> peak, frame to frame
     reach = 1
     while reach < frames:  # cumulative composition of permutations, over 1, 2, 4, ... frames
         head, tail = order[..., :reach, :], order[..., reach:, :]

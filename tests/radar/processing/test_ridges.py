@@ -79,6 +79,14 @@ def test_permutations_are_the_cheapest():
             assert cost(range(count)) == best
 
 
+def test_long_clips_are_connected_in_pieces_that_fit_together():
+    """Six ridges of 400 frames take several blocks; every frame continues the one before."""
+    tracks = np.arange(10, 120, 20)[:, None] + np.zeros((1, 400), dtype=int)
+    heights = np.random.default_rng(0).uniform(0.5, 1.0, tracks.shape)
+    indices = RidgeExtractor(6)(bumps(tracks, heights)).indices
+    assert torch.equal(indices, indices[:, :1].expand(-1, 400))
+
+
 def test_rows_start_in_the_order_of_strength():
     k = np.arange(5)
     tracks = np.stack((20 + 0 * k, 60 + 0 * k, 100 + 0 * k))
