@@ -121,6 +121,8 @@ def check_shape(x: Tensor, shape: list[int], name: str) -> None:
 
 def check_mask(x: Tensor, shape: list[int], name: str) -> None:
     """Refuse anything but a boolean tensor of this shape."""
+    if not torch.jit.is_scripting():
+        check_is_tensor(x, name)
     if x.dtype != torch.bool or list(x.shape) != shape:
         raise TensorsimError(
             f"{name}: got {x.dtype} of shape {list(x.shape)}, expected bool of shape {shape}"

@@ -10,6 +10,7 @@ from tensorsim.config import ProcessingConfig, RadarConfig, SceneConfig, WallCon
 from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, check_scene, is_exporting
 from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
+from tensorsim.protocols import check_instance
 from tensorsim.radar.options import configured, echo_of, refuse_conflicts
 from tensorsim.radar.processing.ambiguity import SpeedCheck, check_unambiguous
 from tensorsim.radar.processing.columns import Columns, block_rms, join_pulses
@@ -98,9 +99,9 @@ class RadarSimulator(nn.Module):
         min_pulses: the shortest clip that has a Doppler frame.
 
     Raises:
-        TensorsimError: see the stages; maps of a clip shorter than ``min_pulses``; motion that the PRF cannot follow
-            (eager only, like the warnings of targets beyond the range axis or a fixed gate; see
-            :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
+        TensorsimError: see the stages; ready modules of another class; maps of a clip shorter than ``min_pulses``;
+            motion that the PRF cannot follow (eager only, like the warnings of targets beyond the range axis or a
+            fixed gate; see :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
     """
 
     def __init__(
@@ -121,6 +122,13 @@ class RadarSimulator(nn.Module):
         super().__init__()
         if isinstance(mti, str):
             options["mti"] = mti
+        elif mti is not None:
+            check_instance(mti, MovingTargetIndicator, "mti")
+        if echo is not None:
+            check_instance(echo, EchoSynthesizer, "echo")
+        for name, part in (("doppler", doppler), ("ridges", ridges)):
+            if part is not None:
+                check_instance(part, nn.Module, name)
         scene, processing = configured(radar, wall, processing, options)
         ready: dict[str, nn.Module | None] = {"echo": echo, "doppler": doppler, "ridges": ridges}
         ready["mti"] = mti if isinstance(mti, nn.Module) else None
@@ -164,8 +172,7 @@ class RadarSimulator(nn.Module):
 
     def forward(self, positions: Tensor, rcs: Tensor) -> RadarMaps:
         """Positions (..., M, S, 3) m and RCS (..., S) or (..., M, S) m^2 to maps."""
-        lead = list(positions.shape)[:-3]
-        positions, rcs = self._scene(positions, rcs)
+        positions, rcs, lead = self._scene(positions, rcs)
         pulses = positions.shape[1]
         self._check_pulses(pulses)
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
@@ -198,8 +205,7 @@ class RadarSimulator(nn.Module):
     @torch.jit.export
     def doppler_time(self, positions: Tensor, rcs: Tensor) -> Tensor:
         """Only the Doppler-time map (..., F, K) of :meth:`forward`; with one seed the same."""
-        lead = list(positions.shape)[:-3]
-        positions, rcs = self._scene(positions, rcs)
+        positions, rcs, lead = self._scene(positions, rcs)
         self._check_pulses(positions.shape[1])
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         pending = self._nothing_pending(positions)
@@ -218,8 +224,7 @@ class RadarSimulator(nn.Module):
         Channel ``v = k A + a`` is transmitter k with receiver a; transmitters fire in turn, see
         :func:`~tensorsim.radar.align_transmitters`. With one seed those of :meth:`forward`.
         """
-        lead = list(positions.shape)[:-3]
-        positions, rcs = self._scene(positions, rcs)
+        positions, rcs, lead = self._scene(positions, rcs)
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
         parts: list[Tensor] = []
         for start, points, sections, way in self._stretches(positions, rcs):
@@ -229,12 +234,12 @@ class RadarSimulator(nn.Module):
             profiles = profiles.unflatten(-1, [self.channels, -1]).transpose(1, 2)
         return unflatten_batch(profiles, lead)
 
-    def _scene(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (B, M, S, 3) and RCS (B, M, S) of a scene, checked."""
+    def _scene(self, positions: Tensor, rcs: Tensor) -> tuple[Tensor, Tensor, list[int]]:
+        """Positions (B, M, S, 3) and RCS (B, M, S) of a scene, checked, and its leading dimensions."""
         rcs = check_scene(positions, rcs)
         if not torch.jit.is_scripting() and not is_exporting():
             check_unambiguous(positions, rcs, self.radar, self.fixed_gate_m, self.one_channel)
-        return flatten_batch(positions, 3), flatten_batch(rcs, 2)
+        return flatten_batch(positions, 3), flatten_batch(rcs, 2), list(positions.shape[:-3])
 
     def _stretches(self, positions: Tensor, rcs: Tensor) -> list[tuple[int, Tensor, Tensor, Tensor | None]]:
         return stretches(positions, rcs, self.echo.displacements(positions), self.span(positions))
@@ -325,7 +330,7 @@ class RadarSimulator(nn.Module):
         """
         rcs = check_scene(positions, rcs)
         pending = self._nothing_pending(positions) if pending is None else pending
-        nothing = torch.zeros(positions.shape[0], dtype=torch.float64)
+        nothing = torch.zeros(positions.shape[0], dtype=torch.float64, device=positions.device)
         fresh, _ = self.recorder.received(positions, rcs, first, None, Levels(nothing, nothing), [])
         return self._piece(fresh, positions, rcs, pending)
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_choice, check_positive
+from tensorsim.protocols import check_instance
 from tensorsim.recognition.labels import LabelSet
 from tensorsim.recognition.map_image import MapToImage, ridge_map
 from tensorsim.recognition.spgnet import SPGNet
@@ -61,8 +62,8 @@ class ActivityRecognizer(nn.Module):
         labels: the same as a :class:`LabelSet`.
 
     Raises:
-        TensorsimError: unknown inputs, ``either_way`` with ``"merged"`` ones, a network with another number of input
-            channels, or another number of classes than names.
+        TensorsimError: unknown inputs, ``either_way`` with ``"merged"`` ones, a network that is no module, has another
+            number of input channels, or another number of classes than names; maps that are no RadarMaps.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class ActivityRecognizer(nn.Module):
                 "form"
             )
         self.either_way = bool(either_way)
+        check_instance(network, nn.Module, "ActivityRecognizer.network")
         channels = getattr(network, "in_channels", INPUTS[inputs])
         if channels != INPUTS[inputs]:
             raise TensorsimError(
@@ -124,6 +126,8 @@ class ActivityRecognizer(nn.Module):
     @torch.jit.export
     def picture(self, maps: RadarMaps) -> Tensor:
         """Input image of the network: (..., C, size, size) in [0, 1]."""
+        if not torch.jit.is_scripting():
+            check_instance(maps, RadarMaps, "maps")
         if self.inputs == "ridges":
             bins = maps.doppler_time.shape[-2]
             return self.doppler_picture(ridge_map(maps.ridges, maps.ridge_magnitudes, bins))

@@ -255,6 +255,26 @@ def test_ready_stages_take_the_place_of_their_settings():
     assert_same(ready(p, rcs), RadarSimulator(SMALL, snr_db=None, **named)(p, rcs))
 
 
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        ({"mti": torch.nn.Identity()}, "mti: got a Identity, expected an instance of MovingTargetIndicator"),
+        ({"mti": 3}, "mti: got a int"),
+        ({"echo": RidgeExtractor()}, "echo: got a RidgeExtractor, expected an instance of EchoSynthesizer"),
+        ({"ridges": RidgeExtractor}, "ridges: got the class RidgeExtractor"),
+        ({"doppler": 0}, "doppler: got a int"),
+    ],
+)
+def test_ready_stages_of_another_kind_are_refused(stage, message):
+    with pytest.raises(TensorsimError, match=message):
+        RadarSimulator(SMALL, **stage)
+
+
+def test_positions_that_are_no_tensor_are_refused():
+    with pytest.raises(TensorsimError, match="positions: got list, expected a tensor"):
+        RadarSimulator(SMALL)([[0.0, 3.0, 1.0]], torch.ones(1))
+
+
 def test_scene_is_that_of_the_echo_synthesizer():
     p, rcs = tensors(swinging(60, 3, 256.0), np.ones(3))
     scene = {"floor": FloorConfig(), "direct": False}

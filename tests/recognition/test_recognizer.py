@@ -122,6 +122,10 @@ def test_bad_arguments() -> None:
         TensorsimError, match="inputs: got 'picture', expected one of doppler, ridges, merged"
     ):
         ActivityRecognizer(RADAR, SPNet(), "picture")
+    with pytest.raises(TensorsimError, match="network: got the class SPNet, expected an instance of Module"):
+        ActivityRecognizer(RADAR, SPNet)
+    with pytest.raises(TensorsimError, match="maps: got a Tensor, expected an instance of RadarMaps"):
+        ActivityRecognizer(RADAR, SPNet())(torch.zeros(256, 20))
     with pytest.raises(TensorsimError, match="1 input channels, expected 2 for inputs 'merged'"):
         ActivityRecognizer(RADAR, SPNet(), "merged")
 

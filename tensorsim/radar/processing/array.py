@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_min_rank, check_tensor
+from tensorsim.config.checks import is_finite
+from tensorsim.errors import TensorsimError, check_min_rank, check_not_empty, check_tensor
 from tensorsim.ops import safe_sqrt
 from tensorsim.radar.synthesis.dechirp import phasor
 
@@ -75,7 +76,7 @@ def array_steering(radar: RadarConfig, azimuth_rad: Tensor, elevation_rad: float
     azimuth = torch.as_tensor(azimuth_rad).double()
     if azimuth.dim() != 1 or azimuth.numel() == 0 or not bool(torch.isfinite(azimuth).all()):
         raise TensorsimError(f"azimuth_rad: got shape {list(azimuth.shape)}, expected (D,) finite angles")
-    if not math.isfinite(elevation_rad):
+    if not is_finite(elevation_rad):
         raise TensorsimError(f"elevation_rad: got {elevation_rad}, expected a finite angle")
     cycles = steering_vectors(virtual_elements(radar), azimuth, elevation_rad, radar.doppler_wavelength_m)
     return cycles - cycles.round()
@@ -141,7 +142,7 @@ class AngleMapper(nn.Module):
 
     Raises:
         TensorsimError: a radar without an array; azimuths that are not a finite vector; profiles with another
-            number of channels, or real ones.
+            number of channels, empty or real ones.
     """
 
     azimuth_rad: Tensor
@@ -159,6 +160,7 @@ class AngleMapper(nn.Module):
         """(..., V, M, R) to range-angle (..., R, D) and azimuth-time (..., D, M)."""
         layout = f"(..., {self.channels} channels, pulses, range bins)"
         check_tensor(profiles, "profiles", layout, "complex")
+        check_not_empty(profiles, "profiles")
         cycles = self.cycles.double()
         by_range = beam_power(profiles.transpose(-1, -2), cycles).transpose(-1, -2)
         by_pulse = beam_power(profiles, cycles) * profiles.shape[-1]

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tensorsim.config.checks import is_finite
 from tensorsim.errors import (
     TensorsimError,
     check_choice,
@@ -17,6 +18,7 @@ from tensorsim.errors import (
     check_finite,
     check_floating,
     check_min_rank,
+    check_not_empty,
     is_exporting,
 )
 from tensorsim.ops import flatten_batch, unflatten_batch
@@ -90,7 +92,8 @@ class CfarDetector(nn.Module):
 
     Raises:
         TensorsimError: settings without reference cells, a probability or rank outside (0, 1), unknown names, fewer
-            than one look, several with ordered statistics, a map smaller than the reach, negative power, NaN.
+            than one look, several with ordered statistics, an empty map or one smaller than the reach, negative
+            power, NaN.
     """
 
     def __init__(
@@ -104,12 +107,16 @@ class CfarDetector(nn.Module):
         looks: int = 1,
     ) -> None:
         super().__init__()
-        if min(*guard, *training) < 0 or max(training) == 0:
+        for name, pair in (("guard", guard), ("training", training)):
+            if not (isinstance(pair, tuple | list) and len(pair) == 2):
+                raise TensorsimError(f"CfarDetector.{name}: got {pair!r}, expected cells along both axes")
+            for cells in pair:
+                check_count(cells, f"CfarDetector.{name}", 0)
+        if max(training) == 0:
             raise TensorsimError(
-                f"CfarDetector: got guard {guard} and training {training}, expected no negative numbers and at "
-                f"least one training cell"
+                f"CfarDetector.training: got {training}, expected at least one training cell"
             )
-        if not (0 < false_alarm < 1 and 0 < rank < 1):
+        if not (is_finite(false_alarm) and is_finite(rank) and 0 < false_alarm < 1 and 0 < rank < 1):
             raise TensorsimError(
                 f"CfarDetector: got false_alarm {false_alarm} and rank {rank}, expected both between 0 and 1"
             )
@@ -136,6 +143,7 @@ class CfarDetector(nn.Module):
         """Power (..., H, W) above which a cell counts as detected, for power (..., H, W)."""
         check_floating(power, "power")
         check_min_rank(power, 2, "power", "(..., H, W)")
+        check_not_empty(power, "power")
         check_finite(power, "power")
         rows, columns = power.shape[-2], power.shape[-1]
         if rows <= self.reach_rows or columns <= self.reach_columns:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
+from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_tensor, is_writing_onnx
 from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
 from tensorsim.radar.processing.range_profile import gate_bins
@@ -102,9 +103,9 @@ class DopplerFrames(nn.Module):
 
     def __init__(self, radar: RadarConfig, window_s: float = 0.1, overlap: float = 0.9) -> None:
         super().__init__()
-        if not 0 <= overlap < 1:
+        if not (is_finite(overlap) and 0 <= overlap < 1):
             raise TensorsimError(f"overlap: got {overlap}, expected a number in [0, 1)")
-        if not (math.isfinite(window_s) and round(window_s * radar.prf_hz) >= 2):
+        if not (is_finite(window_s) and round(window_s * radar.prf_hz) >= 2):
             raise TensorsimError(
                 f"window_s: got {window_s} s, expected at least two pulses at a PRF of {radar.prf_hz} Hz"
             )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_choice, check_complex_map
+from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_count, check_positive
 from tensorsim.ops import flatten_batch, unflatten_batch
 from tensorsim.radar.processing.iir import BlockFilter
 
@@ -87,8 +87,8 @@ class MovingTargetIndicator(nn.Module):
     ) -> None:
         super().__init__()
         check_choice(method, METHODS, "method")
-        if method == "n-pulse" and pulses < 2:
-            raise TensorsimError(f"pulses: got {pulses}, expected at least 2")
+        if method == "n-pulse":
+            check_count(pulses, "pulses", 2)
         unused = [
             name
             for name, differs, used_by in (
@@ -120,10 +120,10 @@ class MovingTargetIndicator(nn.Module):
             raise TensorsimError(
                 "radar: got None, expected the radar: a high-pass needs its PRF and wavelength"
             )
-        if not 1 <= order <= 8:
-            raise TensorsimError(f"order: got {order}, expected 1 to 8")
+        check_count(order, "order", 1, 8)
+        check_positive(cutoff_m_s, "cutoff_m_s")
         cutoff_hz = 2 * cutoff_m_s / radar.doppler_wavelength_m
-        if not 0 < cutoff_hz < radar.prf_hz / 2:
+        if not cutoff_hz < radar.prf_hz / 2:
             limit = radar.doppler_wavelength_m * radar.prf_hz / 4
             raise TensorsimError(
                 f"cutoff_m_s: got {cutoff_m_s} m/s, expected a speed between 0 and the unambiguous {limit:.4g} m/s"

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_mask, check_positive
+from tensorsim.errors import check_count, check_mask, check_not_empty, check_positive, check_tensor
 from tensorsim.ops import flatten_batch
 
 
@@ -84,20 +84,16 @@ class PointCloud(nn.Module):
         check_positive(range_step_m, "range_step_m")
         check_positive(speed_step_m_s, "speed_step_m_s")
         check_positive(spacing_wavelengths, "spacing_wavelengths")
-        if points < 1 or beams < 2:
-            raise TensorsimError(
-                f"PointCloud: got {points} points and {beams} beams, expected at least 1 and 2"
-            )
+        check_count(points, "points")
+        check_count(beams, "beams", 2)
         self.range_step_m, self.speed_step_m_s = float(range_step_m), float(speed_step_m_s)
         self.points, self.beams, self.peaks_only = points, beams, peaks_only
         self.spacing_wavelengths = float(spacing_wavelengths)
 
     def forward(self, cube: Tensor, detected: Tensor) -> Points:
         """Cube (..., A, R, F) complex and detections (..., R, F) to points (..., K)."""
-        if not cube.is_complex() or cube.dim() < 3 or cube.numel() == 0:
-            raise TensorsimError(
-                f"cube: got shape {list(cube.shape)} of {cube.dtype}, expected complex (..., antennas, range, Doppler)"
-            )
+        check_tensor(cube, "cube", "(..., antennas, range, Doppler)", "complex", finite=False)
+        check_not_empty(cube, "cube")
         lead = list(cube.shape[:-3])
         check_mask(detected, lead + list(cube.shape[-2:]), "detected")
         power = cube.abs().square().mean(-3)

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import check_tensor
+from tensorsim.config.checks import is_finite
+from tensorsim.errors import TensorsimError, check_tensor
 from tensorsim.radar.processing.array import array_steering, beam_weights, row_spacing_m
 from tensorsim.radar.processing.cfar import CfarDetector
 from tensorsim.radar.processing.doppler import DopplerFrames
@@ -155,6 +156,8 @@ class PointDetector(nn.Module):
         cfar: CfarDetector | None = None,
     ) -> None:
         super().__init__()
+        if not is_finite(nearest_m):
+            raise TensorsimError(f"nearest_m: got {nearest_m!r}, expected a finite range")
         self.cube = RangeDopplerCube(radar, window_s, overlap)
         spacing = row_spacing_m(radar) / radar.doppler_wavelength_m
         self.cfar = point_cfar(radar, self.cube) if cfar is None else cfar

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, check_complex_map, check_min_rank, check_positive
+from tensorsim.config.checks import is_finite
+from tensorsim.errors import TensorsimError, check_complex_map, check_floating, check_min_rank, check_positive
 
 _WINDOWS = {
     "hamming": torch.hamming_window,
@@ -45,8 +46,8 @@ def gate_bins(gate_m: tuple[float, float], spacing_m: float, bins: int) -> tuple
     Raises:
         TensorsimError: no bin lies within.
     """
-    near, far = gate_m
-    if math.isfinite(near) and math.isfinite(far):
+    if isinstance(gate_m, tuple | list) and len(gate_m) == 2 and all(map(is_finite, gate_m)):
+        near, far = gate_m
         first = max(0, math.ceil(near / spacing_m - 1e-9))
         last = min(bins - 1, math.floor(far / spacing_m + 1e-9))
         if first <= last:
@@ -156,6 +157,7 @@ class FollowingGate(nn.Module):
             raise TensorsimError(
                 f"positions: got shape {list(positions.shape)}, expected {list(profiles.shape[:-1])} and scatterers, 3"
             )
+        check_floating(rcs, "rcs")
         if rcs.shape != positions.shape[:-1]:
             raise TensorsimError(
                 f"rcs: got shape {list(rcs.shape)}, expected {list(positions.shape[:-1])} (per pulse) m^2"

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tensorsim.config.checks import is_finite
 from tensorsim.errors import (
     TensorsimError,
     check_finite,
@@ -53,7 +54,7 @@ class CosineAntenna(nn.Module):
             check_positive(exponent, "exponent")
             self.exponent = float(exponent)
         elif beamwidth_rad is not None and exponent is None:
-            if not 0 < beamwidth_rad < math.pi:
+            if not (is_finite(beamwidth_rad) and 0 < beamwidth_rad < math.pi):
                 raise TensorsimError(f"beamwidth_rad: got {beamwidth_rad}, expected between 0 and pi")
             # log(cos(a)), accurate also for narrow beams.
             self.exponent = math.log(0.5) / math.log1p(-2 * math.sin(beamwidth_rad / 4) ** 2)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, Vector
 from tensorsim.errors import check_positive, check_scene
+from tensorsim.limits import check_range
 from tensorsim.motion.scatterers import check_antenna
 from tensorsim.radar.synthesis.dechirp import phasor
 from tensorsim.radar.synthesis.legs import leg_length
@@ -45,8 +46,8 @@ class ContinuousWaveEcho(nn.Module):
     after ``.double()``. Differentiable by both.
 
     Raises:
-        TensorsimError: a carrier that is not positive, an antenna without three finite numbers, shapes that do not go
-            together.
+        TensorsimError: a carrier that is not positive, an antenna without three finite numbers, an implausible
+            gain, shapes that do not go together.
     """
 
     tx: Tensor
@@ -58,6 +59,7 @@ class ContinuousWaveEcho(nn.Module):
         check_positive(carrier_hz, "carrier_hz")
         check_antenna("tx_m", tx_m)
         check_antenna("rx_m", rx_m)
+        check_range(antenna_gain_dbi, "gain", "antenna_gain_dbi")
         self.wavelength_m = SPEED_OF_LIGHT_M_S / carrier_hz
         self.gain = 10 ** (antenna_gain_dbi / 10)
         self.register_buffer("tx", torch.tensor(tx_m, dtype=torch.float64), persistent=False)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
+from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_complex_map
 from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 
@@ -49,7 +50,7 @@ class Interference(nn.Module):
             raise TensorsimError(
                 "radar, other: got several antennas, expected one transmitter and one receiver each"
             )
-        if not (math.isfinite(delay_s) and math.isfinite(power_ratio_db)):
+        if not (is_finite(delay_s) and is_finite(power_ratio_db)):
             raise TensorsimError(
                 f"delay_s, power_ratio_db: got {delay_s} and {power_ratio_db}, expected finite numbers"
             )

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_positive
 from tensorsim.limits import check_range
 
@@ -117,7 +118,7 @@ class ReceiverNoise(nn.Module):
         if snr_db is not None:
             check_range(snr_db, "ratio of powers", "snr_db")
         check_range(noise_figure_db, "ratio of powers", "noise_figure_db")
-        if not (math.isfinite(empty_power) and empty_power >= 0):
+        if not (is_finite(empty_power) and empty_power >= 0):
             raise TensorsimError(f"empty_power: got {empty_power}, expected a finite power >= 0")
         check_positive(bandwidth_hz, "bandwidth_hz")
         check_positive(transmit_power_w, "transmit_power_w")

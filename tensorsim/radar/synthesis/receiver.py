@@ -10,7 +10,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_complex_map, check_positive
+from tensorsim.config.checks import is_finite
+from tensorsim.errors import TensorsimError, check_complex_map, check_count, check_positive
 
 
 class QuadratureImbalance(nn.Module):
@@ -36,7 +37,7 @@ class QuadratureImbalance(nn.Module):
 
     def __init__(self, gain_db: float = 0.5, phase_rad: float = math.radians(2.0)) -> None:
         super().__init__()
-        if not (math.isfinite(gain_db) and math.isfinite(phase_rad)):
+        if not (is_finite(gain_db) and is_finite(phase_rad)):
             raise TensorsimError(
                 f"gain_db, phase_rad: got {gain_db} and {phase_rad}, expected finite numbers"
             )
@@ -139,8 +140,7 @@ class Converter(nn.Module):
 
     def __init__(self, bits: int, full_scale: float) -> None:
         super().__init__()
-        if not 1 <= bits <= 24:
-            raise TensorsimError(f"bits: got {bits}, expected 1 to 24")
+        check_count(bits, "bits", 1, 24)
         check_positive(full_scale, "full_scale")
         self.bits, self.full_scale = bits, float(full_scale)
 

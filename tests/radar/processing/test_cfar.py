@@ -51,6 +51,7 @@ class TestCfarDetector(StageTester):
         x = exponential(12, 9)
         return [
             ((x[0],), "power: got shape"),
+            ((x.expand(0, 12, 9),), "power: got an empty tensor"),
             ((x[:4],), r"power: got shape \[4, 9\], expected more than the 4 x 2"),
             ((-x,), "power: got a minimum of"),
             ((x * float("nan"),), "power: got NaN"),
@@ -129,7 +130,10 @@ def test_the_threshold_is_differentiable():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"guard": (-1, 0), "training": (1, 1)}, "guard"),
+        ({"guard": (-1, 0), "training": (1, 1)}, "guard: got -1"),
+        ({"guard": 1, "training": (1, 1)}, "guard: got 1, expected cells along both axes"),
+        ({"guard": (1, 1), "training": (1, 1, 1)}, "training: got .*, expected cells along both axes"),
+        ({"guard": (0, 0), "training": (1, 1), "false_alarm": "low"}, "false_alarm low"),
         ({"guard": (1, 1), "training": (0, 0)}, "at least one training cell"),
         ({"guard": (0, 0), "training": (1, 1), "false_alarm": 1.0}, "false_alarm 1.0"),
         ({"guard": (0, 0), "training": (1, 1), "false_alarm": 0.0}, "false_alarm 0.0"),

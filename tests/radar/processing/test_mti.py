@@ -201,6 +201,9 @@ def test_mean_removal_keeps_motion_and_drops_clutter():
     [
         ({"method": "three-pulse"}, "method: got 'three-pulse'"),
         ({"method": "n-pulse", "pulses": 1}, "pulses: got 1"),
+        ({"method": "n-pulse", "pulses": 2.5}, "pulses: got 2.5, expected an integer"),
+        ({"method": "high-pass", "radar": FREE, "order": 2.5}, "order: got 2.5, expected an integer"),
+        ({"method": "high-pass", "radar": FREE, "cutoff_m_s": None}, "cutoff_m_s: got None"),
         ({"method": "high-pass"}, "radar: got None"),
         ({"method": "high-pass", "radar": FREE, "cutoff_m_s": 0.0}, "cutoff_m_s: got 0.0"),
         ({"method": "high-pass", "radar": FREE, "cutoff_m_s": 8.0}, "unambiguous 7.77"),

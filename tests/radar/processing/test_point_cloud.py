@@ -37,7 +37,9 @@ class TestPointCloud(StageTester):
     def bad_inputs(self):
         cube, found = self.inputs((), torch.float32)
         return [
-            ((cube.abs(), found), "cube: got shape .* expected complex"),
+            ((cube.abs(), found), "cube: got dtype torch.float32, expected a complex tensor"),
+            ((cube[:, :0], found[:0]), "cube: got an empty tensor"),
+            ((cube, found.tolist()), "detected: got list, expected a tensor"),
             ((cube[0], found[0]), "cube: got shape"),
             ((cube, found[1:]), r"detected: got torch.bool of shape \[19, 16\]"),
             ((cube, found.float()), "detected: .*expected bool"),
@@ -107,7 +109,13 @@ def test_power_is_differentiable():
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"points": 0}, "0 points"), ({"beams": 1}, "1 beams"), ({"spacing_wavelengths": 0.0}, "spacing")],
+    [
+        ({"points": 0}, "points: got 0"),
+        ({"points": 1.5}, "points: got 1.5, expected an integer"),
+        ({"beams": 1}, "beams: got 1"),
+        ({"beams": math.inf}, "beams: got inf"),
+        ({"spacing_wavelengths": 0.0}, "spacing"),
+    ],
 )
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(TensorsimError, match=message):

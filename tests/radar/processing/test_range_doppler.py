@@ -221,5 +221,7 @@ def test_refuses() -> None:
         RangeDopplerAngle(ARRAY, torch.zeros(2, 2))
     with pytest.raises(TensorsimError, match="elevation_rad: got nan"):
         RangeDopplerAngle(ARRAY, torch.zeros(2), math.nan)
+    with pytest.raises(TensorsimError, match="nearest_m: got nan"):
+        PointDetector(ARRAY, nearest_m=math.nan)
     with pytest.raises(TensorsimError, match="integration: got 'coherent' with several antennas"):
         RadarSimulator(ARRAY, integration="coherent")

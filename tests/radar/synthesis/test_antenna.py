@@ -103,6 +103,7 @@ class TestAngleMapper(StageTester):
             ((x.real,), "profiles: got dtype"),
             ((x[0],), "profiles: got shape"),
             ((x[:3],), "4 channels"),
+            ((x[:, :0],), "profiles: got an empty tensor"),
         ]
 
 

@@ -61,7 +61,11 @@ def test_the_phase_of_an_approaching_target_decreases():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((0.0, (0, 0, 1), (0, 0, 1)), "carrier_hz"), ((1e9, (0, 0), (0, 0, 1)), "tx_m")],
+    [
+        ((0.0, (0, 0, 1), (0, 0, 1)), "carrier_hz"),
+        ((1e9, (0, 0), (0, 0, 1)), "tx_m"),
+        ((1e9, (0, 0, 1), (0, 0, 1), float("nan")), "antenna_gain_dbi: got nan"),
+    ],
 )
 def test_bad_settings_are_refused(arguments, message):
     with pytest.raises(TensorsimError, match=message):

@@ -138,6 +138,7 @@ def test_power_and_pieces() -> None:
         (lambda: Interference(RADAR, replace(RADAR)), "other.tx_m: got"),
         (lambda: Interference(replace(RADAR, rx_m=((0, 0, 1), (1, 0, 1))), OTHER), "several antennas"),
         (lambda: Interference(RADAR, OTHER, delay_s=math.nan), "delay_s, power_ratio_db: got nan"),
+        (lambda: Interference(RADAR, OTHER, power_ratio_db="6"), "delay_s, power_ratio_db: got 0.0 and 6"),
     ],
 )
 def test_refuses(make: Any, message: str) -> None:

@@ -155,6 +155,7 @@ def test_gradient_scales_the_noise_with_the_signal():
         ({"snr_db": float("nan")}, "snr_db: got nan"),
         ({"reference": "peak"}, "reference: got 'peak'"),
         ({"empty_power": -1.0}, "empty_power: got -1.0"),
+        ({"empty_power": None}, "empty_power: got None"),
         ({"bandwidth_hz": 0.0}, "bandwidth_hz: got 0.0"),
         ({"transmit_power_w": -1.0}, "transmit_power_w: got -1.0"),
         ({"noise_figure_db": float("inf")}, "noise_figure_db: got inf"),

@@ -135,7 +135,9 @@ def test_converter_gradient_is_that_of_clipping() -> None:
     [
         (lambda: QuadratureImbalance(math.nan), "gain_db, phase_rad: got nan"),
         (lambda: DcOffset(complex(math.inf, 0)), "offset: got"),
+        (lambda: QuadratureImbalance(0.5, None), "gain_db, phase_rad: got 0.5 and None"),
         (lambda: Converter(0, 1.0), "bits: got 0"),
+        (lambda: Converter(8.5, 1.0), "bits: got 8.5, expected an integer"),
         (lambda: Converter(8, 0.0), "full_scale: got 0.0"),
     ],
 )
