@@ -73,7 +73,8 @@ def entropy(maps: Tensor) -> Tensor:
     """Shannon entropy (...) in nats of the distribution of power over a map (..., F, K).
 
     ``-sum p ln p`` with ``p = |map|^2 / sum |map|^2``; a gain has no influence. 0 for a single point (and for a map of
-    zeros), ``ln(F K)`` for a constant map; sharper maps have lower entropy.
+    zeros), ``ln(F K)`` for a constant map; sharper maps have lower entropy. Differentiable; the gradient by a cell of 0
+    is 0.
 
     >>> float(entropy(torch.eye(4)))  # four equal cells: ln 4
     1.3862943649291992
@@ -81,7 +82,9 @@ def entropy(maps: Tensor) -> Tensor:
     _check_map(maps, "map")
     power = maps.square()
     total = power.sum((-2, -1), keepdim=True)
-    return torch.special.entr(power / torch.where(total > 0, total, 1.0)).sum((-2, -1))
+    share = power / torch.where(total > 0, total, 1.0)
+    # The slope of p ln p at 0 is infinite, that of the map's cell is 0; an empty cell counts 0, as one with p = 1 does.
+    return torch.special.entr(torch.where(share > 0, share, 1.0)).sum((-2, -1))
 
 
 def psnr(maps: Tensor, reference: Tensor, scale: str = "db", range_db: float = 40.0) -> Tensor:

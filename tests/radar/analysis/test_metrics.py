@@ -87,6 +87,16 @@ def test_entropy_of_known_maps():
     assert float(metrics.entropy(two)) == pytest.approx(-0.1 * math.log(0.1) - 0.9 * math.log(0.9), rel=1e-6)
 
 
+def test_gradient_of_entropy_in_closed_form():
+    """dH / dm = -2 m (ln p + H) / sum m^2, which is 0 in a cell of 0."""
+    m = np.array([[1.0, 3.0], [0.0, 2.0]])
+    x = torch.tensor(m, requires_grad=True)
+    metrics.entropy(x).backward()
+    p = m**2 / 14
+    slope = np.log(p, where=p > 0, out=np.zeros_like(p)) + metrics.entropy(x).item()
+    np.testing.assert_allclose(x.grad, -2 * m * slope / 14, rtol=1e-12)
+
+
 def test_level_envelope():
     axis = torch.linspace(-2, 2, 9)
     x = torch.zeros(9, 4)
