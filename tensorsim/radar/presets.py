@@ -148,19 +148,20 @@ PRESETS |= MEASURED_SENSORS | {
 }
 
 
-def radar_scene(name_or_path: str) -> SceneConfig:
+def radar_scene(name_or_path: str | Path) -> SceneConfig:
     """The preset of this name, or the scene of this YAML file.
 
     Raises:
         TensorsimError: neither a preset nor a file, or a file that :func:`load_scene_yaml` refuses.
     """
-    if name_or_path in PRESETS:
-        return PRESETS[name_or_path]
+    name = str(name_or_path)
+    if name in PRESETS:
+        return PRESETS[name]
     if Path(name_or_path).is_file():
         return load_scene_yaml(name_or_path)
     raise TensorsimError(
-        f"radar: got {name_or_path!r}, which is not a file, expected one or a preset"
-        f"{suggestion(name_or_path, list(PRESETS))} ({', '.join(PRESETS)})"
+        f"radar: got {name!r}, which is not a file, expected one or a preset"
+        f"{suggestion(name, list(PRESETS))} ({', '.join(PRESETS)})"
     )
 
 

@@ -88,6 +88,7 @@ class ActivityRecognizer(nn.Module):
                 "form"
             )
         self.either_way = bool(either_way)
+        check_instance(radar, RadarConfig, "ActivityRecognizer.radar")
         check_instance(network, nn.Module, "ActivityRecognizer.network")
         channels = getattr(network, "in_channels", INPUTS[inputs])
         if channels != INPUTS[inputs]:

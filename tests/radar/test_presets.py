@@ -195,6 +195,8 @@ def test_refuses_what_is_no_text_and_no_file(tmp_path: Path) -> None:
         TensorsimError, match=r"got 'ti-awr1834', which is not a file, .* perhaps 'ti-awr1843'"
     ):
         radar_scene("ti-awr1834")
+    with pytest.raises(TensorsimError, match=r"radar: got 'radar\.yaml', which is not a file"):
+        radar_scene(Path("radar.yaml"))
 
 
 def test_every_field_can_be_set_from_a_file(tmp_path: Path) -> None:

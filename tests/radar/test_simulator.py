@@ -12,14 +12,16 @@ import torch
 from tensorsim.config import FloorConfig, RadarConfig, ReceiverConfig, SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.radar import AngleMapper, BulkDopplerCompensation, Interference, PhaseNoise
 from tensorsim.radar.processing.ambiguity import check_unambiguous, gate_around
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.processing.doppler import DopplerTimeMap
 from tensorsim.radar.processing.mti import MovingTargetIndicator
-from tensorsim.radar.processing.range_profile import FollowingGate
+from tensorsim.radar.processing.range_profile import FollowingGate, RangeProfile
 from tensorsim.radar.processing.ridges import RidgeExtractor
 from tensorsim.radar.simulator import RadarSimulator
 from tensorsim.radar.synthesis.echo import EchoSynthesizer
+from tensorsim.recognition import ActivityRecognizer
 from tests.radar import reference
 from tests.radar.scenes import SMALL, SceneCase, joint_rcs, recorded_walk, swinging, tensors
 from tests.stage import assert_same
@@ -270,6 +272,42 @@ def test_ready_stages_of_another_kind_are_refused(stage, message):
         RadarSimulator(SMALL, **stage)
 
 
+SCENE = SceneConfig(SMALL)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: EchoSynthesizer(SCENE),
+        lambda: RangeProfile(SCENE),
+        lambda: FollowingGate(SCENE, torch.arange(12.0), 0.8),
+        lambda: MovingTargetIndicator("high-pass", SCENE),
+        lambda: DopplerTimeMap(SCENE),
+        lambda: AngleMapper(SCENE, torch.zeros(2)),
+        lambda: PhaseNoise(SCENE),
+        lambda: Interference(SCENE, SMALL),
+        lambda: BulkDopplerCompensation(SCENE),
+        lambda: ActivityRecognizer(SCENE, torch.nn.Identity()),
+    ],
+)
+def test_a_scene_such_as_a_preset_is_no_radar(make):
+    with pytest.raises(TensorsimError, match="radar: got a SceneConfig, expected an instance of RadarConfig"):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"wall": FloorConfig()}, "wall: got a FloorConfig, expected an instance of WallConfig"),
+        ({"floor": True}, "floor: got a bool, expected an instance of FloorConfig"),
+        ({"antenna": "cosine"}, "antenna: got a str, expected an instance of Module"),
+    ],
+)
+def test_parts_of_a_scene_of_another_kind_are_refused(part, message):
+    with pytest.raises(TensorsimError, match=message):
+        EchoSynthesizer(SMALL, **part)
+
+
 def test_positions_that_are_no_tensor_are_refused():
     with pytest.raises(TensorsimError, match="positions: got list, expected a tensor"):
         RadarSimulator(SMALL)([[0.0, 3.0, 1.0]], torch.ones(1))
@@ -489,3 +527,17 @@ def test_a_last_pulse_alone_in_its_piece_goes_on_as_the_one_before():
     rcs = torch.ones(1, dtype=torch.float64)
     streamed = simulator.stream(lambda start, stop: (p[start:stop], rcs.expand(stop - start, 1)), 65)
     assert_same(streamed.range_time, simulator(p, rcs).range_time, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("positions", "margin_m", "message"),
+    [
+        (torch.ones(4, 2), 0.5, r"positions: got shape \[4, 2\], expected \(..., 3\) metres"),
+        ([[0.0, 2.0, 1.0]], 0.5, "positions: got list, expected a tensor"),
+        (torch.ones(4, 3), math.nan, "margin_m: got nan"),
+        (torch.ones(4, 3), -5.0, "margin_m: got -5.0, expected metres from 0 on"),
+    ],
+)
+def test_gates_around_nothing_are_refused(positions, margin_m, message):
+    with pytest.raises(TensorsimError, match=message):
+        gate_around(positions, THROUGH, margin_m)

@@ -15,6 +15,7 @@ from tensorsim.errors import (
     check_not_empty,
     check_positive,
 )
+from tensorsim.protocols import check_instance
 
 
 def path_of_speed(speed_m_s: Tensor, prf_hz: float) -> Tensor:
@@ -51,6 +52,7 @@ class BulkDopplerCompensation(nn.Module):
 
     def __init__(self, radar: RadarConfig, migration: bool = False) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
         self.migration = migration
         self.doppler_wavelength_m = radar.doppler_wavelength_m
         self.range_resolution_m = radar.range_resolution_m

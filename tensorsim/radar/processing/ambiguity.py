@@ -7,7 +7,16 @@ import torch
 from torch import Tensor
 
 from tensorsim.config import RadarConfig
-from tensorsim.errors import TensorsimError, TensorsimWarning, check_finite, check_not_empty
+from tensorsim.config.checks import is_finite
+from tensorsim.errors import (
+    TensorsimError,
+    TensorsimWarning,
+    check_finite,
+    check_floating,
+    check_min_rank,
+    check_not_empty,
+    check_size,
+)
 from tensorsim.radar.synthesis.legs import leg_length
 
 #: A scatterer with a smaller share of the largest RCS has been filtered out by the receiver.
@@ -33,13 +42,18 @@ def gate_around(positions: Tensor, radar: RadarConfig, margin_m: float = 0.5) ->
         margin_m: added on both sides, for the width of a target in range and the delay of a wall.
 
     Raises:
-        TensorsimError: no positions, or positions that are not finite.
+        TensorsimError: no positions, positions of another shape or that are not finite, a margin below 0.
 
     >>> gate_around(torch.tensor([[0.0, 2.0, 1.0], [0.0, 5.0, 1.0]]), RadarConfig(tx_m=(0, 0, 1), rx_m=(0, 0, 1)))
     (1.5, 5.5)
     """
+    check_floating(positions, "positions")
+    check_min_rank(positions, 1, "positions", "(..., 3) metres")
+    check_size(positions, -1, 3, "positions", "(..., 3) metres")
     check_not_empty(positions, "positions")
     check_finite(positions, "positions")
+    if not (is_finite(margin_m) and margin_m >= 0):
+        raise TensorsimError(f"margin_m: got {margin_m!r}, expected metres from 0 on")
     distance = mean_range(positions, radar)
     return max(0.0, float(distance.min()) - margin_m), float(distance.max()) + margin_m
 

@@ -14,8 +14,9 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.config.checks import is_finite
-from tensorsim.errors import TensorsimError, check_min_rank, check_not_empty, check_tensor
+from tensorsim.errors import TensorsimError, check_not_empty, check_tensor
 from tensorsim.ops import safe_sqrt
+from tensorsim.protocols import check_instance
 from tensorsim.radar.synthesis.dechirp import phasor
 
 
@@ -106,11 +107,10 @@ def align_transmitters(profiles: Tensor, transmitters: int) -> Tensor:
     Differentiable.
 
     Raises:
-        TensorsimError: real profiles, or a number of channels that is no multiple of the transmitters.
+        TensorsimError: empty or real profiles, or a number of channels that is no multiple of the transmitters.
     """
-    if not profiles.is_complex():
-        raise TensorsimError(f"profiles: got dtype {profiles.dtype}, expected a complex tensor")
-    check_min_rank(profiles, 3, "profiles", "(..., channels, pulses, range bins)")
+    check_tensor(profiles, "profiles", "(..., channels, pulses, range bins)", "complex", finite=False)
+    check_not_empty(profiles, "profiles")
     channels = profiles.shape[-3]
     if transmitters < 1 or channels % transmitters != 0:
         raise TensorsimError(
@@ -150,6 +150,7 @@ class AngleMapper(nn.Module):
 
     def __init__(self, radar: RadarConfig, azimuth_rad: Tensor, elevation_rad: float = 0.0) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
         if not radar.has_array:
             raise TensorsimError("radar: got one transmitter and one receiver, expected several: rx_m (A, 3)")
         self.register_buffer("cycles", array_steering(radar, azimuth_rad, elevation_rad), persistent=False)

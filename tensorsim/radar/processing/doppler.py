@@ -13,6 +13,7 @@ from tensorsim.config import RadarConfig
 from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_tensor, is_writing_onnx
 from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
+from tensorsim.protocols import check_instance
 from tensorsim.radar.processing.range_profile import gate_bins
 
 
@@ -103,6 +104,7 @@ class DopplerFrames(nn.Module):
 
     def __init__(self, radar: RadarConfig, window_s: float = 0.1, overlap: float = 0.9) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
         if not (is_finite(overlap) and 0 <= overlap < 1):
             raise TensorsimError(f"overlap: got {overlap}, expected a number in [0, 1)")
         if not (is_finite(window_s) and round(window_s * radar.prf_hz) >= 2):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_count, check_positive
 from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.protocols import check_instance
 from tensorsim.radar.processing.iir import BlockFilter
 
 METHODS = ("two-pulse", "n-pulse", "mean", "high-pass")
@@ -120,6 +121,7 @@ class MovingTargetIndicator(nn.Module):
             raise TensorsimError(
                 "radar: got None, expected the radar: a high-pass needs its PRF and wavelength"
             )
+        check_instance(radar, RadarConfig, "radar")
         check_count(order, "order", 1, 8)
         check_positive(cutoff_m_s, "cutoff_m_s")
         cutoff_hz = 2 * cutoff_m_s / radar.doppler_wavelength_m

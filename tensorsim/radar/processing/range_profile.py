@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from tensorsim.config import RadarConfig
 from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_complex_map, check_floating, check_min_rank, check_positive
+from tensorsim.protocols import check_instance
 
 _WINDOWS = {
     "hamming": torch.hamming_window,
@@ -90,6 +91,7 @@ class RangeProfile(nn.Module):
         gate_m: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
         samples = radar.samples_per_chirp
         values = torch.ones(samples, dtype=torch.float64)
         if window is not None:
@@ -142,6 +144,7 @@ class FollowingGate(nn.Module):
 
     def __init__(self, radar: RadarConfig, range_m: Tensor, width_m: float) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
         check_positive(width_m, "width_m")
         self.half_width_m = width_m / 2
         self.register_buffer("range_m", range_m.double(), persistent=False)

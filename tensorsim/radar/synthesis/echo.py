@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from tensorsim.config import FloorConfig, RadarConfig, WallConfig
 from tensorsim.errors import TensorsimError, check_count, check_scatterers, check_scene
 from tensorsim.ops import flatten_batch, unflatten_batch
+from tensorsim.protocols import check_instance
 from tensorsim.radar.synthesis.dechirp import beat_sum, dispersed_sum
 from tensorsim.radar.synthesis.paths import Paths, PropagationPaths, Resonance, chosen_paths
 from tensorsim.radar.synthesis.wall import place_wall
@@ -101,6 +102,11 @@ class EchoSynthesizer(nn.Module):
         wall_attenuation: bool = True,
     ) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
+        parts = (("wall", wall, WallConfig), ("floor", floor, FloorConfig), ("antenna", antenna, nn.Module))
+        for name, part, kind in parts:
+            if part is not None:
+                check_instance(part, kind, name)
         check_count(pulse_chunk, "pulse_chunk")
         names = chosen_paths(multipath, leakage, wall_echo, direct, floor is not None, paths)
         wall = place_wall(wall, radar)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig
 from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_complex_map
+from tensorsim.protocols import check_instance
 from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 
 
@@ -45,6 +46,8 @@ class Interference(nn.Module):
         phase_noise: PhaseNoise | None = None,
     ) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
+        check_instance(other, RadarConfig, "other")
         self.phase_noise: PhaseNoise | None = phase_noise
         if radar.has_array or other.has_array:
             raise TensorsimError(

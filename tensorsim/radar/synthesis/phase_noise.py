@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError, check_complex_map
+from tensorsim.protocols import check_instance
 from tensorsim.radar.synthesis.counter_noise import normal
 
 #: Single-sideband phase noise of integrated oscillators at 77 GHz (typical): offsets from the carrier, L there.
@@ -65,6 +66,7 @@ class PhaseNoise(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        check_instance(radar, RadarConfig, "radar")
         ascending = all(a < b for a, b in itertools.pairwise(offsets_hz))
         if len(offsets_hz) < 2 or offsets_hz[0] <= 0 or not ascending:
             raise TensorsimError(
