@@ -4,12 +4,13 @@ Source: see :mod:`tensorsim.vision.detection.acf_features`; P. Dollár, R. Appel
 frame-rate pedestrian detection", ECCV 2012, for the constant cascade. Only people who stand or walk upright are found.
 """
 
+import math
 import os
 
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_images
+from tensorsim.errors import TensorsimError, check_count, check_images
 from tensorsim.geometry.boxes import box_area, box_intersection
 from tensorsim.types import Detections
 from tensorsim.vision.detection.acf_features import CELL, CHANNELS, pyramid
@@ -104,11 +105,12 @@ class AcfDetector(nn.Module):
             ("max_detections", max_detections, 1),
             ("octaves_up", octaves_up, 0),
         ):
-            if count < least:
-                raise TensorsimError(f"AcfDetector.{name}: got {count}, expected at least {least}")
+            check_count(count, f"AcfDetector.{name}", least)
         for name, share in (("overlap", overlap), ("score_threshold", score_threshold)):
             if not 0 <= share <= 1:
                 raise TensorsimError(f"AcfDetector.{name}: got {share}, expected a number from 0 to 1")
+        if math.isnan(cascade):
+            raise TensorsimError("AcfDetector.cascade: got nan, expected a number")
         self.cascade, self.overlap, self.score_threshold = float(cascade), overlap, score_threshold
         self.octaves_up, self.max_detections = octaves_up, max_detections
         self.rows, self.columns, self.cell, self.block = ROWS, COLUMNS, CELL, _BLOCK

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tensorsim.config import JOINTS
 from tensorsim.errors import (
     TensorsimError,
     check_count,
@@ -128,7 +129,7 @@ class NearestPoseLifter(nn.Module):
         search that finds the candidates is not.
 
     Raises:
-        TensorsimError: other shapes, NaN, negative weights, or no frames.
+        TensorsimError: settings out of range, other shapes, NaN, negative weights, or no frames.
     """
 
     def __init__(
@@ -152,7 +153,11 @@ class NearestPoseLifter(nn.Module):
                 f"NearestPoseLifter.neighbours: got {neighbours}, expected at most "
                 f"{poses.shape[0] * yaws}, the library's {poses.shape[0]} poses at {yaws} headings"
             )
+        check_count(search_joints, "NearestPoseLifter.search_joints", 1, len(JOINTS))
         check_positive(tolerance, "NearestPoseLifter.tolerance")
+        for name, angle in (("pitch_rad", pitch_rad), ("roll_rad", roll_rad)):
+            if not math.isfinite(angle):
+                raise TensorsimError(f"NearestPoseLifter.{name}: got {angle}, expected a finite angle")
         if not 0 <= temporal < float("inf"):
             raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
         self.neighbours, self.tolerance = neighbours, tolerance

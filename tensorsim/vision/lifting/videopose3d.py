@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.errors import (
     TensorsimError,
+    check_count,
     check_finite,
     check_floating,
     check_image_size,
@@ -116,7 +117,7 @@ class VideoPose3D(nn.Module):
         dropout: in training.
 
     Raises:
-        TensorsimError: no kernels, or an even one; joints that are not (..., T, 17, 2).
+        TensorsimError: no kernels, or an even one; no channels; joints that are not (..., T, 17, 2).
     """
 
     def __init__(
@@ -125,6 +126,7 @@ class VideoPose3D(nn.Module):
         super().__init__()
         if not kernels or any(kernel < 1 or kernel % 2 == 0 for kernel in kernels):
             raise TensorsimError(f"VideoPose3D: got kernels {kernels}, expected odd lengths")
+        check_count(channels, "VideoPose3D.channels")
         joints = len(H36M_JOINTS)
         self.receptive_field = 1
         for kernel in kernels:

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_finite, check_positive, check_rank, check_size
+from tensorsim.errors import TensorsimError, check_count, check_finite, check_positive, check_rank, check_size
 from tensorsim.geometry.boxes import center_to_xyxy, xyxy_to_center
 from tensorsim.types import Detections, Tracks
 
@@ -89,9 +89,11 @@ class MosseTracker(nn.Module):
             if not 0 <= share <= 1:
                 raise TensorsimError(f"MosseTracker.{name}: got {share}, expected a number from 0 to 1")
         check_positive(sigma, "MosseTracker.sigma")
-        if size < 16 or max_tracks < 1:
+        check_count(size, "MosseTracker.size", 16)
+        check_count(max_tracks, "MosseTracker.max_tracks")
+        if not 0 <= least_ratio < math.inf:
             raise TensorsimError(
-                f"MosseTracker: got size {size} and max_tracks {max_tracks}, expected at least 16 and 1"
+                f"MosseTracker.least_ratio: got {least_ratio}, expected a finite number >= 0"
             )
         self.learning_rate, self.least_ratio, self.start_score = learning_rate, least_ratio, start_score
         self.size, self.max_tracks, self.epsilon = size, max_tracks, _EPSILON

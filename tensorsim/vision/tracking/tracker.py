@@ -147,7 +147,14 @@ class GNNTracker(nn.Module):
         duplicate_part: float = 0.9,
     ) -> None:
         super().__init__()
-        for name, count in (("max_tracks", max_tracks), ("min_hits", min_hits)):
+        for name, count in (
+            ("max_tracks", max_tracks),
+            ("min_hits", min_hits),
+            ("confirm_hits", confirm_hits),
+            ("confirm_window", confirm_window),
+            ("delete_misses", delete_misses),
+            ("delete_window", delete_window),
+        ):
             check_count(count, f"GNNTracker.{name}")
         _check_window("confirm_hits", confirm_hits, confirm_window)
         _check_window("delete_misses", delete_misses, delete_window)
@@ -229,9 +236,10 @@ class GNNTracker(nn.Module):
     def _associate(self, boxes: Tensor, scores: Tensor, usable: Tensor, looked: Tensor) -> Tensor:
         """Which detection each confirmed track of one clip is in every frame (I, T), -1 where none."""
         frames = boxes.shape[0]
-        table = torch.full((0, frames), -1, dtype=torch.int64)
         confirmed = torch.zeros(0, dtype=torch.bool)
         living = self._start(torch.zeros(0, dtype=torch.int64), boxes.new_zeros(0, 4))
+        # Which track was matched to which detection when, of all frames.
+        rows, times, found = [living.rows], [living.rows], [living.rows]
         for t in range(frames):
             predicted = constant_velocity_predict(living.box, self._process_noise(), 1.0)
             living = Living(living.rows, predicted, living.history, living.age)
@@ -242,7 +250,7 @@ class GNNTracker(nn.Module):
             box, strong = boxes[t][index], scores[t][index] >= self.start_score
             column = self._assign(living, box, scores[t][index], confirmed[living.rows])
             hit = column >= 0
-            table[living.rows[hit], t] = index[column[hit]]
+            matched = living.rows[hit]
             living = self._correct(living, xyxy_to_center(box), column)
 
             recent_hits = living.history[:, : self.confirm_window].sum(-1)
@@ -251,14 +259,19 @@ class GNNTracker(nn.Module):
             alive = self._alive(living, steady)
 
             new = self._newcomers(box, strong, column[hit])
-            born = torch.arange(new.shape[0]) + table.shape[0]
-            table = torch.cat([table, torch.full((new.shape[0], frames), -1, dtype=torch.int64)])
-            table[born, t] = index[new]
+            born = torch.arange(new.shape[0]) + confirmed.shape[0]
             at_once = torch.full((new.shape[0],), self.confirm_hits == 1, dtype=torch.bool)
             confirmed = torch.cat([confirmed, at_once])
+            rows.append(torch.cat([matched, born]))
+            times.append(torch.full_like(rows[-1], t))
+            found.append(index[torch.cat([column[hit], new])])
             start = self._start(born, xyxy_to_center(box[new]))
             living = joined(living, alive, start)
-        return table[confirmed]
+        row = torch.cat(rows)
+        kept = confirmed[row]
+        table = torch.full((int(confirmed.sum()), frames), -1, dtype=torch.int64)
+        table[(confirmed.cumsum(0) - 1)[row[kept]], torch.cat(times)[kept]] = torch.cat(found)[kept]
+        return table
 
     def _alive(self, living: Living, confirmed: Tensor) -> Tensor:
         """(n,) bool, which tracks go on."""
@@ -372,8 +385,8 @@ def _presence(matched: Tensor, looked: Tensor) -> Tensor:
 
 
 def _check_window(name: str, count: int, window: int) -> None:
-    if not 1 <= count <= window:
-        raise TensorsimError(f"GNNTracker.{name}: got {count} of {window}, expected M of N with 1 <= M <= N")
+    if count > window:
+        raise TensorsimError(f"GNNTracker.{name}: got {count} of {window}, expected M of N with M <= N")
 
 
 def _check(detections: Detections, observed: Tensor | None) -> None:

@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 from typing import Any
 
@@ -273,6 +274,9 @@ def test_weights_survive_a_file(tmp_path: Path) -> None:
         ({"trees": 0}, "trees: got 0"),
         ({"overlap": 1.5}, "overlap: got 1.5"),
         ({"octaves_up": -1}, "octaves_up: got -1"),
+        ({"octaves_up": 0.5}, "octaves_up: got 0.5"),
+        ({"max_detections": 2.5}, "max_detections: got 2.5"),
+        ({"cascade": math.nan}, "cascade: got nan"),
     ],
 )
 def test_refuses_bad_settings(settings: dict[str, Any], message: str) -> None:

@@ -81,6 +81,12 @@ class TestNearestPoseLifter(StageTester):
         ({"library": LIBRARY, "tolerance": 0.0}, "tolerance"),
         ({"library": LIBRARY, "temporal": -1.0}, "temporal"),
         ({"library": LIBRARY, "chunk": 0}, "chunk"),
+        (
+            {"library": LIBRARY, "search_joints": 15},
+            "search_joints: got 15, expected an integer from 1 to 14",
+        ),
+        ({"library": LIBRARY, "pitch_rad": math.nan}, "pitch_rad: got nan"),
+        ({"library": LIBRARY, "roll_rad": math.inf}, "roll_rad: got inf"),
     ],
 )
 def test_refuses_bad_settings(options: dict[str, Any], message: str) -> None:

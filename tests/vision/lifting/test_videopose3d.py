@@ -109,6 +109,11 @@ def test_bad_kernels(kernels: tuple[int, ...]) -> None:
         VideoPose3D(kernels)
 
 
+def test_no_channels() -> None:
+    with pytest.raises(TensorsimError, match="channels: got 0"):
+        VideoPose3D(channels=0)
+
+
 class Told(VideoPose3D):
     """Says the pose that it was told, metres about the pelvis in camera axes, whatever it sees."""
 

@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 from typing import Any
 
@@ -200,8 +201,11 @@ def test_ratio_of_a_known_response() -> None:
     [
         ({"learning_rate": 1.5}, "learning_rate: got 1.5"),
         ({"sigma": 0.0}, "expected a positive"),
-        ({"size": 8}, "got size 8"),
-        ({"max_tracks": 0}, "max_tracks 0"),
+        ({"size": 8}, "size: got 8"),
+        ({"size": 32.5}, "size: got 32.5"),
+        ({"max_tracks": 0}, "max_tracks: got 0"),
+        ({"max_tracks": 2.5}, "max_tracks: got 2.5"),
+        ({"least_ratio": math.nan}, "least_ratio: got nan"),
     ],
 )
 def test_refuses_bad_settings(settings: dict[str, Any], message: str) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tensorsim.errors import TensorsimError
 from tensorsim.geometry.boxes import box_iou, center_to_xyxy, xyxy_to_center
@@ -353,12 +354,39 @@ def test_smoothed_boxes_are_nearer_the_truth_than_the_detections() -> None:
     assert (tracks.boxes[0, 0] - truth).square().mean() < 0.8 * raw
 
 
+class Largest(TorchDispatchMode):
+    """Notes the largest number of elements of what operations give."""
+
+    elements = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if isinstance(out, Tensor):
+            self.elements = max(self.elements, out.numel())
+        return out
+
+
+def test_memory_is_that_of_people_not_of_all_that_was_taken_for_one() -> None:
+    """A detection that is not seen again is forgotten: rows for all would make memory grow with the square of time."""
+    frames, flickers = 200, 10
+    generator = torch.Generator().manual_seed(0)
+    middle = 1e5 * torch.rand(frames, flickers, 2, generator=generator, dtype=torch.float64)
+    short = [center_to_xyxy(torch.cat([at, 0 * at + 100.0], dim=-1)) for at in middle.unbind(1)]
+    detections = film([walker(100, 500, frames), *short])
+    with Largest() as largest:
+        tracks = GNNTracker()(detections)
+    assert tracks.boxes.shape[1] == 1
+    assert largest.elements < 20 * frames * (flickers + 1)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"max_tracks": 0}, "max_tracks"),
         ({"min_hits": 0}, "min_hits"),
         ({"confirm_hits": 6}, "confirm_hits: got 6 of 5"),
+        ({"confirm_hits": 0}, "confirm_hits: got 0"),
+        ({"confirm_window": 5.5}, "confirm_window: got 5.5"),
         ({"delete_misses": 24}, "delete_misses: got 24 of 23"),
         ({"assignment_threshold": 0.0}, "assignment_threshold"),
         ({"detection_threshold": 1.5}, "detection_threshold"),
