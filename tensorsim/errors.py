@@ -115,6 +115,8 @@ def check_size(x: Tensor, dim: int, size: int, name: str, layout: str) -> None:
 
 def check_shape(x: Tensor, shape: list[int], name: str) -> None:
     """Refuse a tensor of another shape."""
+    if not torch.jit.is_scripting():
+        check_is_tensor(x, name)
     if list(x.shape) != shape:
         raise TensorsimError(f"{name}: got shape {list(x.shape)}, expected {shape}")
 

@@ -17,7 +17,9 @@ from tensorsim.errors import (
     check_choice,
     check_count,
     check_finite,
+    check_mask,
     check_positive,
+    check_shape,
     check_tensor,
 )
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
@@ -80,6 +82,13 @@ def test_arrays_get_a_hint() -> None:
         TensorsimError, match=r"got ndarray, expected a tensor, as torch\.from_numpy gives it"
     ):
         ts.radar.RangeProfile(RADAR)(IF.numpy())
+
+
+def test_shapes_and_masks_are_of_tensors() -> None:
+    for check in (check_shape, check_mask):
+        for other in (None, np.zeros(3)):
+            with pytest.raises(TensorsimError, match=r"scores: got (NoneType|ndarray), expected a tensor"):
+                check(other, [3], "scores")
 
 
 def test_conjugates_and_half_precision() -> None:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.gait import boulic_gait, cycle_s
 from tensorsim.body.skeleton import mid_hips
-from tensorsim.errors import TensorsimError, check_mask, check_points, check_positive
+from tensorsim.errors import TensorsimError, check_finite, check_mask, check_points, check_positive
 from tensorsim.vision.smoothing.along_time import local_linear
 
 #: Harmonics of the angles of a gait cycle.
@@ -66,6 +66,7 @@ class HiddenLegs(nn.Module):
     def forward(self, joints: Tensor, seen: Tensor, valid: Tensor, fps: float) -> Tensor:
         """Joints, which of them are seen, frames with a person, frame rate -> joints."""
         check_points(joints, 3, 14, 3, "joints", "(..., T, 14, 3) metres")
+        check_finite(joints, "joints")
         check_mask(seen, list(joints.shape[:-1]), "seen")
         check_mask(valid, list(joints.shape[:-2]), "valid")
         check_positive(fps, "fps")

@@ -209,6 +209,8 @@ class MetricPose(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Joints, scores, Lifted, valid, image size, fps, camera poses, cut off -> world joints and what was seen."""
         _check(keypoints, scores, lifted, valid, image_height, image_width, fps)
+        if cut_off is not None:
+            check_mask(cut_off, list(valid.shape), "cut_off")
         seen = (scores >= self.keypoint_threshold) & valid[..., None]
         height = self._of_each(self.heights, keypoints)
         distance = self._of_each(self.distances, keypoints)
@@ -312,6 +314,7 @@ class MetricPose(nn.Module):
         expected = list(keypoints.shape[:-4])
         expected.extend([keypoints.shape[-3], 3, 4])
         check_shape(camera_pose, expected, "camera_pose")
+        check_finite(camera_pose, "camera_pose")
         return camera_pose.to(keypoints.dtype).unsqueeze(-4)
 
     def _of_each(self, values: Tensor, like: Tensor) -> Tensor:
@@ -394,10 +397,14 @@ def _check(
     check_shape(lifted.depth, list(shape[:-1]), "lifted.depth")
     check_shape(lifted.scale, list(shape[:-2]), "lifted.scale")
     check_shape(lifted.keypoints, list(shape), "lifted.keypoints")
+    check_shape(lifted.distance, list(shape[:-2]), "lifted.distance")
     check_mask(valid, list(shape[:-2]), "valid")
     if shape[-3] < 1:
         raise TensorsimError(f"keypoints: got shape {list(shape)}, expected at least 1 frame")
     check_finite(keypoints, "keypoints")
     check_finite(scores, "scores")
+    check_finite(lifted.depth, "lifted.depth")
+    check_finite(lifted.scale, "lifted.scale")
+    check_finite(lifted.keypoints, "lifted.keypoints")
     check_image_size(image_height, image_width)
     check_positive(fps, "fps")

@@ -15,7 +15,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_count, check_finite, check_positive, check_rank, check_size
+from tensorsim.errors import (
+    TensorsimError,
+    check_count,
+    check_finite,
+    check_floating,
+    check_mask,
+    check_positive,
+    check_rank,
+    check_shape,
+    check_size,
+)
 from tensorsim.geometry.boxes import center_to_xyxy, xyxy_to_center
 from tensorsim.types import Detections, Tracks
 
@@ -191,9 +201,19 @@ class MosseTracker(nn.Module):
             )
         if video.is_floating_point():
             check_finite(video, "video")
-        check_rank(start.boxes, 3, "start.boxes", "(B, K, 4), of the first frames")
+        elif video.dtype != torch.uint8:
+            raise TensorsimError(f"video: got dtype {video.dtype}, expected uint8 or floating point")
+        layout = "(B, K, 4), of the first frames"
+        check_floating(start.boxes, "start.boxes")
+        check_rank(start.boxes, 3, "start.boxes", layout)
+        check_size(start.boxes, 2, 4, "start.boxes", layout)
         if start.boxes.shape[0] != video.shape[0]:
             raise TensorsimError(
                 f"start: got detections of {start.boxes.shape[0]} clips, expected {video.shape[0]}"
             )
+        each = list(start.boxes.shape[:2])
+        check_floating(start.scores, "start.scores")
+        check_shape(start.scores, each, "start.scores")
+        check_shape(start.labels, each, "start.labels")
+        check_mask(start.valid, each, "start.valid")
         check_finite(torch.where(start.valid.unsqueeze(-1), start.boxes, 0.0), "start.boxes where valid")

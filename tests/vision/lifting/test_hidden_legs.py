@@ -63,6 +63,7 @@ class TestHiddenLegs(StageTester):
         joints, seen, valid, fps = self.inputs((), torch.float32)
         return [
             ((joints[..., :13, :], seen, valid, fps), "14"),
+            ((joints * float("nan"), seen, valid, fps), "joints: got NaN"),
             ((joints, seen[..., :13], valid, fps), "seen"),
             ((joints, seen, valid.float(), fps), "valid"),
             ((joints, seen, valid, 0.0), "fps"),

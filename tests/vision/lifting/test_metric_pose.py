@@ -84,6 +84,9 @@ class MetricPoseTester(StageTester):
             (but(2, good[2][..., :3]), r"lifted.depth: got shape \[2, 8, 3\]"),
             (but(3, good[3][..., :3]), r"lifted.scale: got shape \[2, 3\]"),
             (but(4, good[4][..., :1]), r"lifted.keypoints: got shape"),
+            (but(2, good[2] * float("nan")), "lifted.depth: got NaN"),
+            (but(3, good[3] * float("nan")), "lifted.scale: got NaN"),
+            (but(4, good[4] * float("nan")), "lifted.keypoints: got NaN"),
             (but(5, good[5][:1]), r"valid: got torch.bool of shape \[1, 8\]"),
             (but(5, good[5].float()), "valid: got torch.float32 .* expected bool"),
             (tuple(x[:, :0] for x in good), "at least 1 frame"),
@@ -91,7 +94,19 @@ class MetricPoseTester(StageTester):
 
 
 class TestCameraMode(MetricPoseTester):
-    pass
+    def test_refuses_what_does_not_fit_the_people(self) -> None:
+        keypoints, scores, depth, scale, fit, valid = self.inputs((), torch.float32)
+        index = torch.zeros(scale.shape, dtype=torch.int64)
+        lifted = Lifted(depth, scale, fit, index, torch.zeros_like(scale), torch.zeros_like(depth))
+        place, rest = MetricPose(), (valid, 480, 640, 30.0)
+        with pytest.raises(TensorsimError, match=r"lifted.distance: got shape \[1, 8\]"):
+            place(keypoints, scores, lifted._replace(distance=lifted.distance[:1]), *rest)
+        for cut_off in (valid[:1], valid.float()):
+            with pytest.raises(TensorsimError, match="cut_off: got"):
+                place(keypoints, scores, lifted, *rest, None, cut_off)
+        poses = torch.eye(3, 4).expand(8, 3, 4) * float("nan")
+        with pytest.raises(TensorsimError, match="camera_pose: got NaN"):
+            place(keypoints, scores, lifted, *rest, poses)
 
 
 class TestPaperMode(MetricPoseTester):

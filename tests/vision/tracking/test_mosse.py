@@ -84,6 +84,11 @@ class TestMosseTracker(StageTester):
             ((video[:, :0], start), "at least one clip and frame"),
             ((video[:1], start), "got detections of 2 clips, expected 1"),
             ((video * float("nan"), start), "NaN or infinite"),
+            ((video.long(), start), "video: got dtype torch.int64"),
+            ((video, start._replace(boxes=start.boxes[..., :3])), r"start.boxes: got shape .* \(B, K, 4\)"),
+            ((video, start._replace(scores=start.scores[:, :1])), "start.scores: got shape"),
+            ((video, start._replace(labels=start.labels[:1])), "start.labels: got shape"),
+            ((video, start._replace(valid=start.valid.float())), "start.valid: got torch.float32"),
         ]
 
 
