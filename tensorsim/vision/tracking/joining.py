@@ -40,16 +40,20 @@ def join_tracks(
         (I', T) int64 with I' <= I, in the order of the first of the joined tracks.
     """
     order = looked.to(torch.int64).cumsum(0)
-    again = True
-    while again:
-        again = False
-        for i in range(table.shape[0]):
-            for j in range(i + 1, table.shape[0]):
-                if not again and _same(table[i], table[j], boxes, scores, order, strong_score, longest_gap):
-                    joined = _joined(table[i], table[j], scores)
-                    table = torch.cat([table[:i], joined[None], table[i + 1 : j], table[j + 1 :]])
-                    again = True
-    return table
+    count = table.shape[0]
+    table, left = table.clone(), torch.ones(count, dtype=torch.bool)
+    # Pairs to look at, in order: each once, and again where one of the two has been joined since.
+    due = torch.ones(count, count, dtype=torch.bool).triu(1)
+    while bool(due.any()):
+        first = int(due.flatten().to(torch.uint8).argmax())
+        i, j = first // count, first % count
+        due[i, j] = False
+        if _same(table[i], table[j], boxes, scores, order, strong_score, longest_gap):
+            table[i] = _joined(table[i], table[j], scores)
+            left[j] = False
+            due[j], due[:, j] = False, False
+            due[:i, i], due[i, i + 1 :] = left[:i], left[i + 1 :]
+    return table[left]
 
 
 def _same(

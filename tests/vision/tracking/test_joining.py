@@ -1,10 +1,13 @@
 """Tracks that are one person, on boxes whose truth is known."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
 from tensorsim.types import Detections
+from tensorsim.vision.tracking import joining
 from tensorsim.vision.tracking.joining import contained, join_tracks
 from tensorsim.vision.tracking.tracker import GNNTracker
 
@@ -128,3 +131,27 @@ def test_pairs_are_found_where_there_are_more_tracks_than_frames() -> None:
         table, boxes, torch.full((2, 3), 0.8).double(), torch.ones(2, dtype=torch.bool), 0.5, 5
     )
     assert found.tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
+def test_pairs_are_looked_at_once_unless_one_of_them_was_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve people side by side, six of whom are lost and found again; the result is that of looking at all anew."""
+    places = [(200.0 * k, 100.0, 200.0 * k + 80.0, 300.0) for k in range(12)]
+    tracks = [(slice(0, 15 if k % 2 else 40), place, 0.8) for k, place in enumerate(places)]
+    tracks += [(slice(17, 40), place, 0.8) for place in places[1::2]]
+    looked, same = torch.ones(40, dtype=torch.bool), joining._same
+    calls = 0
+
+    def counted(*arguments: Any) -> bool:
+        nonlocal calls
+        calls += 1
+        return same(*arguments)
+
+    monkeypatch.setattr(joining, "_same", counted)
+    table, boxes, scores = clip(*tracks)
+    before = table.clone()
+    joined = join_tracks(table, boxes, scores, looked, 0.5, 23)
+    assert torch.equal(table, before)
+    expected = table[:12].clone()
+    expected[1::2] = torch.maximum(expected[1::2], table[12:])
+    assert torch.equal(joined, expected)
+    assert calls <= 18 * 17 // 2 + 6 * 17
