@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_shape
+from tensorsim.errors import TensorsimError, check_finite, check_floating, check_positive, check_shape
 from tensorsim.types import Tracks
 
 
@@ -34,9 +34,14 @@ def to_even_time(
         boxes, key points and scores.
 
     Raises:
-        TensorsimError: times of another shape, not finite or not increasing.
+        TensorsimError: times of another shape, not finite or not increasing, fewer than 2 frames, fps not positive.
     """
     clips, frames = tracks.valid.shape[0], tracks.valid.shape[2]
+    check_positive(fps, "fps")
+    if frames < 2:
+        raise TensorsimError(
+            f"tracks.valid: got shape {list(tracks.valid.shape)}, expected at least 2 frames"
+        )
     check_floating(times_s, "times_s")
     check_shape(times_s, [clips, frames], "times_s")
     check_finite(times_s, "times_s")
@@ -52,7 +57,8 @@ def to_even_time(
     share = torch.where(share < 1e-3, 0.0, torch.where(share > 1 - 1e-3, 1.0, share))
 
     here = _both(tracks.valid, after, share) & (even <= since[:, -1:] + 1e-3 / fps).unsqueeze(1)
-    moved = Tracks(_linear(tracks.boxes, after, share), here, _both(tracks.matched, after, share) & here)
+    boxes = _linear(tracks.boxes, after, share) * here.unsqueeze(-1)
+    moved = Tracks(boxes, here, _both(tracks.matched, after, share) & here)
     return moved, _linear(keypoints, after, share), _both(scores, after, share)
 
 

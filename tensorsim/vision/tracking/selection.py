@@ -38,7 +38,7 @@ def select_people(pose: Pose, mode: str, fps: float) -> Pose:
         mean = (range_m * valid).sum(dim=-1) / valid.sum(dim=-1).clamp(min=1)
         mean = torch.where(steady & valid.any(dim=-1), mean, torch.full_like(mean, float("inf")))
         chosen = torch.arange(people, device=valid.device) == mean.argmin()
-    elif mode.isdecimal() and 1 <= int(mode) <= people:
+    elif isinstance(mode, str) and mode.isdecimal() and 1 <= int(mode) <= people:
         chosen = torch.arange(people, device=valid.device) == int(mode) - 1
     else:
         raise TensorsimError(

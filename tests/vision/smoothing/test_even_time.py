@@ -28,7 +28,7 @@ def seen(clips: int, people: int, frames: int) -> tuple[Tracks, Tensor, Tensor]:
     boxes = 100 * torch.rand(clips, people, frames, 4, generator=generator)
     keypoints = 100 * torch.rand(clips, people, frames, 17, 2, generator=generator)
     return (
-        Tracks(boxes, valid, valid & True),
+        Tracks(boxes * valid[..., None], valid, valid & True),
         keypoints,
         torch.rand(keypoints.shape[:-1], generator=generator),
     )
@@ -46,6 +46,8 @@ def test_equals_numpy() -> None:
             columns = values[clip].movedim(1, -1).flatten(0, -2).numpy()
             expected = np.stack([np.interp(even, since, column) for column in columns])
             found = result[clip].movedim(1, -1).flatten(0, -2).numpy()
+            if result is moved.boxes:  # of those who are there
+                expected = expected * moved.valid[clip].repeat_interleave(4, dim=0).numpy()
             np.testing.assert_allclose(
                 found[:, inside], expected[:, inside], atol=0.2
             )  # 1e-3 of a frame is a frame
@@ -63,6 +65,14 @@ def test_even_times_change_nothing() -> None:
     times = torch.arange(30, dtype=torch.float64)[None] / FPS + 7.0
     moved = to_even_time(tracks, keypoints, scores, times, FPS)
     assert_same((*moved[0], *moved[1:]), (*tracks, keypoints, scores), atol=1e-5)
+
+
+def test_one_frame_and_no_rate_are_refused() -> None:
+    times = torch.zeros(1, 1)
+    with pytest.raises(ts.TensorsimError, match=r"got shape \[1, 1, 1\], expected at least 2 frames"):
+        to_even_time(*seen(1, 1, 1), times, FPS)
+    with pytest.raises(ts.TensorsimError, match="fps: got 0"):
+        to_even_time(*seen(1, 1, 5), torch.arange(5.0)[None], 0.0)
 
 
 def test_scripted_equals_eager() -> None:

@@ -42,6 +42,8 @@ def test_what_is_refused(scene: Pose) -> None:
     for mode in ("5", "0", "nobody", "-1"):
         with pytest.raises(TensorsimError, match=r"'moving', 'nearest' or the number of one of the 4 found"):
             select_people(scene, mode, FPS)
+    with pytest.raises(TensorsimError, match="got 2, expected 'all'"):
+        select_people(scene, 2, FPS)  # type: ignore[arg-type]
     twice = Pose(*(torch.cat([part, part]) for part in scene))
     with pytest.raises(TensorsimError, match="got 2 clips"):
         select_people(twice, "all", FPS)
