@@ -96,6 +96,23 @@ def _kernel(sigma: float, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
     return offset, torch.exp(-0.5 * (offset / sigma).square())
 
 
+def _convolved(rows: Tensor, kernels: Tensor, most: int = 2**23) -> Tensor:
+    """``F.conv1d`` of rows (R, 1, T) with odd kernels (C, 1, K), zero beyond the ends: (R, C, T).
+
+    Torch copies K values for every one in double precision; pieces of the rows have ``most`` copies at a time.
+    """
+    frames, radius = rows.shape[-1], kernels.shape[-1] // 2
+    if is_exporting() or rows.numel() * kernels.shape[-1] <= most:
+        return F.conv1d(rows, kernels, padding=radius)
+    piece = max(most // (rows.shape[0] * kernels.shape[-1]), 1)
+    padded = F.pad(rows, [radius, radius])
+    parts: list[Tensor] = []
+    for start in range(0, frames, piece):
+        stop = min(start + piece, frames)
+        parts.append(F.conv1d(padded[..., start : stop + 2 * radius], kernels))
+    return torch.cat(parts, dim=-1)
+
+
 def local_linear(x: Tensor, weights: Tensor, sigma: float, ridge: Tensor | None = None) -> Tensor:
     """Local linear regression along time with a Gaussian kernel (Fan and Gijbels, 1996, section 3.1).
 
@@ -114,11 +131,10 @@ def local_linear(x: Tensor, weights: Tensor, sigma: float, ridge: Tensor | None 
     """
     frames = x.shape[-1]
     offset, kernel = _kernel(sigma, frames, x)
-    radius = offset.shape[0] // 2
     moments = torch.stack([kernel, kernel * offset, kernel * offset.square()])[:, None]
     flat, w = x.reshape(-1, 1, frames), weights.reshape(-1, 1, frames)
-    s = F.conv1d(w, moments, padding=radius)
-    t = F.conv1d(w * flat, moments[:2], padding=radius)
+    s = _convolved(w, moments)
+    t = _convolved(w * flat, moments[:2])
     total = s[:, 0].clamp(min=1e-12)
     where, mean = s[:, 1] / total, t[:, 0] / total  # centres of gravity in time and value
     spread = s[:, 2] / total - where.square()
@@ -141,10 +157,9 @@ def ridge_in_gaps(weights: Tensor, sigma: float) -> Tensor:
     """
     frames = weights.shape[-1]
     _, kernel = _kernel(sigma, frames, weights)
-    radius = kernel.shape[0] // 2
     w = weights.reshape(-1, 1, frames)
-    there = F.conv1d(w, kernel[None, None], padding=radius)
-    whole = F.conv1d(torch.ones_like(w), kernel[None, None], padding=radius)
+    there = _convolved(w, kernel[None, None])
+    whole = _convolved(torch.ones_like(w), kernel[None, None])
     return 1e-3 * (whole / there.clamp(min=1e-12) - 2.0).clamp(min=0.0).reshape(weights.shape)
 
 

@@ -1,9 +1,13 @@
 """Filters along tracks, against NumPy."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from tensorsim.vision.smoothing import along_time
 from tensorsim.vision.smoothing.along_time import (
     brief_gaps,
     crossed_within,
@@ -188,3 +192,21 @@ def test_raised_slowly_is_a_mean_of_running_maxima(frames: int, reach: int) -> N
     found = raised_slowly(torch.from_numpy(x), reach)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
     assert bool((found >= torch.from_numpy(x) - 1e-12).all())
+
+
+def test_long_films_of_high_rates_are_smoothed_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three people for 25 s at 240 frames per second, smoothed over 1.5 s; torch copies every window."""
+    x = torch.randn(3, 6000, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).cumsum(-1)
+    weights = (x.cos() > 0).double()
+    convolve, copies = torch.nn.functional.conv1d, []
+
+    def noted(rows: Tensor, kernels: Tensor, **options: Any) -> Tensor:
+        out = convolve(rows, kernels, **options)
+        copies.append(out.numel() // kernels.shape[0] * kernels.shape[-1])
+        return out
+
+    monkeypatch.setattr(along_time.F, "conv1d", noted)
+    smooth = local_linear(x, weights, 360.0)
+    assert max(copies) <= 2**23 < 3 * 6000 * 2883
+    monkeypatch.setattr(along_time, "_convolved", lambda w, k: convolve(w, k, padding=k.shape[-1] // 2))
+    torch.testing.assert_close(smooth, local_linear(x, weights, 360.0), rtol=0, atol=1e-12)
