@@ -44,15 +44,20 @@ def join_tracks(
     table, left = table.clone(), torch.ones(count, dtype=torch.bool)
     # Pairs to look at, in order: each once, and again where one of the two has been joined since.
     due = torch.ones(count, count, dtype=torch.bool).triu(1)
-    while bool(due.any()):
-        first = int(due.flatten().to(torch.uint8).argmax())
-        i, j = first // count, first % count
-        due[i, j] = False
-        if _same(table[i], table[j], boxes, scores, order, strong_score, longest_gap):
-            table[i] = _joined(table[i], table[j], scores)
-            left[j] = False
-            due[j], due[:, j] = False, False
-            due[:i, i], due[i, i + 1 :] = left[:i], left[i + 1 :]
+    i = 0
+    while i < count:
+        joined = False
+        columns: list[int] = torch.nonzero(due[i])[:, 0].tolist()
+        for j in columns:
+            due[i, j] = False
+            if _same(table[i], table[j], boxes, scores, order, strong_score, longest_gap):
+                table[i] = _joined(table[i], table[j], scores)
+                left[j] = False
+                due[j], due[:, j] = False, False
+                due[:i, i], due[i, i + 1 :] = left[:i], left[i + 1 :]
+                joined = True
+                break
+        i = 0 if joined else i + 1
     return table[left]
 
 
