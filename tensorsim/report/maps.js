@@ -4,6 +4,11 @@ function bytesOf(base64) {
   return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 }
 
+// A number with so many digits; what rounds to zero has no sign.
+function fixed(value, digits) {
+  return (Number(value.toFixed(digits)) || 0).toFixed(digits);
+}
+
 // Round numbers, at most about `most` of them, between two ends.
 function ticksBetween(low, high, most) {
   const rough = (high - low) / most;
@@ -12,7 +17,7 @@ function ticksBetween(low, high, most) {
   const ticks = [];
   for (let tick = Math.ceil(low / step) * step; tick <= high + 1e-9; tick += step) ticks.push(tick);
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-  return ticks.map((tick) => [tick, tick.toFixed(digits)]);
+  return ticks.map((tick) => [tick, fixed(tick, digits)]);
 }
 
 function sizedContext(canvas) {
@@ -112,7 +117,7 @@ class MapView {
       for (const [value, text] of ticksBetween(map.low * factor, map.high * factor, 6)) {
         // Ticks within the map: beside the numbers they look like minus signs.
         context.fillStyle = "white";
-        context.fillRect(right - 5, y(value / factor), 5, 1);
+        context.fillRect(x(map.end_s) - 5, y(value / factor), 5, 1);
         context.fillStyle = ink;
         context.fillText(text, right + 5, y(value / factor));
       }

@@ -151,7 +151,7 @@ def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = 
         "start_s": float(axes.time_s[0]) - step_s / 2,
         "end_s": float(axes.time_s[-1]) + step_s / 2,
         "second_axis": {"label": "m/s", "per_unit": axes.speed_per_hz},
-        "ridges": [[None if np.isnan(hz) else round(float(hz), 1) for hz in ridge] for ridge in ridges],
+        "ridges": [[round(float(hz), 1) if abs(hz) <= span else None for hz in ridge] for ridge in ridges],
     }
     contents = [doppler]
     for name, title in (

@@ -71,8 +71,8 @@ function describe(content) {
       row.id,
       `${(row.first_frame / content.fps).toFixed(2)} s`,
       `${(row.last_frame / content.fps).toFixed(2)} s`,
-      `${row.mean_range_m.toFixed(2)} m`,
-      `${row.mean_approach_m_s.toFixed(2)} m/s`,
+      `${fixed(row.mean_range_m, 2)} m`,
+      `${fixed(row.mean_approach_m_s, 2)} m/s`,
       ...(labelled ? [row.label || ""] : []),
     ]),
   );

@@ -95,12 +95,9 @@ class Scene3D {
 
   drawRadar(context) {
     context.fillStyle = "#fff";
-    for (const antenna of this.scene.antennas_m) {
-      const [x, y] = this.project(antenna);
-      context.fillRect(x - 3, y - 3, 6, 6);
-    }
-    const [x, y] = this.project(this.scene.antennas_m[0]);
-    context.fillText("radar", x + 8, y - 6);
+    const places = this.scene.antennas_m.map((antenna) => this.project(antenna));
+    for (const [x, y] of places) context.fillRect(x - 3, y - 3, 6, 6);
+    context.fillText("radar", Math.max(...places.map(([x]) => x)) + 8, places[0][1] - 6);
     if (!this.scene.wall) return;
     const { center_m: center, size_m: size } = this.scene.wall;
     const corner = (signs) => center.map((value, axis) => value + (signs[axis] * size[axis]) / 2);

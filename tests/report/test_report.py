@@ -126,6 +126,19 @@ def test_ridges_are_those_of_the_picture(run: tuple[Pose, RadarMaps, Axes, dict[
         assert np.isfinite(ridges).any() == some
 
 
+def test_ridges_stay_in_their_map(run: tuple[Pose, RadarMaps, Axes, dict[str, Any]]) -> None:
+    """A map shows the part of the Doppler axis in which there is something; ridges in the noise lie anywhere."""
+    _, maps, axes, _ = run
+    noisy = torch.full_like(maps.doppler_time, 0.01)
+    noisy[len(noisy) // 2] = 1.0
+    everywhere = torch.arange(maps.ridges.numel()).reshape(maps.ridges.shape) % len(noisy)
+    strong = torch.ones_like(maps.ridge_magnitudes)
+    noisy_maps = maps._replace(doppler_time=noisy, ridges=everywhere, ridge_magnitudes=strong)
+    doppler = map_contents(noisy_maps, axes, Pictures())[0]
+    ridges = np.array(doppler["ridges"], dtype=float)
+    assert doppler["low"] <= np.nanmin(ridges) < np.nanmax(ridges) <= doppler["high"]
+
+
 def test_windows_that_overlap_become_stretches_that_do_not() -> None:
     windows = [{"start_s": float(k), "end_s": k + 4.0, "label": str(k), "probability": 0.5} for k in range(3)]
     parts = timeline_content(windows, 6.0)
@@ -227,11 +240,36 @@ def test_a_browser_plays_the_maps_without_the_film_beside(
         assert errors == []
 
 
+@pytest.mark.slow
+def test_a_browser_shows_a_tall_film_and_tidy_axes(
+    tmp_path: Path, run: tuple[Pose, RadarMaps, Axes, dict[str, Any]]
+) -> None:
+    with FilmStrip(tmp_path, FRAMES, FPS) as film:
+        for _ in range(FRAMES):
+            film.add(np.full((640, 360, 3), 128, np.uint8))
+    written(tmp_path, run, film)
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        page.goto((tmp_path / "report.html").as_uri())
+        page.wait_for_selector("body[data-ready=yes]")
+        assert page.locator("#film canvas").bounding_box()["height"] < 600, "the whole film is in the window"
+        assert page.evaluate("fixed(-0.001, 2)") == "0.00"
+        assert [text for _, text in page.evaluate("ticksBetween(-1, 1, 12)")][5] == "0.0"
+        assert not page.evaluate(BETWEEN_MAP_AND_SPEEDS), "no tick that looks like a minus sign"
+
+
 #: The box that a scene without people shows, whose antennas are far to the right.
 FAR_RADAR = """() => {
   const nobody = { joints_cm: "", valid: "", count: 0 };
   const scene = new Scene3D(document.createElement("canvas"), nobody, { antennas_m: [[5, 0, 1.5], [5.2, 0, 2.5]] });
   return [scene.low, scene.high];
+}"""
+#: Whether anything is drawn left of the numbers of the speed axis, where the Doppler-time map has ended.
+BETWEEN_MAP_AND_SPEEDS = """() => {
+  const canvas = document.querySelector("canvas[data-map=doppler_time]");
+  const { width, height } = canvas;
+  const pixels = canvas.getContext("2d").getImageData(width - MARGIN.right - 6, 0, 6, height - MARGIN.bottom).data;
+  return pixels.some((value) => value > 0);
 }"""
 #: Seconds that the shown picture is from: of the film beside, or by the grey of the pictures in the page.
 FILM_TIME = """(fps) => {
