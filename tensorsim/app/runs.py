@@ -22,6 +22,8 @@ from tensorsim.progress import watched
 #: Runs that are kept; the oldest is removed for a new one.
 KEPT = 12
 ARCHIVE = "all.zip"
+#: Seconds that a run may take to end once it is cancelled; a stage that reports no progress does not notice.
+LONGEST_END_S = 10.0
 
 
 class CancelledError(TensorsimError):
@@ -121,6 +123,13 @@ class Runs:
         """Cancel a run that may have ended already."""
         with suppress(KeyError):
             self.known[token or ""].cancelled.set()
+
+    def close(self) -> None:
+        """Cancel all runs and wait for them: a thread that still computes when Python ends aborts the process."""
+        for run in self.known.values():
+            run.cancelled.set()
+        for run in self.known.values():
+            run.finished.wait(LONGEST_END_S)
 
     def file(self, token: str, name: str) -> Path | None:
         """The file of a run with this name, None if there is none: nothing else can be read."""

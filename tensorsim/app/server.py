@@ -60,7 +60,7 @@ def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]
         # Else Gradio, when it is mounted, takes any path of this machine for a file that was uploaded.
         page.has_launched = True
         theme = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["monospace"])
-        yield gr.mount_gradio_app(
+        mounted = gr.mount_gradio_app(
             server,
             page,
             path="/",
@@ -71,3 +71,7 @@ def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]
             ssr_mode=False,
             footer_links=[],
         )
+        try:
+            yield mounted
+        finally:
+            runs.close()

@@ -13,6 +13,7 @@ from torch import Tensor
 from tensorsim.config import CameraConfig
 from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError, check_finite, check_floating, check_mask, check_not_empty
+from tensorsim.progress import progress_bar
 from tensorsim.render.body import REFERENCE_HEIGHT_M, Body, build_body
 from tensorsim.render.cast import View, Volumes, cast
 from tensorsim.render.look import Look, Surface, paint
@@ -128,7 +129,8 @@ class PersonRenderer:
         keypoints, depth = view.project(keypoints_m)
 
         frames, masks, visible = [], [], []
-        with one_thread():  # the many small operations of a frame are slower on several
+        # The many small operations of a frame are slower on several threads.
+        with one_thread(), progress_bar("render", times, quiet=True) as bar:
             for t in range(times):
                 who = present[:, t].nonzero()[:, 0].tolist()
                 linear, owner, front = self._frame(t, who, bodies, looks, view, light, scene)
@@ -136,6 +138,7 @@ class PersonRenderer:
                 masks.append(torch.stack([owner == p for p in range(people)]).unflatten(1, view.size))
                 flags = _visibility(keypoints[:, t], depth[:, t], owner, front, view.size)
                 visible.append(flags * present[:, t, None].to(flags))
+                bar.update(1)
         mask = torch.stack(masks, dim=1)
         boxes = _boxes(mask)
         camera = CameraConfig(

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from scipy.io import loadmat
 
 from tensorsim.app.form import GROUPS, controls, for_demo, options_of
@@ -27,6 +28,7 @@ from tensorsim.commands.simulate import Simulate
 from tensorsim.data.video_writer import write_video
 from tensorsim.errors import TensorsimError
 from tensorsim.progress import picture, progress_bar
+from tensorsim.render.renderer import PersonRenderer
 from tests.browser import chromium
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -188,6 +190,34 @@ def test_a_run_that_waits_can_be_cancelled(tmp_path: Path) -> None:
     assert not first.finished.is_set()
     runs.cancel(first.token)
     ended(first)
+
+
+def test_no_run_outlives_the_app(tmp_path: Path) -> None:
+    """A thread that still computes when Python ends aborts the process."""
+    runs = Runs(tmp_path)
+    started = [runs.start(lambda folder: Work(folder, steps=10_000)) for _ in range(2)]
+    while not any(run.done for run in started):
+        time.sleep(0.005)
+    runs.close()
+    assert [(run.finished.is_set(), run.error) for run in started] == [(True, "cancelled")] * 2
+
+
+class Rendering:
+    """Stands in for the command of a generated person."""
+
+    def run(self) -> None:
+        PersonRenderer(height=32, width=32)(torch.rand(500, 14, 3) + torch.tensor([0.0, 3.0, 0.0]))
+
+
+def test_a_run_can_be_cancelled_while_a_film_is_rendered(tmp_path: Path) -> None:
+    runs = Runs(tmp_path)
+    run = runs.start(lambda folder: Rendering())
+    while run.done < 2 and not run.finished.is_set():
+        time.sleep(0.005)
+    assert (run.stage, run.total) == ("render", 500)
+    runs.cancel(run.token)
+    assert ended(run).error == "cancelled"
+    assert run.done < 500
 
 
 def test_failures_are_one_sentence_without_folders(
