@@ -22,6 +22,7 @@ RANGES: dict[str, Range] = {
     # films and motion
     "frame rate": Range(0.1, 1000.0, "frames per second"),
     "time": Range(0.0, 1e6, "s"),
+    "length of a window": Range(1e-6, 1000.0, "s"),
     "stride": Range(1, 100_000, "frames"),
     "image side": Range(2, 8190, "pixels"),
     "people in a frame": Range(1, 64, "people"),

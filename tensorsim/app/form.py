@@ -60,7 +60,7 @@ _OTHERWISE: dict[str, dict[str, Any]] = {
 }
 #: Kinds of controls that take numbers, and what they expect.
 _EXPECTED = {
-    "number": "numbers",
+    "number": "a number",
     "integer": "a whole number",
     "numbers": "numbers",
     "integers": "whole numbers",

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from tensorsim.config.camera import CameraConfig
-from tensorsim.config.checks import require_choices, require_counts, require_positive
+from tensorsim.config.checks import require_choices, require_counts, require_positive, require_ranges
 from tensorsim.errors import TensorsimError, check_per_person, check_score
 
 Position = Literal["camera", "paper"]
@@ -177,5 +177,6 @@ class SmoothingConfig:
     def __post_init__(self) -> None:
         require_choices(self, mode=SmoothingMode, resampling=Resampling)
         require_counts(self, "polynomial_order")
+        require_ranges(self, brief_gap_s="time")
         if self.smoothing_ratio is not None:
-            require_positive("SmoothingConfig", smoothing_ratio=self.smoothing_ratio)
+            require_ranges(self, smoothing_ratio="length of a window")

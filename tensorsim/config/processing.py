@@ -9,6 +9,7 @@ from tensorsim.config.checks import (
     require_choices,
     require_counts,
     require_positive,
+    require_ranges,
 )
 from tensorsim.errors import TensorsimError
 
@@ -67,7 +68,7 @@ class ProcessingConfig:
             require_choices(self, range_window=RangeWindow)
         require_counts(self, "ridge_count", most=6)
         require_counts(self, "pulse_chunk", "energy_stride")
-        require_positive("ProcessingConfig", window_s=self.window_s)
+        require_ranges(self, window_s="length of a window")
         if not (is_finite(self.overlap) and 0 <= self.overlap < 1):
             raise TensorsimError(f"overlap: got {self.overlap!r}, expected a number in [0, 1)")
         self._check_gate()

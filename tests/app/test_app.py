@@ -83,6 +83,8 @@ def test_values_of_controls_become_options() -> None:
     assert options_of({}) == {}
     with pytest.raises(TensorsimError, match=r"Person height \(m\): got 'tall', expected numbers"):
         options_of({"person_height": "tall"})
+    with pytest.raises(TensorsimError, match=r"STFT window \(s\): got 'abc', expected a number$"):
+        options_of({"stft_window": "abc"})
     with pytest.raises(TensorsimError, match=r"Number of ridges: got 2.5, expected a whole number"):
         options_of({"ridges": 2.5})
     with pytest.raises(TensorsimError, match=r"Number of ridges: got '1e400', expected a whole number"):

@@ -88,6 +88,13 @@ def test_a_bad_file_is_refused_with_its_key(text: str, message: str, tmp_path: P
         ({"scene": 3}, "SimulationConfig.scene: got 3, expected a SceneConfig"),
         ({"pose__person_weight_kg": ()}, "person_weight_kg: got no values"),
         ({"scene__paths": ("direct",), "scene__leakage": True}, "got names of paths and leakage"),
+        ({"smoothing__brief_gap_s": float("nan")}, "brief_gap_s: got nan, expected time from 0 to"),
+        ({"smoothing__brief_gap_s": -1.0}, "brief_gap_s: got -1, expected time from 0 to"),
+        ({"smoothing__smoothing_ratio": 1e9}, r"got 1e\+09, expected length of a window from .* to 1000 s"),
+        (
+            {"processing__window_s": 1e7},
+            r"window_s: got 1e\+07, expected length of a window from .* to 1000 s",
+        ),
     ],
 )
 def test_a_bad_change_is_refused(change: dict[str, object], message: str) -> None:
