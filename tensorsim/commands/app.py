@@ -39,7 +39,9 @@ class App:
             import uvicorn
 
             print(f"tensorsim: http://{self.host}:{self.port}/ (Ctrl-C ends)", file=sys.stderr)
-            uvicorn.Server(uvicorn.Config(app, log_level="warning")).run([bound])
+            # A page that is open keeps its connection; Uvicorn reports as an error with a traceback that it is cut.
+            config = uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1)
+            uvicorn.Server(config).run([bound])
 
 
 def _listening(host: str, port: int) -> socket.socket:

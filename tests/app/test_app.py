@@ -277,9 +277,13 @@ def server(tmp_path: Path) -> Iterator[str]:
             except OSError:
                 assert process.poll() is None, "the app has ended"
         yield address
+        with urllib.request.urlopen(
+            f"{address}/gradio_api/heartbeat/open", timeout=10
+        ):  # a page that is open
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=30) == 143
     finally:
-        process.send_signal(signal.SIGTERM)
-        process.wait(timeout=30)
+        process.kill()
     assert list(tmp_path.glob("tensorsim-app-*")) == [], "temporary files are removed"
 
 
