@@ -1,6 +1,6 @@
-"""The radars of public sets of measured people: scenes by name, and the continuous-wave one by its constants.
+"""Radars of public data sets of measured people: scenes by name, and the continuous-wave radar by its constants.
 
-What the makers state is marked (S), what follows from their data (F), typical settings (T).
+Values stated by the makers are marked (S), values that follow from their data (F), typical settings (T).
 """
 
 from tensorsim.config import SPEED_OF_LIGHT_M_S, RadarConfig, SceneConfig
@@ -22,7 +22,7 @@ MEASURED_SENSORS: dict[str, SceneConfig] = {
             carrier_hz=5.8e9,  # S
             bandwidth_hz=400e6,  # S
             chirp_s=1e-3,  # S
-            prf_hz=1000.0,  # S: sweep after sweep
+            prf_hz=1000.0,  # S: back-to-back sweeps
             sample_rate_hz=128e3,  # S: 128 samples a sweep
             tx_m=(-0.2, 0.0, 1.0),  # T
             rx_m=(0.2, 0.0, 1.0),

@@ -1,4 +1,4 @@
-"""The arguments of a simulator: configurations, options by name, modules in place of them, and their conflicts."""
+"""Arguments of a simulator: configurations, options by name, modules that replace them, and their conflicts."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def configured(
     processing: ProcessingConfig | None,
     options: dict[str, Any],
 ) -> tuple[SceneConfig, ProcessingConfig]:
-    """Scene and processing of the arguments of a simulator; a part comes from a configuration or from options."""
+    """Scene and processing from the arguments of a simulator: each from a configuration or from options."""
     of_scene = {name: value for name, value in options.items() if name in SceneConfig.__dataclass_fields__}
     of_processing = {k: v for k, v in options.items() if k in ProcessingConfig.__dataclass_fields__}
     unknown = sorted(options.keys() - of_scene.keys() - of_processing.keys())
@@ -63,12 +63,12 @@ def refuse_conflicts(
     processing: ProcessingConfig,
     options: set[str],
 ) -> None:
-    """Refuse options, and fields of configurations, that a ready module would leave without effect.
+    """Refuse options, and fields of configurations, that would have no effect because a module replaces them.
 
     Args:
         ready: modules by the name of their argument; None where none was given.
         scene, processing: the configurations; a field counts as given where it differs from the default.
-        options: names of the arguments that were given beside them.
+        options: names of the other arguments that were given.
     """
     for part, module in ready.items():
         if module is not None:
@@ -88,7 +88,7 @@ def refuse_conflicts(
 
 
 def _differs(config: SceneConfig | ProcessingConfig, name: str) -> bool:
-    """Whether a field of a configuration differs from its default; not if it has no such field."""
+    """Whether a field of a configuration differs from its default; False if there is no such field."""
     if name == "multipath" and isinstance(config, SceneConfig):
         return config.has_multipath
     field = config.__dataclass_fields__.get(name)

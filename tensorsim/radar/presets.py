@@ -1,8 +1,8 @@
 """Radars by name, and radars from YAML files.
 
-A file holds fields of :class:`~tensorsim.config.RadarConfig` and, for a scene with a wall or a floor that reflects,
-sections with those of :class:`~tensorsim.config.WallConfig` and :class:`~tensorsim.config.FloorConfig`; what is not
-named keeps its default::
+A file holds fields of :class:`~tensorsim.config.RadarConfig` and, for a scene with a wall or a reflecting floor,
+sections with fields of :class:`~tensorsim.config.WallConfig` and :class:`~tensorsim.config.FloorConfig`; fields that
+are not given keep their defaults::
 
     carrier_hz: 24.0e9
     bandwidth_hz: 250e6
@@ -26,15 +26,15 @@ from tensorsim.errors import TensorsimError
 from tensorsim.files import write_text
 from tensorsim.radar.measured_sensors import MEASURED_SENSORS
 
-#: The parts of a scene that a file describes beside the radar.
+#: The parts of a scene that a file describes besides the radar.
 _SECTIONS: dict[str, type] = {"wall": WallConfig, "floor": FloorConfig}
 
 
-#: Radars by name. Each number is marked: (D) limit or value of the public documents of the part, (T) a typical
-#: setting for people, within these limits; antennas stand 1 m above the floor. The documents are the data sheets
-#: of the parts, whose numbers stand beside them, and the guides of the boards; check them where it matters. The
-#: simulated pulses are evenly spaced, without pauses between frames, and the samples complex; the swept band is all
-#: sampled, where a real chirp loses some at its ends.
+#: Radars by name. Each number is marked: (D) a limit or value from the public documents of the part, (T) a typical
+#: setting for observing people, within these limits; antennas are 1 m above the floor. The documents are the data
+#: sheets of the parts, whose numbers are given below, and the user guides of the boards; check them where it matters.
+#: The simulated pulses are evenly spaced, without pauses between frames, and the samples are complex; the whole swept
+#: band is sampled, whereas a real chirp loses some of it at its ends.
 PRESETS: dict[str, SceneConfig] = {
     # The two scenes of the paper's control panel.
     "free-space": SceneConfig(RadarConfig.free_space()),
@@ -82,15 +82,15 @@ PRESETS: dict[str, SceneConfig] = {
         )
     ),
     # Infineon BGT60TR13C (data sheet 2.4.9): antennas in the package, one transmitter, three receivers in an L; here
-    # the corner one.
+    # only the corner one.
     "infineon-bgt60tr13c": SceneConfig(
         RadarConfig(
             carrier_hz=58e9,  # D: 58 to 63.5 GHz
             bandwidth_hz=5.5e9,  # D: widest sweep
             chirp_s=128e-6,  # T: 43 MHz/us; D: at most 400 MHz/us
             prf_hz=4000.0,  # T: 4.9 m/s
-            sample_rate_hz=4e6,  # D: highest rate; real samples, which reach as far as half the bins here; 7.0 m
-            tx_m=(-0.0025, 0.0, 1.0),  # T: other side of a package 6.5 mm wide (D)
+            sample_rate_hz=4e6,  # D: highest rate, of real samples; their range is that of the N / 2 bins here, 7.0 m
+            tx_m=(-0.0025, 0.0, 1.0),  # T: opposite side of a package 6.5 mm wide (D)
             rx_m=(0.0025, 0.0, 1.0),
             antenna_gain_dbi=5.0,  # T
             isolation_db=30.0,  # T
@@ -110,7 +110,7 @@ PRESETS: dict[str, SceneConfig] = {
             isolation_db=30.0,  # T
         )
     ),
-    # A continuous-wave Doppler sensor at 24 GHz, 160 Hz per m/s: a sweep so narrow that all is in one range bin.
+    # A continuous-wave Doppler sensor at 24 GHz, 160 Hz per m/s: a sweep so narrow that everything is in one range bin.
     "cw-24ghz": SceneConfig(
         RadarConfig(
             carrier_hz=24e9 - 0.5e6,  # D: the centre of the sweep at 24 GHz
@@ -138,7 +138,7 @@ PRESETS |= MEASURED_SENSORS | {
             rx_m=tuple((0.01 + k * _HALF_79_GHZ, 0.0, 1.0) for k in range(4)),
         )
     ),
-    # D: the corner of the L, its neighbours 2.5 mm beside and above it (which is up depends on the mounting).
+    # D: the corner of the L, its neighbours 2.5 mm beside and above it (which way is up depends on the mounting).
     "infineon-bgt60tr13c-array": SceneConfig(
         replace(
             PRESETS["infineon-bgt60tr13c"].radar,
@@ -177,11 +177,11 @@ def load_radar_yaml(path: str | Path) -> RadarConfig:
 def load_scene_yaml(path: str | Path) -> SceneConfig:
     """The radar of a YAML file, and its wall and floor if the file has sections ``wall`` and ``floor``.
 
-    The fields of the radar may also stand in a section ``radar``. Numbers may be written as in Python: unlike
+    The fields of the radar may also be in a section ``radar``. Numbers may be written as in Python: unlike
     plain YAML 1.1, ``77e9`` is one. Nothing in the file is run.
 
     Raises:
-        TensorsimError: no such file, no YAML, an unknown or repeated key, a value of the wrong type, or one that
+        TensorsimError: no such file, invalid YAML, an unknown or repeated key, a value of the wrong type, or one that
             the configuration refuses; the message names file and key.
     """
     document = read_yaml(path)

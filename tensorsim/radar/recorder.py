@@ -1,4 +1,4 @@
-"""What a radar records of a scene: range profiles with the noise and the effects of its receiver."""
+"""What a radar records of a scene: range profiles with the noise and other effects of its receiver."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from tensorsim.radar.synthesis.noise import ProfileNoise, ReceiverNoise, energy
 
 
 def receiver_noise(scene: SceneConfig, echo: EchoSynthesizer) -> ReceiverNoise:
-    """The thermal noise of a scene; one without echo gets that of a target of 1 m^2 at 3 m in free space."""
+    """The thermal noise of a scene; without echoes, that for a target of 1 m^2 at 3 m in free space."""
     return ReceiverNoise(
         scene.snr_db,
         scene.noise_reference,
@@ -30,7 +30,7 @@ def receiver_noise(scene: SceneConfig, echo: EchoSynthesizer) -> ReceiverNoise:
 def stretches(
     positions: Tensor, rcs: Tensor, ahead: Tensor | None, span: int
 ) -> list[tuple[int, Tensor, Tensor, Tensor | None]]:
-    """A scene ``span`` pulses at a time: number of the first pulse, positions, RCS and way ahead, as views.
+    """Split a scene every ``span`` pulses: number of the first pulse, positions, RCS and displacements, as views.
 
     Args:
         positions: (B, M, S, 3) m.
@@ -46,21 +46,21 @@ def stretches(
 
 
 class Recorder(nn.Module):
-    """Scatterers to range profiles as they are received, a piece of the clip at a time.
+    """Computes the received range profiles of scatterers, a piece of the clip at a time.
 
-    Noise and converters depend on the mean powers of the whole clip (:class:`Levels`), so every scene is worked on
+    Noise and converters depend on the mean powers of the whole clip (:class:`Levels`), so every scene is processed
     twice: :meth:`survey` measures the powers, :meth:`received` gives the profiles. With an ideal receiver the profiles
-    of the first time are kept, and noise is added to them; otherwise a :class:`FrontEnd` works on the samples.
+    of the first pass are kept, and noise is added to them; otherwise a :class:`FrontEnd` processes the samples.
 
     Args:
         scene: radar, noise, receiver, clutter, interference.
         processing: the engine and ``pulse_chunk``.
-        echo: of the scene.
-        profile: samples to range profiles.
-        seed: of clutter and phase noise.
+        echo: synthesises the echo of the scene.
+        profile: converts samples to range profiles.
+        seed: for clutter and phase noise.
 
     Shapes: positions (B, m, S, 3) m and RCS (B, m, S) m^2, which are not checked here, to profiles (B, m, V R): the
-    channels of V antennas stand one after the other.
+    channels of V antennas are concatenated.
 
     Attributes:
         channels: V.
@@ -96,7 +96,7 @@ class Recorder(nn.Module):
         self.needs_levels = not self.noise.noiseless or self.front_end is not None
 
     def echoes(self, positions: Tensor, rcs: Tensor, span: int) -> tuple[list[Tensor], Levels]:
-        """Profiles free of noise, ``span`` pulses in each (none with a front end), and the levels of the clips."""
+        """Noise-free profiles in pieces of ``span`` pulses (none with a front end), and the levels of the clips."""
         pieces: list[Tensor] = []
         nothing = torch.zeros([positions.shape[0]], dtype=torch.float64, device=positions.device)
         levels = Levels(nothing, nothing)
@@ -110,7 +110,7 @@ class Recorder(nn.Module):
         return pieces, levels
 
     def add(self, levels: Levels, energies: Levels, pulses: int) -> Levels:
-        """Mean powers of clips of this many pulses, with the energies of another piece."""
+        """Add the energies of another piece to the mean powers of clips of this many pulses."""
         samples = pulses * self.samples
         signal = levels.signal + energies.signal.to(levels.signal) / samples
         return Levels(signal, levels.arriving + energies.arriving.to(levels.arriving) / samples)
@@ -118,7 +118,7 @@ class Recorder(nn.Module):
     def survey(
         self, positions: Tensor, rcs: Tensor, first: int, ahead: Tensor | None
     ) -> tuple[Tensor, Levels]:
-        """Profiles free of noise, stored with time running fastest, and energies (B,), of pulses ``first`` onwards.
+        """Noise-free profiles, with time varying fastest in memory, and energies (B,) of pulses ``first`` onwards.
 
         ``ahead`` (B, m, S, 3): see :mod:`~tensorsim.radar.synthesis.engines`.
 
@@ -136,7 +136,7 @@ class Recorder(nn.Module):
             else:
                 profiles, reference = self.engine(points, sections, first + start, way)
                 chunks.append(profiles.transpose(1, 2))
-            # Without noise the ratio is infinite, and no gradient goes through it.
+            # Without noise the ratio is infinite, and no gradient flows through it.
             signal = signal + (reference if self.needs_levels else reference.detach())
         return torch.cat(chunks, -1).transpose(1, 2), Levels(signal, arriving)
 
@@ -149,9 +149,9 @@ class Recorder(nn.Module):
         levels: Levels,
         echoes: list[Tensor],
     ) -> tuple[Tensor, Tensor]:
-        """Profiles of pulses ``first`` onwards with all that the receiver adds, and the energy (B,) of its noise.
+        """Profiles of pulses ``first`` onwards with all receiver effects, and the energy (B,) of the receiver noise.
 
-        The first of ``echoes``, if there is one, is taken out: profiles free of noise, which need not be made again.
+        ``echoes`` may hold noise-free profiles from :meth:`echoes`: the first are removed and used, not recomputed.
         """
         if self.front_end is not None:
             chunks: list[Tensor] = []
@@ -169,13 +169,13 @@ class Recorder(nn.Module):
         return noise.add_(clean), drawn
 
     def drawn(self, clean: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
-        """Noise in the shape of profiles (B, m, V R), of a power (B,) per sample, and its energy (B,)."""
-        # Every antenna has noise of its own.
+        """Noise in the shape of profiles (B, m, V R), with power (B,) per sample, and its energy (B,)."""
+        # Every channel has its own noise.
         like = clean.transpose(1, 2).reshape([clean.shape[0] * self.channels, -1, clean.shape[1]])
         noise, energies = self.profile_noise(like, power.repeat_interleave(self.channels))
         noise = noise.reshape([clean.shape[0], -1, clean.shape[1]]).transpose(1, 2)
         return noise, energies.reshape([-1, self.channels]).mean(-1)
 
     def step(self, positions: Tensor) -> int:
-        """Pulses of every clip to work on at a time."""
+        """Number of pulses per clip to process at a time."""
         return max(1, self.pulse_chunk // max(1, positions.shape[0]))

@@ -1,4 +1,4 @@
-"""The radar chain whole: scatterers in, range-time maps, Doppler-time map and ridges out."""
+"""The whole radar chain: from scatterers to range-time maps, a Doppler-time map and ridges."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -24,19 +24,19 @@ from tensorsim.radar.synthesis.front_end import Levels
 from tensorsim.radar.synthesis.noise import decibels
 from tensorsim.types import RadarMaps
 
-#: ``source(start, stop)`` gives pulses start to stop of a scene: positions (stop - start, S, 3) and RCS.
+#: ``source(start, stop)`` returns pulses start to stop of a scene: positions (stop - start, S, 3) and RCS.
 Source = Callable[[int, int], tuple[Tensor, Tensor]]
 
-#: Largest size of echoes that :meth:`RadarSimulator.stream` keeps: 20 s in free space.
+#: Largest size in bytes of the echoes that :meth:`RadarSimulator.stream` keeps: 20 s in free space.
 KEPT_BYTES = 2**28
 
 
 class Pending(NamedTuple):
-    """What later pulses of B clips need of earlier ones.
+    """What later pulses of B clips need from earlier ones.
 
     Attributes:
-        profiles: (B, p, V R) complex, the last ones that the moving target indicator has seen.
-        moving: (B, q, V R) complex, what it made of them as far as later Doppler frames need it.
+        profiles: (B, p, V R) complex, the last profiles that entered the moving target indicator.
+        moving: (B, q, V R) complex, the part of its output that later Doppler frames still need.
     """
 
     profiles: Tensor
@@ -44,13 +44,13 @@ class Pending(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """What a stretch of m pulses adds to the maps of B clips.
+    """What m consecutive pulses add to the maps of B clips.
 
     Attributes:
-        profiles: (B, m, V R) complex, with noise; the channels of V antennas stand one after the other.
-        moving: (B, m', V R) complex; fewer in the first piece.
-        doppler_time: (B, F, k) frames that the pulses complete.
-        pending: for the next piece.
+        profiles: (B, m, V R) complex, with noise; the channels of V antennas are concatenated.
+        moving: (B, m', V R) complex, after the moving target indicator; fewer pulses in the first piece.
+        doppler_time: (B, F, k) frames completed by these pulses.
+        pending: what the next piece needs.
     """
 
     profiles: Tensor
@@ -62,11 +62,12 @@ class Piece(NamedTuple):
 class RadarSimulator(nn.Module):
     """Echo, receiver noise, range profiles, moving target indicator, Doppler-time map and ridges of a scene.
 
-    The IF is never held whole: it is made and turned into profiles ``pulse_chunk`` pulses at a time. The profiles
-    are, since the noise in them is set by the mean power of the clip; it is drawn where they are, with the
-    covariance that windowed white noise has there (:class:`~tensorsim.radar.synthesis.noise.ProfileNoise`). ``stream``
-    takes clips of any length without holding their profiles, and makes them twice for it; ``doppler_time`` makes
-    that map alone, for data sets: fastest with ``engine="range-bins"``, few ``near_bins`` and a ``range_gate_m``.
+    The IF of a clip is never held as a whole: it is synthesised and turned into profiles ``pulse_chunk`` pulses at a
+    time. The profiles are, since their noise depends on the mean power of the clip; the noise is drawn in the range
+    bins, with the covariance that windowed white noise has there
+    (:class:`~tensorsim.radar.synthesis.noise.ProfileNoise`). ``stream`` takes clips of any length: it computes long
+    ones twice instead of holding their profiles. ``doppler_time`` computes that map alone, for data sets: fastest
+    with ``engine="range-bins"``, few ``near_bins`` and a ``range_gate_m``.
 
     Args:
         radar: the radar, or a whole :class:`~tensorsim.SceneConfig`.
@@ -76,31 +77,31 @@ class RadarSimulator(nn.Module):
         echo: an :class:`~tensorsim.radar.EchoSynthesizer` in place of one made from the scene.
         mti: the method of a :class:`~tensorsim.radar.MovingTargetIndicator`, or a module of that class.
         doppler, ridges: modules in place of those made from ``processing``.
-        seed: of the room's reflectors, the sensor's vibration and the phase noise.
-        **options: fields of :class:`~tensorsim.SceneConfig` (beside a radar) and of
+        seed: for the room's reflectors, the sensor's vibration and the phase noise.
+        **options: fields of :class:`~tensorsim.SceneConfig` (unless one is given) and of
             :class:`~tensorsim.ProcessingConfig` by name: ``multipath=True``, ``snr_db=20.0``, ``ridge_count=1``, ...
-            Here ``multipath`` is off unless it is asked for.
+            Here ``multipath`` is off by default.
 
-    A scene without echo gets the noise of one with a target of 1 m^2 at 3 m in free space. With ``near_bins`` the
+    A scene without echoes gets the noise of one with a target of 1 m^2 at 3 m in free space. With ``near_bins`` the
     relative error is ``simulator.recorder.engine.bins.truncation`` (1.3 % for 8 with Hamming, 0.06 % with Hann).
-    Noise is drawn for a few chunks of pulses at a time, so with one seed another ``pulse_chunk`` is another
-    realisation.
+    Noise is drawn for a few chunks of pulses at a time, so another ``pulse_chunk`` gives another realisation for the
+    same seed.
 
     Shapes: positions (..., M, S, 3) m, rcs (..., S), (..., M, S) or (S,) m^2 ->
-    :class:`~tensorsim.types.RadarMaps` in float32, or float64 after ``.double()``. Differentiable but for
+    :class:`~tensorsim.types.RadarMaps` in float32, or float64 after ``.double()``. Differentiable, except for the
     ridge bins.
 
-    Several antennas are one radar: range-time maps are root mean squares over the V channels, Doppler-time maps add
-    their powers, and every channel has noise of its own. :meth:`profiles` gives the channels themselves, for angles and
-    points (:class:`~tensorsim.radar.AngleMapper`, :class:`~tensorsim.radar.PointDetector`).
+    Several antennas form one radar: range-time maps are root mean squares over the V channels, Doppler-time maps add
+    their powers, and every channel has its own noise. :meth:`profiles` returns the individual channels, for angles
+    and points (:class:`~tensorsim.radar.AngleMapper`, :class:`~tensorsim.radar.PointDetector`).
 
     Attributes:
         range_time_block: pulses per column of the range-time maps.
         min_pulses: the shortest clip that has a Doppler frame.
 
     Raises:
-        TensorsimError: see the stages; ready modules of another class; maps of a clip shorter than ``min_pulses``;
-            motion that the PRF cannot follow (eager only, like the warnings of targets beyond the range axis or a
+        TensorsimError: see the stages; a module of the wrong class; maps of a clip shorter than ``min_pulses``;
+            motion too fast for the PRF (eager mode only, like the warnings about targets beyond the range axis or a
             fixed gate; see :class:`~tensorsim.radar.processing.ambiguity.SpeedCheck`).
     """
 
@@ -162,7 +163,7 @@ class RadarSimulator(nn.Module):
             radar, processing.window_s, processing.overlap, processing.integration
         )
         self.ridges = ridges or RidgeExtractor(processing.ridge_count)
-        # Chunks in a piece: few, so that the allocator reuses their memory; not few, since pieces overlap.
+        # Chunks per piece: few enough that the allocator reuses their memory, but not too few, since pieces overlap.
         self.piece_chunks = 8
         self.range_time_block = 1
         if processing.display_rate_hz is not None:
@@ -190,7 +191,7 @@ class RadarSimulator(nn.Module):
             pending, noise = piece.pending, noise + noise_energy
         doppler_time = torch.cat(doppler_times, -1)
         ridges = self.ridges(doppler_time)
-        # Without noise the ratio is infinite, and no gradient goes through it.
+        # Without noise the ratio is infinite, and no gradient flows through it.
         signal = levels.signal.detach() if self.recorder.noise.noiseless else levels.signal
         snr_db = decibels(signal, noise / (pulses * self.echo.samples)).to(doppler_time.dtype)
         return RadarMaps(
@@ -204,7 +205,7 @@ class RadarSimulator(nn.Module):
 
     @torch.jit.export
     def doppler_time(self, positions: Tensor, rcs: Tensor) -> Tensor:
-        """Only the Doppler-time map (..., F, K) of :meth:`forward`; with one seed the same."""
+        """Only the Doppler-time map (..., F, K) of :meth:`forward`; identical for the same seed."""
         positions, rcs, lead = self._scene(positions, rcs)
         self._check_pulses(positions.shape[1])
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
@@ -219,10 +220,10 @@ class RadarSimulator(nn.Module):
 
     @torch.jit.export
     def profiles(self, positions: Tensor, rcs: Tensor) -> Tensor:
-        """Complex range profiles as they are received, (..., M, R), or (..., V, M, R) of V channels of an array.
+        """Received complex range profiles, (..., M, R), or (..., V, M, R) for the V channels of an array.
 
         Channel ``v = k A + a`` is transmitter k with receiver a; transmitters fire in turn, see
-        :func:`~tensorsim.radar.align_transmitters`. With one seed those of :meth:`forward`.
+        :func:`~tensorsim.radar.align_transmitters`. For the same seed, the profiles are those of :meth:`forward`.
         """
         positions, rcs, lead = self._scene(positions, rcs)
         echoes, levels = self.recorder.echoes(positions, rcs, self.span(positions))
@@ -245,7 +246,7 @@ class RadarSimulator(nn.Module):
         return stretches(positions, rcs, self.echo.displacements(positions), self.span(positions))
 
     def span(self, positions: Tensor) -> int:
-        """Pulses that are worked on, and for which noise is drawn, at a time; for positions (B, M, S, 3)."""
+        """Number of pulses processed, and for which noise is drawn, at a time; for positions (B, M, S, 3)."""
         if self.mti.whole_clip:
             return positions.shape[1]
         return max(self.piece_chunks * self.recorder.step(positions), self.mti.lost_pulses + 1)
@@ -254,9 +255,10 @@ class RadarSimulator(nn.Module):
     def stream(self, source: Source, pulses: int) -> RadarMaps:
         """Maps of one clip of ``pulses`` pulses whose positions come from ``source`` piece by piece.
 
-        The result equals :meth:`forward` on the whole clip (with one seed, noise included), without leading
-        dimensions and without gradients. Memory does not grow with the clip but for the maps themselves; set
-        ``display_rate_hz``. The source is asked twice for every piece and must answer the same.
+        The result equals :meth:`forward` on the whole clip (including the noise for the same seed), without leading
+        dimensions and without gradients. Memory does not grow with the clip, except for the maps themselves; set
+        ``display_rate_hz`` to limit these. The source is called twice for every piece and must return the same both
+        times.
 
         Raises:
             TensorsimError: as forward; also an ``mti`` that needs the whole clip.
@@ -315,18 +317,18 @@ class RadarSimulator(nn.Module):
 
     @torch.no_grad()
     def advance(self, positions: Tensor, rcs: Tensor, first: int, pending: Pending | None) -> Piece:
-        """Maps of the next pulses of a scene without end.
+        """Maps of the next pulses of an endless scene.
 
-        The noise is that of an empty scene, see the class, as the power of what is still to come is not known. Not for
-        several transmitters, effects of the receiver, or a moving target indicator that needs the whole clip, which are
-        not refused here.
+        The noise is that of an empty scene (see the class), as the power of later pulses is not yet known. Not for
+        several transmitters, receiver effects, or a moving target indicator that needs the whole clip; this is not
+        checked here.
 
         Args:
-            positions: (B, m, S, 3) metres; of the first piece, m is above the ``lost_pulses`` of the moving target
+            positions: (B, m, S, 3) metres; in the first piece, m must exceed the ``lost_pulses`` of the moving target
                 indicator.
             rcs: (B, m, S) m^2.
             first: number of the first of these pulses.
-            pending: of the piece before; None begins.
+            pending: from the previous piece; None for the first one.
         """
         rcs = check_scene(positions, rcs)
         pending = self._nothing_pending(positions) if pending is None else pending
@@ -335,17 +337,18 @@ class RadarSimulator(nn.Module):
         return self._piece(fresh, positions, rcs, pending)
 
     def _pieces(self, source: Source, pulses: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
-        """Pieces of a source, checked: number of the first pulse, positions (1, m, S, 3), RCS (1, m, S), way ahead.
+        """Checked pieces of a source: first pulse number, positions (1, m, S, 3), RCS (1, m, S), displacements.
 
-        All but the last are a multiple of ``pulse_chunk`` long. The way until the next pulse (1, m, S, 3) is for
-        transmitters in turn, else None; for it the source is asked for one pulse more, or for the one before.
+        All but the last have the same length, normally a multiple of ``pulse_chunk``. The displacements up to the
+        next pulse (1, m, S, 3) are for transmitters that fire in turn, else None; to compute them, the source is
+        asked for one more pulse, or for the previous one.
         """
         span = max(self.piece_chunks * self.recorder.pulse_chunk, self.mti.lost_pulses + 1)
         for start in range(0, pulses, span):
             own = min(span, pulses - start)
             in_turn = self.echo.paths.transmitters > 1
             stop = min(start + own + in_turn, pulses)
-            # The last pulse goes on as the one before.
+            # The last pulse repeats the displacement of the one before.
             first = start - 1 if in_turn and stop == start + 1 and start > 0 else start
             positions, rcs = source(first, stop)
             if positions.dim() != 3 or positions.shape[0] != stop - first:
@@ -365,7 +368,7 @@ class RadarSimulator(nn.Module):
             )
 
     def _nothing_pending(self, positions: Tensor) -> Pending:
-        """What is pending before the first pulse of positions (B, M, S, 3)."""
+        """The empty :class:`Pending` before the first pulse of positions (B, M, S, 3)."""
         bins = self.range_profile.range_m.shape[0] * self.channels
         nothing = self.echo.static_echo().new_zeros([positions.shape[0], 0, bins])
         return Pending(nothing, nothing)
@@ -378,9 +381,9 @@ class RadarSimulator(nn.Module):
         return safe_sqrt(magnitude.unflatten(1, [self.channels, -1]).square().mean(1))
 
     def _piece(self, fresh: Tensor, positions: Tensor, rcs: Tensor, pending: Pending) -> Piece:
-        """Maps of the next pulses, after those of which ``pending`` is left.
+        """Maps of the next pulses, given what is pending from the earlier ones.
 
-        Their profiles (B, m, V R) as received, positions (B, m, S, 3), RCS (B, m, S).
+        ``fresh`` (B, m, V R) are their received profiles; positions (B, m, S, 3), RCS (B, m, S).
         """
         profiles = join_pulses(pending.profiles, fresh)
         moving = self.mti(profiles)

@@ -158,7 +158,7 @@ class GaitEstimator(nn.Module):
         )
 
     def _power_above_noise(self, doppler_time: Tensor) -> Tensor:
-        """Power by ascending speed less the noise floor, 0 where there is no echo: (..., F, K) -> (..., F', K).
+        """Power by ascending speed minus the noise floor, 0 where there is no echo: (..., F, K) -> (..., F', K).
 
         The threshold applies to averages over neighbouring cells. The power itself keeps its resolution.
         """
@@ -185,7 +185,7 @@ class GaitEstimator(nn.Module):
     def _step_rate(self, swing: Tensor, steady: Tensor) -> Tensor:
         """Strongest frequency in the band of steps of ``swing`` (W, ..., K), after removal of its trend over 1.2 s.
 
-        The trend is that of steady frames: between two walks there is none.
+        The trend is computed from steady frames only: between two walks there is none.
 
         Periodograms of ``log(swing)`` over 4 s, half overlapping, are averaged (Welch), since the phase of the steps
         changes when the person turns. Those of all W are scaled to the same power and added. ``steady`` (..., K).
@@ -199,7 +199,7 @@ class GaitEstimator(nn.Module):
         signal = signal * F.avg_pool1d(weight, 9, 1, 4)
         span = min(frames, 4 * self.second)
         window = torch.hann_window(span, periodic=False, dtype=signal.dtype, device=signal.device)
-        # Zero padding for a spectrum in steps of 0.01 Hz: the clip may have a few steps only.
+        # Zero padding for a spectrum in steps of 0.01 Hz: the clip may contain only a few steps.
         length = 100 * self.second
         pieces = signal.squeeze(1).unfold(-1, span, max(1, span // 2)) * window
         spectrum = torch.fft.rfft(pieces, length).abs().square().mean(1)

@@ -73,8 +73,8 @@ def entropy(maps: Tensor) -> Tensor:
     """Shannon entropy (...) in nats of the distribution of power over a map (..., F, K).
 
     ``-sum p ln p`` with ``p = |map|^2 / sum |map|^2``; a gain has no influence. 0 for a single point (and for a map of
-    zeros), ``ln(F K)`` for a constant map; sharper maps have lower entropy. Differentiable; the gradient by a cell of 0
-    is 0.
+    zeros), ``ln(F K)`` for a constant map; sharper maps have lower entropy. Differentiable; the gradient with respect
+    to a cell of 0 is 0.
 
     >>> float(entropy(torch.eye(4)))  # four equal cells: ln 4
     1.3862943649291992

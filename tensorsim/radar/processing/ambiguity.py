@@ -19,7 +19,7 @@ from tensorsim.errors import (
 )
 from tensorsim.radar.synthesis.legs import leg_length
 
-#: A scatterer with a smaller share of the largest RCS has been filtered out by the receiver.
+#: A scatterer whose RCS is a smaller fraction of the largest counts as filtered out by the receiver.
 _FILTERED = 1e-6
 
 
@@ -34,10 +34,10 @@ def mean_range(positions: Tensor, radar: RadarConfig) -> Tensor:
 
 
 def gate_around(positions: Tensor, radar: RadarConfig, margin_m: float = 0.5) -> tuple[float, float]:
-    """The range gate (nearest, farthest) in metres that holds all scatterers, for ``range_gate_m`` of a simulator.
+    """The range gate (nearest, farthest) in metres that contains all scatterers, for a simulator's ``range_gate_m``.
 
     Args:
-        positions: (..., 3) m of everybody in the data set.
+        positions: (..., 3) m of all people in the data set.
         radar: the radar.
         margin_m: added on both sides, for the width of a target in range and the delay of a wall.
 
@@ -66,14 +66,14 @@ class SpeedCheck:
     whole map is wrong: an error. If only some scatterers are, a foot for instance: a warning. A scatterer at a range
     larger than that of the last bin has a beat frequency above half the sample rate and is not in the map; from twice
     to three times that range the frequency is above the sample rate and the scatterer appears too near: warnings. A
-    receiver of one channel cannot tell frequencies above half the sample rate from those below, and shows everybody
-    beyond the last bin too near. A scatterer outside of a fixed range gate is cut off: a warning. Scatterers with RCS
-    0, such as people before they appear, are ignored.
+    single-channel receiver cannot distinguish frequencies above half the sample rate from those below, so everything
+    beyond the last bin appears too near. A scatterer outside a fixed range gate is cut off: a warning. Scatterers
+    with RCS 0, such as people before they appear, are ignored.
 
     Args:
         radar: the radar.
-        gate_m: (nearest, farthest) m of a fixed range gate; None is all of the range axis.
-        real: the receiver has one channel.
+        gate_m: (nearest, farthest) m of a fixed range gate; None is the whole range axis.
+        real: whether the receiver has a single channel.
     """
 
     def __init__(
@@ -95,8 +95,8 @@ class SpeedCheck:
         self.strongest = max(self.strongest, float(rcs.max()))
         reach_m = self.radar.reach_m
         if self.farthest > reach_m:
-            # Beat frequencies are known up to multiples of the sample rate: the range axis is seen again and again.
-            # Of one channel they are known but for the sign: between, it is seen backwards.
+            # Beat frequencies are known up to multiples of the sample rate, so the range axis repeats. With a single
+            # channel their sign is unknown too, so in between it repeats mirrored.
             seen_again = torch.remainder(distance, 2 * reach_m) < reach_m
             folded = (distance > reach_m) & (seen_again | self.real)
             self.folded = max(self.folded, float(torch.where(folded, rcs, 0.0).max()))
@@ -149,7 +149,7 @@ class SpeedCheck:
                 f"positions: got a scene moving at a mean radial speed of {mean:.2f} m/s, {unambiguous}; expected a "
                 f"PRF of at least {enough:.0f} Hz"
             )
-        # Without the measured speed: Python shows a warning of one text once, not for every clip of a data set.
+        # Without the measured speed the text is always the same, so Python shows it once, not for every clip.
         warnings.warn(
             f"positions: some scatterer has a radial speed {unambiguous}: it appears at a wrong Doppler frequency",
             TensorsimWarning,

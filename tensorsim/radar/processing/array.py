@@ -33,17 +33,17 @@ class AngleMaps(NamedTuple):
 
 
 def virtual_elements(radar: RadarConfig) -> Tensor:
-    """Places ``p + q`` (V, 3) in metres, float64, of the channels ``v = k A + a`` of an array."""
+    """Positions ``p + q`` (V, 3) in metres, float64, of the channels ``v = k A + a`` of an array."""
     tx = torch.tensor(radar.tx_positions_m, dtype=torch.float64)
     rx = torch.tensor(radar.rx_positions_m, dtype=torch.float64)
     return (tx[:, None] + rx).flatten(0, 1)
 
 
 def row_spacing_m(radar: RadarConfig) -> float:
-    """Distance of neighbouring virtual elements of an even row along x; half a wavelength for one alone.
+    """Spacing of the virtual elements of a uniform row along x; half a wavelength for a single element.
 
     Raises:
-        TensorsimError: an array that is no even row along x, from left to right.
+        TensorsimError: an array that is not a uniform row along x, from left to right.
     """
     elements = virtual_elements(radar)
     if len(elements) == 1:
@@ -69,7 +69,7 @@ def steering_vectors(
 
 
 def array_steering(radar: RadarConfig, azimuth_rad: Tensor, elevation_rad: float) -> Tensor:
-    """:func:`steering_vectors` (D, V) of the channels of a radar, less whole cycles.
+    """:func:`steering_vectors` (D, V) of the channels of a radar, minus whole cycles.
 
     Raises:
         TensorsimError: azimuths that are not a finite vector, an elevation that is not finite.
@@ -100,14 +100,14 @@ def beam_power(profiles: Tensor, cycles: Tensor) -> Tensor:
 def align_transmitters(profiles: Tensor, transmitters: int) -> Tensor:
     """Time alignment of profiles (..., V, M, R) of K transmitters that fire in turn (TDM).
 
-    Transmitter k samples the motion k / K of a pulse interval later than the first; an angle estimator would take the
-    phase of this motion for a direction. A linear phase over Doppler, ``exp(-j 2 pi f k / K)`` for f in [-1/2, 1/2)
+    Transmitter k samples the motion k / K of a pulse interval later than the first; an angle estimator would mistake
+    the phase of this motion for a direction. A linear phase over Doppler, ``exp(-j 2 pi f k / K)`` for f in [-1/2, 1/2)
     cycles per interval, shifts its pulses to the start of the interval, for Doppler up to PRF / 2. About six pulses at
     either end stay wrong, because the transform is periodic; range migration within an interval is not corrected.
     Differentiable.
 
     Raises:
-        TensorsimError: empty or real profiles, or a number of channels that is no multiple of the transmitters.
+        TensorsimError: empty or real profiles, or a number of channels that is not a multiple of the transmitters.
     """
     check_tensor(profiles, "profiles", "(..., channels, pulses, range bins)", "complex", finite=False)
     check_not_empty(profiles, "profiles")
@@ -129,13 +129,14 @@ class AngleMapper(nn.Module):
     Args:
         radar: the array; its channels in the order of the echo, ``v = k A + a``.
         azimuth_rad: (D,) directions; 0 is +y, positive is to the right (+x).
-        elevation_rad: of all of them.
+        elevation_rad: elevation of all of them.
 
     Shapes: profiles (..., V, M, R) complex -> :class:`AngleMaps`. Differentiable.
 
-    The wavelength is that of the centre of the sweep, to which the phase of a range profile belongs. Waves are plane:
-    ranges much larger than ``aperture^2 / lambda``. For transmitters in turn (TDM), motion at v m/s changes the phase
-    between neighbours by ``4 pi v / (lambda K PRF)``, which is not corrected here: see :func:`align_transmitters`.
+    The wavelength is that of the centre of the sweep, to which the phase of a range profile belongs. Waves are assumed
+    plane: ranges must be much larger than ``aperture^2 / lambda``. For transmitters that fire in turn (TDM), motion at
+    v m/s changes the phase between neighbours by ``4 pi v / (lambda K PRF)``, which is not corrected here: see
+    :func:`align_transmitters`.
 
     Attributes:
         azimuth_rad: (D,).

@@ -1,4 +1,4 @@
-"""Detection with a constant rate of false alarms: a cell is compared with the cells around it.
+"""Constant false alarm rate (CFAR) detection: each cell is compared with the cells around it.
 
 Sources: Finn and Johnson, RCA Review 29 (1968), for cell averaging; Rohling, IEEE Trans. AES-19 (1983), for ordered
 statistics; Abramowitz and Stegun, *Handbook of Mathematical Functions*, 26.5 and 26.6, for means of several looks.
@@ -28,7 +28,7 @@ EDGES = ("circular", "reflect")
 
 
 def cell_averaging_factor(false_alarm: float, cells: int, looks: int = 1) -> float:
-    r"""Threshold over mean of N cells, whose power is a mean of V independent exponentially distributed powers.
+    r"""Threshold over mean of N cells, each the mean of V independent exponentially distributed powers.
 
     The ratio of a cell to that mean has an F distribution of 2 V and 2 N V degrees of freedom, so that
 
@@ -73,19 +73,19 @@ class CfarDetector(nn.Module):
     """Two-dimensional CFAR detector.
 
     The reference cells of a cell are those of the rectangle that reaches ``guard + training`` cells to each side,
-    less the rectangle that reaches ``guard`` cells. False alarms come at the rate asked for where the reference
-    cells are independent and their power is exponentially distributed (a square-law detector in Gaussian noise), or a
-    mean of ``looks`` such powers.
+    minus the rectangle that reaches ``guard`` cells. The false alarm rate is the requested one if the reference cells
+    are independent and their power is exponentially distributed (a square-law detector in Gaussian noise), or a mean
+    of ``looks`` such powers.
 
     Args:
         guard: cells on each side of the cell that are left out, along both axes.
-        training: cells beyond them on each side.
+        training: reference cells beyond those on each side.
         false_alarm: probability of a false alarm, in (0, 1).
         method: ``"cell-averaging"`` compares with the mean of the reference cells, ``"ordered-statistic"`` with one
-            of them in the order of size.
-        rank: which of N cells that is, as a share of N: 0.75 is usual.
-        edges: what lies beyond the edges of each axis, ``"circular"`` or ``"reflect"``.
-        looks: independent powers, such as those of antennas, whose mean each cell is; with cell averaging.
+            of them in order of size.
+        rank: which of the N cells that is, as a fraction of N; 0.75 is typical.
+        edges: how each axis continues beyond its edges, ``"circular"`` or ``"reflect"``.
+        looks: number of independent powers, such as those of antennas, averaged in each cell; for cell averaging.
 
     Shapes: power (..., H, W), not negative -> (..., H, W) bool. :meth:`threshold` is differentiable, a detection is
     not.

@@ -151,7 +151,7 @@ class DopplerFrames(nn.Module):
     def spectrum(self, frames: Tensor, padded: Tensor | None = None) -> Tensor:
         """Real and imaginary part (..., F, 2) of the transform of frames (..., L), Doppler ascending.
 
-        ``padded`` (..., F), which is zero beyond L, takes the windowed frames; it is for blocks without gradients.
+        ``padded`` (..., F), which is zero beyond L, receives the windowed frames; only for blocks without gradients.
         """
         window = self.shifting_window.to(frames.dtype)
         if padded is None:
@@ -172,8 +172,8 @@ class DopplerTimeMap(DopplerFrames):
         window_s: length of the window in seconds.
         overlap: overlap of neighbouring windows as a fraction of their length, in [0, 1).
         integration: over range bins. ``"noncoherent"``: :func:`doppler_time_map`. ``"coherent"``: |STFT| of
-            :func:`coherent_sum`, which adds the bins of one target in phase, but not those of several: for a gate
-            around one target. ``"paper"``: the paper's formula, the STFT of the sum of magnitudes over range.
+            :func:`coherent_sum`, which adds the bins of one target in phase, but not those of several: use it with a
+            gate around one target. ``"paper"``: the paper's formula, the STFT of the sum of magnitudes over range.
             That sum is real, so the map is symmetric and has lost the sign of Doppler.
         gate_m: (nearest, farthest) range in metres of the bins to use, for profiles that start at range 0; None
             uses all bins.

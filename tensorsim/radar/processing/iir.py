@@ -48,7 +48,7 @@ class BlockFilter(nn.Module):
 
     Shapes: real (B, M, C) -> (B, M, C), each column filtered along M.
 
-    The state is scaled by the response that it causes (O has orthonormal columns), so that float32 is accurate also
+    The state is scaled by the response that it causes (O has orthonormal columns), so that float32 is accurate even
     for poles near the unit circle.
     """
 

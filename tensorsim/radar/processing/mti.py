@@ -22,7 +22,7 @@ def two_pulse_canceller(profiles: Tensor) -> Tensor:
 
     $$ y[m] = x[m + 1] - x[m], \quad |H(f_d)| = |2 \sin(\pi f_d / \mathrm{PRF})| $$
 
-    Inputs are not checked; one pulse gives none.
+    Inputs are not checked; a single pulse gives an empty result.
     """
     return profiles[..., 1:, :] - profiles[..., :-1, :]
 
@@ -68,7 +68,7 @@ class MovingTargetIndicator(nn.Module):
         lost_pulses: M - M'.
         delay_pulses: output m belongs to the instant ``(m + delay_pulses) / PRF`` of the input: (n - 1) / 2 for the
             cancellers, whose weights are symmetric, else 0. The delay of the recursive filter depends on Doppler:
-            for order 4, 0.6 periods of the cut-off frequency there, 0.004 periods at ten times the cut-off.
+            for order 4, 0.6 periods of the cut-off frequency at the cut-off, 0.004 periods at ten times the cut-off.
         whole_clip: whether every output depends on all pulses or all earlier ones, so that a clip cannot be
             processed in pieces that overlap by ``lost_pulses``.
 

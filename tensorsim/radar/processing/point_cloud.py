@@ -1,4 +1,4 @@
-"""Points from range-Doppler maps of an antenna array: where something was detected, how fast it is, and which way."""
+"""Points from range-Doppler maps of an antenna array: range, speed and direction of each detection."""
 
 from typing import NamedTuple
 
@@ -15,9 +15,9 @@ class Points(NamedTuple):
 
     Attributes:
         range_m, speed_m_s: (..., K); positive speed is approaching.
-        sine: (..., K) of the angle from broadside, positive to the right (+x).
+        sine: (..., K) sine of the angle from broadside, positive to the right (+x).
         power: (..., K) mean over antennas, 0 where there is no point.
-        valid: (..., K) bool, whether there is one.
+        valid: (..., K) bool, whether there is a point.
     """
 
     range_m: Tensor
@@ -35,11 +35,11 @@ def local_maxima(power: Tensor) -> Tensor:
 
 
 def beam_sines(signals: Tensor, spacing_wavelengths: float, beams: int) -> Tensor:
-    """Sine of the angle in which a line of antennas receives most: (..., A) complex -> (...).
+    """Sine of the angle from which a line of antennas receives most: (..., A) complex -> (...).
 
-    Antenna a at ``a d`` along +x hears a plane wave from angle theta ``exp(+j 2 pi a (d / lambda) sin theta)`` later
-    or earlier than the first; the beams are those of a transform of ``beams`` points, the strongest is refined by
-    the parabola through it and its neighbours.
+    Antenna a at ``a d`` along +x receives a plane wave from angle theta with the phase factor
+    ``exp(+j 2 pi a (d / lambda) sin theta)`` relative to the first one; the beams are the bins of a transform of
+    ``beams`` points, and the strongest is refined by the parabola through it and its neighbours.
     """
     spectrum = torch.fft.fft(signals, n=beams, dim=-1).abs()
     best = spectrum.argmax(-1, keepdim=True)
@@ -53,22 +53,22 @@ def beam_sines(signals: Tensor, spacing_wavelengths: float, beams: int) -> Tenso
 
 
 class PointCloud(nn.Module):
-    """Detections of a range-Doppler map to points.
+    """Converts detections in a range-Doppler map to points.
 
     Args:
         range_step_m: range of bin r is ``r range_step_m``.
         speed_step_m_s: speed of Doppler bin f of F is ``(f - F // 2) speed_step_m_s``.
-        points: K, the most points of a frame.
-        spacing_wavelengths: distance of neighbouring antennas (of the virtual array: half of it sees as far as
-            half the circle).
+        points: K, the largest number of points per frame.
+        spacing_wavelengths: spacing of neighbouring antennas of the virtual array; 0.5 is unambiguous over the half
+            circle in front of it.
         beams: points of the transform over antennas.
         peaks_only: leave out detections that have a stronger neighbour in range or Doppler.
 
-    Shapes: cube (..., A, R, F) complex, detected (..., R, F) bool -> :class:`Points` (..., K). Powers, ranges and
-    speeds of chosen cells are differentiable as far as they depend on the cube; the choice is not.
+    Shapes: cube (..., A, R, F) complex, detected (..., R, F) bool -> :class:`Points` (..., K). Powers and sines of the
+    chosen cells are differentiable; the choice of cells, and so their ranges and speeds, is not.
 
     Raises:
-        TensorsimError: steps that are not positive, fewer than one point or two beams, shapes that do not go together.
+        TensorsimError: steps that are not positive, fewer than one point or two beams, shapes that do not match.
     """
 
     def __init__(

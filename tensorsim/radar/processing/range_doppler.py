@@ -1,4 +1,4 @@
-"""Range, Doppler and angle of each frame of an array's pulses, and the points that are detected in them."""
+"""Range, Doppler and angle of each frame of an array's pulses, and the points detected in them."""
 
 import math
 
@@ -15,11 +15,12 @@ from tensorsim.radar.processing.point_cloud import PointCloud, Points
 
 
 class RangeDopplerCube(DopplerFrames):
-    """Complex range-Doppler spectra of each antenna and frame, with transmitters in turn (TDM) compensated.
+    """Complex range-Doppler spectra of each channel and frame, compensated for transmitters that fire in turn (TDM).
 
-    Transmitter k of K fires ``k / (K PRF)`` late, in which a target of Doppler f turns by ``2 pi f k / (K PRF)``: each
-    Doppler bin is turned back by as much. Targets beyond PRF / 2 stay wrong. Input is conjugated as in the Doppler-time
-    map: positive Doppler is approaching, and the phase grows towards antennas that are nearer to the target.
+    Transmitter k of K fires ``k / (K PRF)`` late; meanwhile the phase of a target of Doppler f turns by
+    ``2 pi f k / (K PRF)``, and each Doppler bin is turned back by as much. Targets beyond PRF / 2 stay wrong. Input is
+    conjugated as in the Doppler-time map: positive Doppler is approaching, and the phase grows towards antennas that
+    are nearer to the target.
 
     Args:
         radar: the array, its channels in the order of the echo, ``v = k A + a``; or one antenna pair.
@@ -68,11 +69,11 @@ class RangeDopplerAngle(nn.Module):
     Args:
         radar: the array.
         azimuth_rad: (D,) directions; 0 is +y, positive is to the right (+x).
-        elevation_rad: of all of them.
+        elevation_rad: elevation of all of them.
         window_s, overlap: see :class:`RangeDopplerCube`.
 
-    Shapes: profiles (..., V, M, R) complex -> (..., K, R, F, D) power; a plane wave has that of one channel at its
-    direction. Differentiable.
+    Shapes: profiles (..., V, M, R) complex -> (..., K, R, F, D) power; in its own direction a plane wave
+    has the power of one channel. Differentiable.
 
     Raises:
         TensorsimError: as :class:`RangeDopplerCube`; azimuths that are not a finite vector.
@@ -104,8 +105,8 @@ def point_cfar(radar: RadarConfig, frames: DopplerFrames) -> CfarDetector:
     """Cell averaging over (range, Doppler) of the mean power of all channels, with a false alarm rate of 1e-5.
 
     Along Doppler the main lobe of a target, of the Hann window over L pulses, reaches ``2 F / L`` of F bins to each
-    side; reference cells begin beyond it. They are along Doppler alone where the radar has hardly any range, as one of
-    continuous wave.
+    side; reference cells begin beyond it. They extend along Doppler alone if the radar has hardly any range bins, like
+    a continuous-wave one.
     """
     lobe, most = 2 * math.ceil(frames.bins / frames.length), frames.bins // 4 - 1
     guard, training = min(max(4, lobe), most), min(max(8, lobe), most)
@@ -120,22 +121,23 @@ def point_cfar(radar: RadarConfig, frames: DopplerFrames) -> CfarDetector:
 
 
 class PointDetector(nn.Module):
-    """Profiles of an antenna array to detected points: range-Doppler cube, CFAR over range and Doppler, angles.
+    """Detects points in profiles of an antenna array: range-Doppler cube, CFAR over range and Doppler, angles.
 
     Args:
-        radar: the array; its virtual elements stand in a row along x, evenly spaced, or it is one antenna pair, whose
-            points have angle 0.
+        radar: an array whose virtual elements form an evenly spaced row along x, or one antenna pair, whose points
+            have angle 0.
         window_s, overlap: frames, see :class:`RangeDopplerCube`.
-        points: the most points of a frame.
+        points: the largest number of points per frame.
         nearest_m: range of the first bin of the profiles.
-        cfar: detector over (range, Doppler) of the mean power of the V channels; None is :func:`point_cfar`. Side
-            lobes that stand out of the noise are detected too: profiles of strong echoes want ``range_window="hann"``.
+        cfar: detector over (range, Doppler) of the mean power of the V channels; None is :func:`point_cfar`.
+            Sidelobes above the noise are detected too: for strong echoes use ``range_window="hann"``.
 
-    Shapes: profiles (..., V, M, R) complex, after a moving target indicator where what stands still is not wanted ->
+    Shapes: profiles (..., V, M, R) complex, after a moving target indicator if static targets are not wanted ->
     :class:`Points` (..., K, points). Differentiable as :class:`PointCloud`.
 
     Raises:
-        TensorsimError: as :class:`RangeDopplerCube` and :class:`CfarDetector`; an array that is no even row along x.
+        TensorsimError: as :class:`RangeDopplerCube` and :class:`CfarDetector`; an array that is not a uniform row
+            along x.
 
     Example:
         >>> scene = ts.radar.PRESETS["ti-awr1843-array"]

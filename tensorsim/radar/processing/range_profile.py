@@ -30,7 +30,7 @@ def range_profile(
     Args:
         intermediate: (..., M, N) complex IF samples of M pulses.
         window: (N,) real.
-        first_bin, last_bin: the bins; None is the last of the first N // 2.
+        first_bin, last_bin: the bins to keep; ``last_bin`` None is the last of the first N // 2.
 
     Returns:
         (..., M, last_bin + 1 - first_bin) complex; bin $k$ is at range $k c / (2 B)$.
@@ -45,7 +45,7 @@ def gate_bins(gate_m: tuple[float, float], spacing_m: float, bins: int) -> tuple
     """First and last of ``bins`` range bins, ``spacing_m`` apart, that lie within (nearest, farthest) metres.
 
     Raises:
-        TensorsimError: no bin lies within.
+        TensorsimError: no bin lies within the gate.
     """
     if isinstance(gate_m, tuple | list) and len(gate_m) == 2 and all(map(is_finite, gate_m)):
         near, far = gate_m
@@ -73,12 +73,12 @@ class RangeProfile(nn.Module):
 
     Attributes:
         range_m: (R,) range of each bin, ``k c / (2B)``.
-        first_bin, last_bin: k of the first and the last of them.
+        first_bin, last_bin: k of the first and the last bin.
         window: (N,).
 
     Raises:
-        TensorsimError: unknown window, one of zeros alone (for two samples), a gate without bins, a real IF, N other
-            than the radar's.
+        TensorsimError: an unknown window or one that is all zeros (for two samples), a gate without bins, a real IF,
+            N other than the radar's.
     """
 
     window: Tensor
@@ -120,22 +120,22 @@ class RangeProfile(nn.Module):
 
 
 class FollowingGate(nn.Module):
-    """Range gate that follows the targets: bins outside of it are set to zero, pulse by pulse.
+    """Range gate that follows the targets: bins outside it are set to zero, pulse by pulse.
 
     The gate is centred on the RCS-weighted mean of the targets' geometric range ``(|P - Ptx| + |P - Prx|) / 2``. The
     additional delay of a wall is not included, so the width must allow for it. Pulses without any RCS are not gated.
-    For profiles after moving target indication: the moving gate would modulate a static echo.
+    Use it after moving target indication: the moving gate would modulate a static echo.
 
     Args:
-        radar: positions of the antennas; of several, the mean range.
+        radar: positions of the antennas; the range is the mean over several.
         range_m: (R,) range of each bin.
-        width_m: bins within half of it of the mean range are kept.
+        width_m: bins are kept up to half this distance from the mean range of the targets.
 
     Shapes: profiles (..., M, R) complex, positions (..., M, S, 3) m, rcs (..., M, S) m^2 -> (..., M, R).
-    Differentiable by the profiles; the choice of bins is not.
+    Differentiable with respect to the profiles; the choice of bins is not.
 
     Raises:
-        TensorsimError: a width that is not positive; real profiles, shapes that do not go together.
+        TensorsimError: a width that is not positive; real profiles, shapes that do not match.
     """
 
     range_m: Tensor

@@ -16,7 +16,7 @@ from tensorsim.errors import (
 )
 from tensorsim.ops import flatten_batch, unflatten_batch
 
-#: Bins of a Doppler axis, more than any map has; bounds counts of them.
+#: More Doppler bins than any map has; an upper bound for counts of bins.
 MAX_BINS = 65_536
 
 
@@ -37,7 +37,7 @@ def strongest_peaks(doppler_time: Tensor, count: int) -> Ridges:
 
     (..., F, K) -> (..., C, K) with C = ``count``.
 
-    The Doppler axis is periodic with the PRF, so its ends are neighbours. Of a plateau the first bin counts. In a
+    The Doppler axis is periodic with the PRF, so its ends are neighbours. The first bin of a plateau counts. In a
     frame with fewer maxima the largest is repeated; in a frame without any, all are at zero Doppler, bin F // 2.
     """
     bins = doppler_time.shape[-2]
@@ -55,8 +55,8 @@ def connect(peaks: Ridges, orders: Tensor, bins: int) -> Ridges:
     """Reorder the peaks of each frame so that each row continues the same row of the frame before.
 
     Between neighbouring frames the permutation of the peaks with the smallest sum of bin jumps is used; jumps are
-    taken modulo ``bins``. ``orders`` (C!, C) contains all permutations. The rows of the first frame are in the order
-    of magnitude.
+    taken modulo ``bins``. ``orders`` (C!, C) contains all permutations. The rows of the first frame are in order of
+    magnitude.
     """
     index = peaks.indices.transpose(-1, -2)  # (..., K, C)
     frames, count = index.shape[-2], index.shape[-1]
@@ -81,7 +81,7 @@ def connect(peaks: Ridges, orders: Tensor, bins: int) -> Ridges:
 
 
 def check_map(doppler_time: Tensor, least_bins: int) -> None:
-    """Refuse anything but a finite real map (..., F, K) with ``least_bins`` Doppler bins and one frame."""
+    """Refuse anything but a finite real map (..., F, K) with at least ``least_bins`` Doppler bins and one frame."""
     check_floating(doppler_time, "map")
     check_min_rank(doppler_time, 2, "map", "(..., Doppler bins, frames)")
     if doppler_time.shape[-2] < least_bins or doppler_time.shape[-1] == 0:
@@ -177,7 +177,7 @@ class PathRidgeExtractor(nn.Module):
     map are at the first bin. Bins have no gradient, magnitudes do.
 
     Raises:
-        TensorsimError: settings out of range, fewer Doppler bins than a jump either way, no frame, NaN.
+        TensorsimError: settings out of range, fewer than ``2 max_jump + 1`` Doppler bins, no frame, NaN.
     """
 
     jumps: Tensor

@@ -32,7 +32,7 @@ def reassigned_bins(spectrum: Tensor, derivative: Tensor, threshold: Tensor) -> 
 
 
 class SynchrosqueezedMap(DopplerFrames):
-    """Doppler-time map by the Fourier synchrosqueezed transform; the interface of
+    """Doppler-time map by the Fourier synchrosqueezed transform, with the interface of
     :class:`~tensorsim.radar.DopplerTimeMap`.
 
     Every STFT value is moved along frequency to its local frequency, the time derivative of its phase (Oberlin,
@@ -45,13 +45,13 @@ class SynchrosqueezedMap(DopplerFrames):
         radar: the radar (its PRF).
         window_s: length of the window in seconds.
         overlap: overlap of neighbouring windows as a fraction of their length, in [0, 1).
-        hop: pulses from frame to frame instead of ``overlap``, at most those of a window; 1 for a transform that can
-            be inverted at every pulse.
+        hop: pulses from frame to frame instead of ``overlap``, at most the length of a window; 1 for a transform that
+            can be inverted at every pulse.
         threshold_db: values this far below the strongest of their frame and range bin are not moved.
 
     Shapes: (..., M, R) complex -> (..., F, K) magnitude, ``sqrt(sum over range bins of |T|^2)``; for one
     coherent series pass it as R = 1 (see :func:`~tensorsim.radar.processing.doppler.coherent_sum`). Differentiable
-    by the values, not by their bins.
+    with respect to the values, not to their bins.
 
     Attributes:
         doppler_hz: (F,) Doppler axis in Hz, ascending, positive = approaching.
@@ -113,7 +113,7 @@ class SynchrosqueezedMap(DopplerFrames):
         """Transform (..., R, F, K) to the profiles (..., K, R) at pulses ``L // 2 + hop * k`` of the clip.
 
         ``x = sum over f of T / (F g(0))``, the conjugate of which is the raw profile; g is 1 at its centre. To
-        extract one component of a signal, set the transform outside of its band to 0.
+        extract one component of a signal, set the transform to 0 outside its band.
         """
         check_min_rank(transform, 3, "transform", "(..., range bins, Doppler bins, frames)")
         centre = self.window[self.length // 2].to(torch.view_as_real(transform).dtype)
