@@ -44,7 +44,7 @@ class BulkDopplerCompensation(nn.Module):
 
     Shapes: profiles (..., M, R) complex, range of the point (..., M) m, half the bistatic path; see
     :func:`path_of_speed` for a track of speeds -> (..., M, R) complex. Only changes of range matter. Differentiable
-    by both.
+    with respect to both.
 
     Raises:
         TensorsimError: real profiles, a path of another length than the pulses, NaN.

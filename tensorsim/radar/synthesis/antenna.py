@@ -39,8 +39,8 @@ class CosineAntenna(nn.Module):
     """Cosine-power pattern: relative gain ``cos(a)^q`` at an angle a from +y, 0 for angles above 90 degrees.
 
     Args:
-        exponent: q > 0 of the gain. Or:
-        beamwidth_rad: full width at half power in (0, pi), ``cos(beamwidth / 2)^q = 1/2``.
+        exponent: q > 0 of the gain.
+        beamwidth_rad: instead of it, full width at half power in (0, pi), ``cos(beamwidth / 2)^q = 1/2``.
 
     Shapes: directions (..., 3) of any length -> amplitude (...). Differentiable.
 
@@ -56,7 +56,7 @@ class CosineAntenna(nn.Module):
         elif beamwidth_rad is not None and exponent is None:
             if not (is_finite(beamwidth_rad) and 0 < beamwidth_rad < math.pi):
                 raise TensorsimError(f"beamwidth_rad: got {beamwidth_rad}, expected between 0 and pi")
-            # log(cos(a)), accurate also for narrow beams.
+            # log(cos(a)), accurate for narrow beams too.
             self.exponent = math.log(0.5) / math.log1p(-2 * math.sin(beamwidth_rad / 4) ** 2)
         else:
             raise TensorsimError(
@@ -79,7 +79,7 @@ class TabulatedAntenna(nn.Module):
     Args:
         azimuth_rad: (A,) ascending angles, A >= 2.
         elevation_rad: (E,) ascending angles, E >= 2.
-        gain_db: (E, A) gain relative to the peak. Directions outside of the table get the value at its edge.
+        gain_db: (E, A) gain relative to the peak. Directions outside the table get the value at its edge.
 
     Shapes: directions (..., 3) of any length -> amplitude (...). Differentiable between the nodes.
 

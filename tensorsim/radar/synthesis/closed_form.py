@@ -6,11 +6,11 @@ referred to mid-chirp, its windowed transform is real except for s::
     X[k] = exp(-j pi k (N - 1) / N) sum over paths of s W(k - b),
     W(x) = sum over n of w[n] cos(2 pi x (n - (N - 1) / 2) / N)
 
-for a symmetric window. W is one Dirichlet kernel ``sin(pi x) / sin(pi x / N)`` without window, three for Hamming and
-Hann, five for Blackman (Harris, *On the use of windows for harmonic analysis with the DFT*, 1978). The Dirichlet
+for a symmetric window. W is one Dirichlet kernel ``sin(pi x) / sin(pi x / N)`` without a window, three for Hamming
+and Hann, five for Blackman (Harris, *On the use of windows for harmonic analysis with the DFT*, 1978). The Dirichlet
 kernel is 0 / 0 at the peak. With ``b = n + f``, n an integer and ``|f| <= 1/2``, W is smooth in f, and a Chebyshev
-series of few terms has the accuracy of the number format (its coefficients decrease like the Bessel functions
-``J_j(pi / 2)``): a small table for any window.
+series of few terms reaches the accuracy of the number format (its coefficients decrease like the Bessel functions
+``J_j(pi / 2)``): a small table suffices for any window.
 """
 
 import math
@@ -137,18 +137,18 @@ class RangeBinSynthesizer(nn.Module):
         profile: the window, and the gate if it has one.
         near_bins: compute only the bins at most this far from the one nearest to each path; None computes all.
             All bins take longer than the time-domain engine, a few bins several times less.
-        energy_stride: :meth:`energy` is worked out for every n-th pulse and taken for those up to the next.
+        energy_stride: :meth:`energy` is computed for every n-th pulse and reused for the pulses up to the next.
 
     Shapes: positions (..., M, S, 3) m, rcs (..., S), (..., M, S) or (S,) m^2 -> (..., M, R) complex, free of
-    noise; complex64, and complex128 after ``.double()``. Differentiable by both.
+    noise; complex64, and complex128 after ``.double()``. Differentiable with respect to both.
 
     Attributes:
         truncation: expected relative error of the norm for one path due to ``near_bins``: the square root of the
             fraction of the window's energy in the other bins, averaged over fractions of a bin. 0 for all bins.
 
     Raises:
-        TensorsimError: ``near_bins`` or ``energy_stride`` that are no counts, an echo with several antennas or a
-            closed Airy slab; see :class:`~tensorsim.radar.EchoSynthesizer`.
+        TensorsimError: ``near_bins`` or ``energy_stride`` below 1, an echo with several antennas or a wall with
+            incidence ``"airy"``; see :class:`~tensorsim.radar.EchoSynthesizer`.
     """
 
     table: Tensor

@@ -14,25 +14,24 @@ VIBRATION_HZ = (2.0, 60.0)
 
 
 def vibration_spectrum(frequency_hz: Tensor) -> Tensor:
-    """Form of the power density of displacement: constant velocity density, the inverse square of frequency."""
+    """Shape of the displacement's spectral density: inverse square of frequency, so that velocity is white."""
     return 1 / frequency_hz.square()
 
 
 class RoomClutter(nn.Module):
     """Static point reflectors in a room, as scatterers of the scene.
 
-    Their echoes stay what they are from pulse to pulse, and a moving target indicator takes them out, but for the
-    vibration of the sensor: a shift of the sensor by u is a shift of the whole room by -u. After a two-pulse canceller
-    a reflector keeps the share ``(4 pi / lambda)^2 E[(u(t + 1/PRF) - u(t))^2]`` of its power, u along the line of
-    sight.
+    Their echoes are the same in every pulse, and a moving target indicator removes them, except for the vibration of
+    the sensor: a shift of the sensor by u is a shift of the whole room by -u. After a two-pulse canceller a reflector
+    keeps the fraction ``(4 pi / lambda)^2 E[(u(t + 1/PRF) - u(t))^2]`` of its power, with u along the line of sight.
 
     Reflectors are static targets, not people: add their echo after the noise has been set by that of the targets.
-    The vibration is a function of time alone: pieces of a clip give what the whole clip gives.
+    The vibration is a function of time alone, so a clip processed in pieces gives the same result.
 
     Args:
-        count: reflectors.
+        count: number of reflectors.
         x_m, y_m, z_m: ranges of the room from which their positions are drawn, uniformly.
-        rcs_m2: range from which their cross sections are drawn, uniformly in dB: chairs to corners of a room.
+        rcs_m2: range from which their cross sections are drawn, uniformly in dB: from chairs to corners of a room.
         jitter_m: root mean square of the sensor's vibration along each axis.
         seed: of the draw.
 

@@ -1,4 +1,4 @@
-"""Echoes in front of a radar of one constant frequency: no range, one complex number at each instant."""
+"""Echoes received by a continuous-wave radar: no range, one complex number at each instant."""
 
 import math
 
@@ -18,7 +18,7 @@ def continuous_wave(path_m: Tensor, amplitude: Tensor, wavelength_m: float) -> T
     """``sum over scatterers of a exp(+j 2 pi R / lambda)``, transmitted times conjugate received wave.
 
     Args:
-        path_m: (..., S) float64 R, from the transmitter over the scatterer to the receiver.
+        path_m: (..., S) float64 R, from the transmitter via the scatterer to the receiver.
         amplitude: (..., S) a.
         wavelength_m: lambda.
 
@@ -26,28 +26,28 @@ def continuous_wave(path_m: Tensor, amplitude: Tensor, wavelength_m: float) -> T
         (...) complex in the precision of ``amplitude``; the phase of an approaching target decreases.
     """
     cycles = path_m / wavelength_m
-    # Whole cycles go in float64: a phase in float32 would leave a floor near -60 dB.
+    # Whole cycles are removed in float64: a phase in float32 would leave a floor near -60 dB.
     return (amplitude * phasor((cycles - cycles.round()).to(amplitude.dtype))).sum(-1)
 
 
 class ContinuousWaveEcho(nn.Module):
-    """What a continuous-wave radar receives of a scene, mixed to baseband, free of noise.
+    """Noise-free baseband signal of a scene, as a continuous-wave radar receives it.
 
     Equals the first sample of each pulse of :class:`~tensorsim.radar.EchoSynthesizer` with the same carrier and
-    antennas in free space, but for the residual video phase of a sweep, ``mu tau^2 / 2`` cycles. Instants are those of
-    the positions and need not be evenly spaced.
+    antennas in free space, except for the residual video phase of a sweep, ``mu tau^2 / 2`` cycles. The instants are
+    those of the positions and need not be evenly spaced.
 
     Args:
         carrier_hz: transmitted frequency.
-        tx_m, rx_m: transmitter and receiver in metres.
-        antenna_gain_dbi: of each antenna, the same in all directions.
+        tx_m, rx_m: positions of transmitter and receiver in metres.
+        antenna_gain_dbi: gain of each antenna, the same in all directions.
 
     Shapes: positions (..., M, S, 3) m and rcs (..., S), (..., M, S) or (S,) m^2 -> (..., M) complex64, or complex128
-    after ``.double()``. Differentiable by both.
+    after ``.double()``. Differentiable with respect to both.
 
     Raises:
         TensorsimError: a carrier that is not positive, an antenna without three finite numbers, an implausible
-            gain, shapes that do not go together.
+            gain, shapes that do not match.
     """
 
     tx: Tensor
@@ -69,7 +69,7 @@ class ContinuousWaveEcho(nn.Module):
     def forward(self, positions: Tensor, rcs: Tensor) -> Tensor:
         """Scatterers (..., M, S, 3) m with (..., M, S) m^2 to the baseband signal (..., M)."""
         rcs = check_scene(positions, rcs)
-        shortest_m = self.wavelength_m / (4 * math.pi)  # as everywhere: the radar equation ends there
+        shortest_m = self.wavelength_m / (4 * math.pi)  # as elsewhere: the radar equation does not hold below
         there = leg_length(positions.double(), self.tx.double(), shortest_m)
         back = leg_length(positions.double(), self.rx.double(), shortest_m)
         amplitude = radar_equation_amplitude(

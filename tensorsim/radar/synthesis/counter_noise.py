@@ -1,7 +1,7 @@
-"""Random numbers by their place and a seed, not by the order in which they are drawn.
+"""Random numbers that depend on their position and a seed, not on the order in which they are drawn.
 
-A pulse gets the same numbers whether a clip is made whole or in pieces. See Salmon et al., *Parallel random numbers:
-as easy as 1, 2, 3*, SC11; the mixing function is that of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
+A pulse gets the same numbers whether a clip is computed whole or in pieces. See Salmon et al., *Parallel random
+numbers: as easy as 1, 2, 3*, SC11; the mixing function is that of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
 """
 
 import math
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def mix(x: Tensor) -> Tensor:
-    """A bijection of int64 (...) that flips half of the bits when one changes."""
+    """A bijection of int64 (...) that flips about half of the output bits when one input bit changes."""
     # Shifts of int64 keep the sign: the mask makes them logical. Constants are those of the source, as signed numbers.
     x = (x ^ ((x >> 30) & 0x3FFFFFFFF)) * -4658895280553007687
     x = (x ^ ((x >> 27) & 0x1FFFFFFFFF)) * -7723592293110705685

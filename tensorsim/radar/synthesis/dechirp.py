@@ -53,7 +53,7 @@ def phasor(cycles: Tensor) -> Tensor:
 def tones(step: Tensor, count: int, first: Tensor | None = None) -> Tensor:
     """``first exp(j 2 pi step n)`` for n = 0, ..., count - 1: (...) cycles and (...) complex, or 1 -> (count, ...).
 
-    Products instead of exponentials: with the first Q and ``exp(j 2 pi step Q)`` come the next Q.
+    Uses products instead of exponentials: the first Q values times ``exp(j 2 pi step Q)`` are the next Q.
     """
     turn = phasor(step)
     head = torch.ones_like(turn) if first is None else first

@@ -1,7 +1,7 @@
 """Echo synthesis: intermediate frequency (IF) samples of an FMCW radar, from moving scatterers.
 
-The formula is :func:`~tensorsim.radar.synthesis.dechirp.intermediate_frequency`, the delays and gains in it come from
-:class:`~tensorsim.radar.synthesis.paths.PropagationPaths`; the Module here adds them up in blocks.
+The formula is :func:`~tensorsim.radar.synthesis.dechirp.intermediate_frequency`; its delays and gains come from
+:class:`~tensorsim.radar.synthesis.paths.PropagationPaths`, and the module here adds up the paths in blocks.
 """
 
 import math
@@ -20,7 +20,7 @@ from tensorsim.radar.synthesis.wall import place_wall
 
 
 class SideChannels(NamedTuple):
-    """Ground truth of each of P paths over each scatterer, (..., M, S, P) float64.
+    """Ground truth of each of P paths via each scatterer, (..., M, S, P) float64.
 
     With several antennas (..., V, M, S, P).
 
@@ -51,14 +51,14 @@ class EchoSynthesizer(nn.Module):
         direct: include the direct path to each target; False leaves multipath only.
         pulse_chunk: pulses processed at a time; limits the working memory.
         incidence: ``"normal"``, ``"oblique"`` or ``"airy"``: how legs pass the wall.
-        polarization: ``"te"`` or ``"tm"`` at the wall, for the latter two.
+        polarization: ``"te"`` or ``"tm"`` at the wall, for ``"oblique"`` and ``"airy"``.
         bounces: largest number of pairs of internal bounces on a leg.
         floor: a reflecting floor.
         antenna: pattern of all antennas (:mod:`~tensorsim.radar.synthesis.antenna`); None is isotropic.
-        paths: names of the path groups to include, of ``tensorsim.radar.synthesis.paths.PATH_NAMES``; replaces
+        paths: names of the path groups to include, from ``tensorsim.radar.synthesis.paths.PATH_NAMES``; replaces
             ``direct``, ``multipath``, ``leakage``, ``wall_echo`` and ``floor``.
         learnable: which of ``tensorsim.radar.synthesis.paths.LEARNABLE`` are parameters of ``.paths``, by that name.
-        wall_attenuation: False lets echoes through the wall keep their power and their delay.
+        wall_attenuation: False lets echoes through the wall keep their power; their delay is not changed.
 
     Shapes:
         positions (..., M, S, 3) metres in the world frame, rcs (..., S) m^2 per clip, (..., M, S) per pulse
@@ -69,7 +69,8 @@ class EchoSynthesizer(nn.Module):
     instant are interpolated linearly between pulses, and extrapolated after the last.
 
     The result is complex64, and complex128 after ``.double()``; geometry is always computed in float64.
-    Differentiable by positions, RCS (the gradient of sqrt(RCS) at RCS 0 is set to 0) and learnable constants.
+    Differentiable with respect to positions, RCS (the gradient of sqrt(RCS) at RCS 0 is set to 0) and learnable
+    constants.
 
     >>> scene = EchoSynthesizer(RadarConfig.free_space())
     >>> scene(torch.tensor([[[0.0, 3.0, 1.0]]]), torch.ones(1)).shape  # one pulse, one scatterer at 3 m
@@ -199,9 +200,9 @@ class EchoSynthesizer(nn.Module):
 
     @torch.jit.export
     def displacements(self, positions: Tensor) -> Tensor | None:
-        """Way of the scatterers until the next pulse, (..., M, S, 3) like ``positions``; None for one transmitter.
+        """Displacements up to the next pulse, (..., M, S, 3) like ``positions``; None for one transmitter.
 
-        That of the last pulse is as long as the one before.
+        The last pulse repeats that of the pulse before.
         """
         if self.paths.transmitters == 1:
             return None
@@ -265,7 +266,7 @@ class EchoSynthesizer(nn.Module):
 
     @torch.jit.export
     def side_channels(self, positions: Tensor, rcs: Tensor) -> SideChannels:
-        """Range, radial speed and amplitude of each path over each scatterer; arguments as in forward."""
+        """Range, radial speed and amplitude of each path via each scatterer; arguments as in forward."""
         rcs = check_scene(positions, rcs)
         step = self.displacements(positions)
         paths = self.paths(positions.double(), rcs.double(), step)

@@ -2,11 +2,11 @@
 
     engine(positions (B, m, S, 3) m, rcs (B, m, S) m^2, start, ahead) -> profiles (B, m, V R), energy (B,)
 
-``start`` is the number of the first of m pulses, by which the room's clutter vibrates; ``ahead`` (B, m, S, 3) the way
-of the scatterers until the next pulse for transmitters in turn, else None. The channels of V antennas stand one after
-the other along the range bins. ``energy`` is that of the reference signal of the receiver noise, over
-m pulses and the N samples of their IF, mean over the channels. Arguments are not checked; the simulator has checked
-them.
+``start`` is the number of the first of m pulses, which sets the time of the room clutter's vibration; ``ahead``
+(B, m, S, 3) is the displacement of the scatterers up to the next pulse, for transmitters that fire in turn, else None.
+The channels of V antennas are concatenated along the range bins. ``energy`` is that of the reference signal of the
+receiver noise, summed over m pulses and the N samples of their IF, mean over the channels. Arguments are not checked
+here; the simulator has checked them.
 """
 
 import torch
@@ -30,7 +30,7 @@ class TimeEngine(nn.Module):
     Args:
         echo: scatterers -> IF.
         profile: IF -> range profiles.
-        total: the energy includes the static paths and the clutter.
+        total: whether the energy includes the static paths and the clutter.
         clutter: of the room.
     """
 
@@ -67,7 +67,7 @@ class TimeEngine(nn.Module):
 
 
 class RangeBinEngine(nn.Module):
-    """Computes range bins in closed form, of one antenna; arguments as for :class:`TimeEngine`."""
+    """Computes range bins in closed form, for one antenna pair; other arguments as for :class:`TimeEngine`."""
 
     def __init__(self, bins: RangeBinSynthesizer, total: bool, clutter: RoomClutter | None = None) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The receiver of a scene: what it does to the samples of the echo, one effect after the other."""
+"""The receiver of a scene: its effects on the samples of the echo, one after another."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,8 +19,8 @@ class Levels(NamedTuple):
     """Mean powers per sample of B clips.
 
     Attributes:
-        signal: (B,) that the receiver noise refers to.
-        arriving: (B,) of everything that reaches the receiver, free of noise.
+        signal: (B,) power of the signal that the receiver noise refers to.
+        arriving: (B,) power of everything that reaches the receiver, free of noise.
     """
 
     signal: Tensor
@@ -28,7 +28,7 @@ class Levels(NamedTuple):
 
 
 def interfering_radar(radar: RadarConfig, other: InterferenceConfig) -> RadarConfig:
-    """A radar of the same band at another place, whose sweeps follow one another almost without a pause.
+    """A radar in the same band at another position, whose sweeps follow one another almost without a pause.
 
     Raises:
         TensorsimError: sweeps that are too short or too long for a radar.
@@ -45,19 +45,19 @@ def interfering_radar(radar: RadarConfig, other: InterferenceConfig) -> RadarCon
 
 
 def oscillator(radar: RadarConfig, level_dbc_hz: float, seed: int) -> PhaseNoise:
-    """Phase noise of this level 1 MHz from the carrier; the typical curve, shifted."""
+    """Phase noise with this level 1 MHz from the carrier: the typical curve, shifted."""
     shift = level_dbc_hz - LEVELS_DBC_HZ[OFFSETS_HZ.index(1e6)]
     return PhaseNoise(radar, OFFSETS_HZ, tuple(level + shift for level in LEVELS_DBC_HZ), seed)
 
 
 class FrontEnd(nn.Module):
-    """From the IF that arrives to the samples that are recorded.
+    """Converts the arriving IF to the recorded samples.
 
-    In the order of a receiver: phase noise, interference, thermal noise, unequal I and Q, constant offset, converters,
-    one channel in place of two. Phase noise of the echo cancels in part, as it comes from the same oscillator; that of
-    the interference does not. Offset and full scale of the converters are relative to the mean powers of the whole
-    clip. Phase noise and interference depend on the number of the pulse, so that pieces of a clip give what the whole
-    gives; all antennas and all clips of a batch have the same.
+    The effects follow the order of a real receiver: phase noise, interference, thermal noise, I/Q imbalance, DC
+    offset, converters, one channel instead of two. Phase noise of the echo cancels in part, as it comes from the same
+    oscillator; that of the interference does not. The offset and the converters' full scale are relative to the mean
+    powers of the whole clip. Phase noise and interference depend on the pulse number, so that a clip processed in
+    pieces gives the same result; they are the same for all antennas and all clips of a batch.
 
     Args:
         scene: its radar, interference and receiver.
@@ -65,7 +65,7 @@ class FrontEnd(nn.Module):
         seed: of the phase noise.
 
     Shapes: IF (B, M, N) or (B, V, M, N) complex, :class:`Levels` of the clip, number of the first pulse -> samples
-        likewise, and the energy (B,) of the thermal noise, mean over antennas. Differentiable but for quantisation.
+        likewise, and the energy (B,) of the thermal noise, mean over antennas. Differentiable, except for quantisation.
 
     Raises:
         TensorsimError: see the stages.
@@ -121,7 +121,7 @@ class FrontEnd(nn.Module):
         if self.bits > 0:
             full_scale = safe_sqrt((levels.arriving + thermal + offset) * self.headroom)
             samples = quantise(samples, broadcast(full_scale, samples), self.bits)
-        if self.real is not None:  # last: no level of a converter is 0, which a missing channel is
+        if self.real is not None:  # last: a missing channel is 0, which no converter level is
             samples = self.real(samples)
         return samples, drawn
 

@@ -1,4 +1,4 @@
-"""Another FMCW radar that is heard."""
+"""Interference from another FMCW radar."""
 
 import math
 
@@ -15,26 +15,27 @@ from tensorsim.radar.synthesis.phase_noise import PhaseNoise
 class Interference(nn.Module):
     """Adds the chirps of another FMCW radar to the IF, where they pass through the receiver's band.
 
-    The two sweeps beat at the difference of their instantaneous frequencies; what is within half the sample rate
-    of zero is in the IF, a chirp in itself that spreads over all range bins, and what lies beyond is filtered
-    out. One path, direct and in air, whatever walls the scene has: amplitude ``sqrt(Pt2 / Pt1 Gt Gr) lambda /
-    (4 pi R)`` (Friis). See Brooker, *Mutual interference of millimeter-wave radar systems*, IEEE Trans. Electromagn.
-    Compat. 49, 2007.
+    The two sweeps beat at the difference of their instantaneous frequencies. The part within half the sample rate
+    of zero enters the IF, as a chirp that spreads over all range bins; the rest is filtered out. There is one path,
+    direct and in air, whatever walls the scene has, with amplitude ``sqrt(Pt2 / Pt1 Gt Gr) lambda / (4 pi R)``
+    (Friis). See Brooker, *Mutual interference of millimeter-wave radar systems*, IEEE Trans. Electromagn. Compat. 49,
+    2007.
 
-    Times count from pulse 0, so that pieces of a clip give what the whole clip gives. The two clocks are ideal.
+    Times count from pulse 0, so that a clip processed in pieces gives the same result. The two clocks are ideal.
 
     Args:
-        radar: the receiver, of one transmitter and one receiver.
-        other: the other radar, where it stands; its PRF and sweep need not be those of ``radar``.
-        delay_s: time at which its sweep number 0 begins, plus the way to the receiver.
+        radar: the receiving radar, with one transmitter and one receiver.
+        other: the other radar, at its own position; its PRF and sweep need not be those of ``radar``.
+        delay_s: time at which its sweep number 0 begins, plus the propagation time to the receiver.
         power_ratio_db: its transmit power over that of ``radar``.
-        phase_noise: of the oscillator of ``radar``; that of the other is as noisy and independent. None: of neither.
+        phase_noise: of the oscillator of ``radar``; that of the other radar is independent and equally noisy. None:
+            neither has any.
 
     Shapes: IF (..., M, N) complex, number of its first pulse -> IF likewise. Differentiable.
 
     Raises:
-        TensorsimError: an array, a radar at the place of the other, numbers that are not finite, an IF that is not
-            complex or has another number of samples.
+        TensorsimError: an array, the other radar at the receiver's position, numbers that are not finite, an IF that
+            is not complex or has another number of samples.
     """
 
     def __init__(
@@ -81,14 +82,14 @@ class Interference(nn.Module):
         own = torch.arange(self.samples, dtype=torch.float64, device=device) / self.rate_hz
         begin = pulse / self.prf_hz - self.delay_s
         sweep = torch.floor((begin + own) * self.other_prf_hz)
-        # Time in the sweep that is heard. The long times are subtracted first: their rounding is that of the pulse, a
-        # phase that all of its samples share.
+        # Time within the received sweep. The long times are subtracted first, so that their rounding error is a phase
+        # that all samples of a pulse share.
         theirs = (begin - sweep / self.other_prf_hz) + own
 
         beat = self.apart_hz + self.slope * own - self.other_slope * theirs
         heard = (beat.abs() < self.rate_hz / 2) & (theirs < self.other_chirp_s)
-        # Tx conj(Rx): own phase less that of the wave that comes in, in cycles; carriers are taken at the sample's
-        # time within each sweep, so each of their sweeps begins with the same phase.
+        # Tx conj(Rx): own phase minus that of the incoming wave, in cycles; carriers are taken at the sample's time
+        # within each sweep, so each sweep of the other radar begins with the same phase.
         turns = (
             self.apart_hz * own
             + self.slope * own.square() / 2

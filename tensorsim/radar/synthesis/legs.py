@@ -128,7 +128,7 @@ def passes_face(
 
 
 class TracedLegs(nn.Module):
-    """Computes the alternatives of a leg and owns their constants; base class of ``PropagationPaths``."""
+    """Computes the alternatives of a leg and holds their constants; base class of ``PropagationPaths``."""
 
     relative_permittivity: Tensor
     loss_tangent: Tensor
@@ -189,7 +189,7 @@ class TracedLegs(nn.Module):
         return Slab(slab.reflection, slab.loss_neper, (length - straight) / self.speed_m_s, slab.bounce_s)
 
     def _transmission(self, slab: Slab, bounces: int) -> Tensor:
-        """Transmission of one leg with this number of internal bounce pairs; relative to none if nothing is lost."""
+        """Transmission of one leg with this many bounce pairs; without attenuation, relative to that with none."""
         if self.attenuates and self.paper:
             return paper_transmission(slab, bounces, self.carrier_hz)
         if self.attenuates:
@@ -252,7 +252,7 @@ class TracedLegs(nn.Module):
             permittivity = torch.full_like(cosine, self.floor_permittivity)
             loss_tangent = torch.full_like(cosine, self.floor_loss)
             reflection = fresnel(permittivity, loss_tangent, cosine, self.floor_polarization)
-            # Fresnel's coefficient is that of the field along the floor; upright antennas have the vertical one.
+            # Fresnel's coefficient is that of the field along the floor; vertical antennas receive the vertical one.
             if self.floor_polarization == "tm":
                 reflection = -reflection
         else:

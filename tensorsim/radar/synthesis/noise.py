@@ -35,14 +35,14 @@ class ProfileNoise(nn.Module):
 
     White noise of variance v in the N samples of a pulse is white noise of variance N v in the N bins. A window w
     convolves it circularly with ``W(m) / N``, where W is the transform of the window. Few values of W matter: three
-    for Hamming and Hann, five for Blackman, one without window. The others, less than 1e-4 of the energy, are left
+    for Hamming and Hann, five for Blackman, one without a window. The others, less than 1e-4 of the energy, are left
     out. Phases are referred to sample N / 2.
 
     Args:
         window: (N,) over fast time, symmetric.
 
     Shapes: like (B, R, M) complex, noise power per IF sample (B,) -> noise (B, R, M) in R neighbouring bins, and the
-        energy (B,) that this realisation would have in N samples. Differentiable by the power.
+        energy (B,) that this realisation would have in N samples. Differentiable with respect to the power.
     """
 
     taps: list[float]
@@ -78,7 +78,7 @@ class ProfileNoise(nn.Module):
 class ReceiverNoise(nn.Module):
     r"""Adds complex white Gaussian noise to IF samples.
 
-    Its power per sample is that of the reference, averaged over the clip, over the signal-to-noise ratio:
+    Its power per sample is that of the reference, averaged over the clip, divided by the signal-to-noise ratio:
 
     $$ P_n = P_s \, 10^{-\mathrm{SNR} / 10} $$
 
@@ -86,7 +86,7 @@ class ReceiverNoise(nn.Module):
 
     Args:
         snr_db: signal-to-noise ratio per IF sample, both powers averaged over the clip; None adds no noise.
-        reference: the signal of the ratio: ``"echo"``, the echo of the targets; ``"total"``, the whole IF,
+        reference: the signal in the ratio: ``"echo"``, the echo of the targets; ``"total"``, the whole IF,
             including leakage and wall echo. ``"absolute"`` sets the noise power to $k T_0 B F / P_t$ (IF
             samples are for transmit power 1) and ignores ``snr_db``.
         empty_power: signal power assumed for a clip whose signal is exactly zero, so that an empty scene has a

@@ -28,7 +28,7 @@ LEARNABLE = ("relative_permittivity", "loss_tangent", "thickness_m", "tx_m", "rx
 
 
 class Paths(NamedTuple):
-    """Delays and gains of P paths over each of S scatterers.
+    """Delays and gains of P paths via each of S scatterers.
 
     Attributes:
         delay_s: (..., S, P) float64 seconds.
@@ -77,7 +77,7 @@ def radar_equation_amplitude(
         tx_gain, rx_gain: $G_t$ and $G_r$, linear power gains.
 
     Returns:
-        (...) real, square root of received over transmitted power. Differentiable; the gradient by an RCS of 0 is 0.
+        (...) real, square root of received over transmitted power. Differentiable; the gradient at an RCS of 0 is 0.
 
     Inputs are not checked; a range of 0 gives an infinite amplitude.
 
@@ -125,15 +125,15 @@ class PropagationPaths(TracedLegs):
                         see :func:`~tensorsim.radar.synthesis.legs.mirror_delays`.
     ``floor``           the images of the antennas in z = 0, times the floor's reflection coefficient:
                         floor-direct, direct-floor, floor-floor. These legs pass the wall without bounces. The
-                        coefficient is that of the field that antennas hear: of upright ones, the vertical field's
-                        (Balanis, *Antenna Theory*, 4.8), 1 over metal and -1 at grazing incidence.
+                        coefficient is that of the field the antennas receive: for vertical antennas, the vertical
+                        field's (Balanis, *Antenna Theory*, 4.8), 1 over metal and -1 at grazing incidence.
     ``leakage``         transmitter to receiver: ``10^(-isolation/20)``, delay ``|Ptx - Prx| / c``.
     ``wall_echo``       transmitter - near face - receiver, the Friis equation on the mirrored path:
                         ``lambda sqrt(Gt Gr) / (4 pi R) G`` with ``R = |Ptx' - Prx|``.
     ==================  ===================================================================================
 
     A scatterer inside the slab counts as behind it. There is no diffraction at the edges. The mirror for targets
-    in front of the wall is not limited to the rectangle. The loss of the wall is that at fc, as is lambda. Legs
+    in front of the wall is not limited to the rectangle. The loss of the wall and lambda are those at fc. Legs
     are at least lambda / (4 pi) long: the radar equation does not hold for shorter ones.
 
     Args:
@@ -160,7 +160,8 @@ class PropagationPaths(TracedLegs):
 
     Shapes: positions (..., S, 3) metres, rcs (..., S) m^2 -> :class:`Paths` of (..., S, P). All float64.
     Several antennas: (..., M, S, 3), (..., M, S) -> (..., V, M, S, P), channel ``v = k A + a`` for transmitter
-    k and receiver a. Differentiable by both and by learnable constants, for a fixed choice of paths.
+    k and receiver a. Differentiable with respect to both and to learnable constants, for a fixed
+    choice of paths.
 
     Attributes:
         path_names: names of the P paths of a scatterer, in order: pairs of legs such as ``"direct"``,

@@ -1,4 +1,4 @@
-"""Phase noise of the oscillator after the mixer, where most of it cancels (range correlation)."""
+"""Oscillator phase noise after the mixer, where most of it cancels (range correlation)."""
 
 import itertools
 import math
@@ -12,7 +12,7 @@ from tensorsim.errors import TensorsimError, check_complex_map
 from tensorsim.protocols import check_instance
 from tensorsim.radar.synthesis.counter_noise import normal
 
-#: Single-sideband phase noise of integrated oscillators at 77 GHz (typical): offsets from the carrier, L there.
+#: Single-sideband phase noise of integrated oscillators at 77 GHz (typical): offsets from the carrier, and L at them.
 OFFSETS_HZ = (1e4, 1e5, 1e6, 1e7)
 LEVELS_DBC_HZ = (-68.0, -80.0, -93.0, -113.0)
 
@@ -31,8 +31,8 @@ class PhaseNoise(nn.Module):
 
     Transmitted wave and echo have the same phase noise, one delay apart, so that the IF of a path of delay tau gets
     ``phi(t) - phi(t - tau)``, whose spectrum is ``4 sin^2(pi f tau)`` times that of phi (Budge and Burt, *Range
-    correlation effects in radars*, IEEE National Radar Conference 1993). Leakage and near walls keep little of it, a
-    far and strong echo has a pedestal of noise in range and Doppler.
+    correlation effects in radars*, IEEE National Radar Conference 1993). Leakage and near walls keep little of it;
+    a strong, distant echo gets a pedestal of noise in range and Doppler.
 
     The delay of every part of the IF is known from its beat frequency, tau = f_beat / slope. For one beat the
     difference is the derivative of phi at the middle of the delay times tau, and a second term with the third
@@ -46,12 +46,12 @@ class PhaseNoise(nn.Module):
             constant. The defaults are typical of integrated oscillators at 77 GHz (-93 dBc/Hz at 1 MHz).
         seed: of the noise.
 
-    Shapes: IF (..., M, N) complex, number of its first pulse -> IF likewise. A pulse has the same noise whatever
-        piece of the clip it comes in. Differentiable.
+    Shapes: IF (..., M, N) complex, number of its first pulse -> IF likewise. A pulse has the same noise in whichever
+        piece of the clip it is processed. Differentiable.
 
     Raises:
-        TensorsimError: offsets that are not positive and ascending, a level for each, an IF that is not complex or
-            has another number of samples.
+        TensorsimError: offsets that are not positive and ascending, not one finite level for each, an IF that is not
+            complex or has another number of samples.
     """
 
     deviation: Tensor
@@ -77,7 +77,7 @@ class PhaseNoise(nn.Module):
                 f"level_dbc_hz: got {level_dbc_hz}, expected {len(offsets_hz)} finite numbers, one per offset"
             )
         self.samples, self.seed = radar.samples_per_chirp, seed
-        self.other_seed = seed + 2**32  # those of configurations are smaller
+        self.other_seed = seed + 2**32  # seeds in configurations are smaller
         self.line_delay_s = radar.sample_rate_hz / radar.slope_hz_per_s / (2 * math.pi)
         spacing = radar.sample_rate_hz / self.samples
         offsets = torch.tensor(tuple(offsets_hz), dtype=torch.float64)
@@ -113,7 +113,7 @@ class PhaseNoise(nn.Module):
 
     @torch.jit.export
     def of_two_oscillators(self, start: int, pulses: int) -> Tensor:
-        """Phase (M, N) float64, in radians, of the IF of a wave from another oscillator, as noisy and independent.
+        """Phase (M, N) float64, in radians, of the IF of a wave from another oscillator, independent and as noisy.
 
         Nothing cancels: its spectrum is twice that of one oscillator.
         """

@@ -1,7 +1,7 @@
-"""What a receiver does to the IF: unequal I and Q, offset, one channel in place of two, and a converter of few bits.
+"""Receiver effects on the IF: I/Q imbalance, DC offset, one channel instead of two, and a converter with few bits.
 
-See Razavi, *RF Microelectronics*, 2nd ed., ch. 4, and Widrow and Kollar, *Quantization Noise*. All act on every
-sample by itself: a clip may come in pieces.
+See Razavi, *RF Microelectronics*, 2nd ed., ch. 4, and Widrow and Kollar, *Quantization Noise*. All act on each sample
+separately, so a clip may be processed in pieces.
 """
 
 import cmath
@@ -15,15 +15,16 @@ from tensorsim.errors import TensorsimError, check_complex_map, check_count, che
 
 
 class QuadratureImbalance(nn.Module):
-    """Makes Q larger than I by a gain and turns it by an angle: an image at the negative frequency.
+    """Scales Q relative to I and turns it by an angle (I/Q imbalance): an image at the negative frequency.
 
     ``y = a x + b conj(x)`` with ``a = (1 + g exp(-j phi)) / 2``, ``b = (1 - g exp(j phi)) / 2``. In a continuous-wave
-    radar the image is at the opposite Doppler; behind a sweep it is at the negative beat: beyond the range profile for
-    a target within it, in it, at the opposite Doppler, for one whose beat is above half the sample rate.
+    radar the image is at the opposite Doppler; with a sweep it is at the negative beat. For a target within the range
+    profile that is outside the profile; for one whose beat is above half the sample rate it is inside, at the opposite
+    Doppler.
 
     Args:
         gain_db: g, gain of Q over I.
-        phase_rad: phi, by which the two are not a quarter turn apart.
+        phase_rad: phi, deviation of I and Q from a phase difference of 90 degrees.
 
     Shapes: IF (..., M, N) complex -> likewise. Differentiable.
 
@@ -79,12 +80,12 @@ class DcOffset(nn.Module):
 
 
 class RealReceiver(nn.Module):
-    """Keeps I alone. Spectra are mirror-symmetric: ``(x + conj x) / 2`` has the wave and its image at half amplitude.
+    """Keeps only I. Spectra are mirror-symmetric: ``(x + conj x) / 2`` has the wave and its image at half amplitude.
 
-    A continuous-wave radar then cannot tell approaching from receding. Behind a sweep the image is at the negative
-    beat, beyond the range profile; a target whose beat is above half the sample rate is seen by its image alone, too
-    near and at the opposite Doppler. The ratio of signal to noise of the samples stays; in a range bin it falls by
-    3 dB, since the noise of the negative beats comes on top.
+    A continuous-wave radar then cannot tell approaching from receding. With a sweep the image is at the negative
+    beat, outside the range profile; a target whose beat is above half the sample rate appears only as its image, too
+    near and at the opposite Doppler. The signal-to-noise ratio of the samples does not change; in a range bin it falls
+    by 3 dB, since the noise of the negative beats is added.
 
     Shapes: IF (..., M, N) complex -> likewise, with imaginary part 0. Differentiable.
 
@@ -106,11 +107,11 @@ def quantise(intermediate: Tensor, full_scale: Tensor, bits: int) -> Tensor:
 
     Args:
         intermediate: (..., M, N) complex.
-        full_scale: (...) largest value of I or Q; where it is 0, all becomes 0.
-        bits: of each channel.
+        full_scale: (...) largest value of I or Q; where it is 0, the result is 0.
+        bits: number of bits per channel.
 
     Returns:
-        (..., M, N) complex. The gradient is that of clipping: steps have none.
+        (..., M, N) complex. The gradient is that of clipping: the steps have none.
     """
     parts = torch.view_as_real(intermediate.resolve_conj())
     step = (2 * full_scale / 2**bits).to(parts.dtype)[..., None, None, None]
@@ -124,15 +125,15 @@ def quantise(intermediate: Tensor, full_scale: Tensor, bits: int) -> Tensor:
 class Converter(nn.Module):
     """Quantises I and Q to a number of bits and clips them (an analogue-to-digital converter for each).
 
-    See :func:`quantise`. Noise of a signal that covers many steps is ``step^2 / 12`` per channel; a tone of full scale
-    has 6.02 bits + 1.76 dB.
+    See :func:`quantise`. For a signal that spans many steps the quantisation noise is ``step^2 / 12`` per channel; a
+    full-scale tone has a signal-to-noise ratio of 6.02 bits + 1.76 dB.
 
     Args:
         bits: 1 to 24.
         full_scale: largest value of I or Q in the unit of the IF (amplitude for transmit power 1); beyond it the
             converter saturates.
 
-    Shapes: IF (..., M, N) complex -> likewise. The gradient is that of clipping: steps have none.
+    Shapes: IF (..., M, N) complex -> likewise. The gradient is that of clipping: the steps have none.
 
     Raises:
         TensorsimError: bits out of range, a full scale that is not positive, an IF that is not complex.

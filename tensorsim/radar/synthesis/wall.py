@@ -22,7 +22,7 @@ from tensorsim.errors import TensorsimError, TensorsimWarning
 #: One-way loss from which a wall is reported as opaque: the two-way echo is then 80 dB down.
 OPAQUE_DB = 40.0
 
-#: Faces closer than this to the antenna plane touch it.
+#: Faces closer than this to the antenna plane count as touching it.
 CONTACT_M = 1e-9
 
 
@@ -76,7 +76,7 @@ def fresnel(
     """
     real, imaginary = refractive_index(relative_permittivity, loss_tangent)
     n = torch.complex(real, -imaginary)
-    # A wall of air has the quotient 0 / 0 at grazing incidence and beyond, where no wave arrives.
+    # For a wall of air the quotient is 0 / 0 at grazing incidence and beyond, where no wave arrives.
     cos_incidence = cos_incidence.clamp_min(1e-9)
     cos_refracted = (n.square() - 1 + cos_incidence.square()).sqrt() / n
     if polarization == "te":
@@ -122,7 +122,7 @@ def slab_coefficients(
 
 
 def bounce_ratio(slab: Slab, bounces: int) -> Tensor:
-    """``T_k / T_0 = (G exp(-alpha d))^(2k)`` of :func:`transmission`, also where T_0 is too small for a number."""
+    """``T_k / T_0 = (G exp(-alpha d))^(2k)`` of :func:`transmission`, even where T_0 underflows to 0."""
     return (slab.reflection * torch.exp(-slab.loss_neper)).pow(2 * bounces)
 
 
@@ -138,7 +138,7 @@ def transmission(slab: Slab, bounces: int) -> Tensor:
 
 
 def passage_phase(slab: Slab, passages: int, frequency_hz: float) -> Tensor:
-    """Propagation phase ``exp(-j beta d)`` of a passage, to the power of their number."""
+    """Propagation phase ``exp(-j beta d)`` of a passage, raised to the number of passages."""
     angle = -passages * math.pi * frequency_hz * slab.bounce_s  # a pair of bounces is 2 d long
     return torch.polar(torch.ones_like(angle), angle)
 
@@ -158,7 +158,7 @@ def two_way_wall_transmission(slab: Slab) -> WallTerms:
 
     $$ (T_0 + T_1)^2 = T_0^2 + 2 T_0 T_1 + T_1^2 $$
 
-    Both legs of the path pass the wall; :func:`transmission` is one of them. Each leg is late by ``excess_s``,
+    Both legs of the path pass the wall; :func:`transmission` is for one leg. Each leg is delayed by ``excess_s``,
     and each pair of internal bounces adds ``bounce_s``::
 
         T0^2     2 excess                direct
