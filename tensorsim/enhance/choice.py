@@ -1,4 +1,4 @@
-"""The denoisers of radar maps by name."""
+"""Denoisers of radar maps by name."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ def map_denoiser(choice: str | None) -> nn.Module | None:
     """The denoiser of magnitude maps (..., H, W) that a name stands for, in evaluation mode.
 
     Args:
-        choice: ``"none"`` or None; ``"perona-malik"``; ``"ksvd"``, which needs scikit-learn, takes minutes per long
-            map and does not script; ``"dncnn"``, the shipped network; or a name or file of other weights of it.
+        choice: ``"none"`` or None; ``"perona-malik"``; ``"ksvd"``, which needs scikit-learn, takes minutes for a long
+            map and cannot be scripted; ``"dncnn"``, the shipped network; or the name or file of other DnCNN weights.
 
     Raises:
-        TensorsimError: weights that are not there or of another network; scikit-learn missing.
+        TensorsimError: missing weights or those of another network; scikit-learn missing.
     """
     if choice is None or choice == "none":
         return None
@@ -33,10 +33,10 @@ def map_denoiser(choice: str | None) -> nn.Module | None:
 
 
 def weights_of_denoiser(choice: str | None) -> Path | None:
-    """The weight file of what :func:`map_denoiser` makes of a name; None for a method without weights.
+    """The weight file that :func:`map_denoiser` uses for a name; None for a method without weights.
 
     Raises:
-        TensorsimError: neither a method nor a name of weights; a path is returned also if there is no such file.
+        TensorsimError: neither a method nor a name of weights; a path is returned even if there is no such file.
     """
     from tensorsim.registry import locate
 
@@ -46,7 +46,7 @@ def weights_of_denoiser(choice: str | None) -> Path | None:
 
 
 def check_denoiser(choice: str | None) -> None:
-    """Refuse, before any work, what :func:`map_denoiser` would not find; nothing is loaded.
+    """Refuse, before any work is done, what :func:`map_denoiser` would not find; nothing is loaded.
 
     Raises:
         TensorsimError: neither a method nor a name or file of weights.

@@ -26,7 +26,7 @@ from tensorsim.errors import (
 
 #: How a map is scaled to an image for the network, see :class:`MapDenoiser`.
 SCALES = ("peak", "floor")
-#: Ten times the network of the paper either way.
+#: Ten times the depth and the width of the paper's network.
 MAX_DEPTH, MAX_CHANNELS = 200, 640
 
 

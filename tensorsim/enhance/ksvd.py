@@ -26,9 +26,9 @@ from tensorsim.errors import (
 def noise_deviation(image: Tensor) -> float:
     """Standard deviation of white noise in an image (H, W).
 
-    From the median of the finest diagonal Haar coefficients (Donoho, Johnstone, 1994). Noise that is alike in
-    neighbouring pixels is hardly seen: in a Doppler-time map at 10 dB, whose columns overlap by 90 %, 0.0002 instead
-    of 0.03, so that :class:`KSVD` leaves such maps as they are.
+    From the median of the finest diagonal Haar coefficients (Donoho, Johnstone, 1994). Noise that is correlated
+    between neighbouring pixels is hardly detected: the estimate for a Doppler-time map at 10 dB, whose columns overlap
+    by 90 %, is 0.0002 instead of 0.03, so that :class:`KSVD` leaves such maps practically unchanged.
     """
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     x = image[:height, :width]
@@ -73,7 +73,7 @@ def ksvd_denoise(
 
     Raises:
         TensorsimError: another rank, an image smaller than a patch, NaN, a negative deviation, counts below one, atoms
-            that are no square number, or scikit-learn missing.
+            that are not a square number, or scikit-learn missing.
     """
     try:
         from sklearn.decomposition import MiniBatchDictionaryLearning, sparse_encode
@@ -121,7 +121,7 @@ def ksvd_denoise(
     found = torch.zeros_like(patches)
     if busy.any():
         with warnings.catch_warnings():
-            # Where atoms are nearly alike the pursuit ends early, with the best fit so far.
+            # If atoms are nearly alike, the pursuit ends early, with the best fit so far.
             warnings.filterwarnings("ignore", "Orthogonal matching pursuit ended", RuntimeWarning)
             codes = sparse_encode(centred[busy], dictionary, algorithm="omp", alpha=tolerance)
         found[torch.from_numpy(busy)] = torch.from_numpy(codes @ dictionary)
@@ -135,7 +135,7 @@ def ksvd_denoise(
 class KSVD(nn.Module):
     """:func:`ksvd_denoise` of magnitude maps (..., H, W), each scaled to [0, 1] and back; for comparison.
 
-    Runs scikit-learn, so it does not script and has no gradient. Takes minutes for a map of 32 000 columns.
+    Runs scikit-learn, so it cannot be scripted and has no gradient. Takes minutes for a map of 32 000 columns.
 
     Raises:
         TensorsimError: scikit-learn missing; maps smaller than a patch, empty ones, NaN or infinity.
@@ -154,7 +154,7 @@ class KSVD(nn.Module):
         check_min_rank(maps, 2, "KSVD", "(..., H, W)")
         check_not_empty(maps, "KSVD")
         check_finite(maps, "KSVD")
-        # Its scale alone would have a gradient, which is none of the whole.
+        # Detached: only the scaling would have a gradient, which is not that of the whole.
         flat = maps.detach().reshape(-1, maps.shape[-2], maps.shape[-1])
         return torch.stack([self._clean(one) for one in flat]).reshape(maps.shape)
 

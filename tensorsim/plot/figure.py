@@ -1,4 +1,4 @@
-"""Figures without a window system, and the files they become."""
+"""Figures that need no window system, and saving them to files."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def save_figure(figure: Figure, path: Path) -> None:
     if suffix not in FIGURE_FORMATS:
         expected = ", ".join(f".{name}" for name in FIGURE_FORMATS)
         raise TensorsimError(f"{path}: got the suffix {path.suffix!r}, expected one of {expected}")
-    # Without the date the same run writes the same file.
+    # Without the date, the same run always writes the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
     with warnings.catch_warnings(), complete_file(path) as scratch:
-        # Names of films may have letters that the font lacks: a box is drawn in their place.
+        # File names of films may contain letters that the font lacks: a box is drawn in their place.
         warnings.filterwarnings("ignore", "Glyph .* missing from")
         if suffix == "png":
             # `savefig` draws twice, first for the layout alone, which drawing once settles as well.

@@ -1,4 +1,4 @@
-"""The floor that a camera is believed to see."""
+"""The floor as a camera is assumed to see it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def floor_lines(camera: CameraConfig, height: int, width: int) -> np.ndarray:
     """Lines 1 m apart on the floor, y from 0 to 8 m and x from -4 to 4 m, in the picture of a camera.
 
     Args:
-        camera: a focal length in pixels is one of this picture.
+        camera: a focal length in pixels refers to this picture.
         height, width: of the picture in pixels.
 
     Returns:
-        (n, 2, 2) float64 ``uv`` pixels of both ends of the parts of lines that are before the camera; they may lie
-        outside the picture.
+        (n, 2, 2) float64 ``uv`` pixels of both ends of the parts of lines that are in front of the camera; they may
+        lie outside the picture.
     """
     import torch
 
@@ -38,7 +38,7 @@ def floor_lines(camera: CameraConfig, height: int, width: int) -> np.ndarray:
     )  # fmt: skip
     depth = project(ends, focal, center, pose)[1]
     ends, depth = ends[(depth > NEAR_M).any(dim=1)], depth[(depth > NEAR_M).any(dim=1)]
-    # What is behind the camera is cut off where the line passes it.
+    # Lines are cut where they pass behind the camera.
     hidden = depth < NEAR_M
     share = ((NEAR_M - depth) / (depth.flip(1) - depth)).where(hidden, torch.zeros(()).double())
     ends = ends + share[..., None] * (ends.flip(1) - ends)
@@ -46,7 +46,7 @@ def floor_lines(camera: CameraConfig, height: int, width: int) -> np.ndarray:
 
 
 def through(lines: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Lines of :func:`floor_lines` through a homography (3, 3); those that it takes behind the camera are left out."""
+    """Map lines of :func:`floor_lines` by a homography (3, 3), leaving out those that end up behind the camera."""
     whole = np.concatenate([lines, np.ones_like(lines[..., :1])], axis=-1) @ homography.T
     whole = whole[(whole[..., 2] > 1e-3).all(axis=-1)]
     return np.asarray(whole[..., :2] / whole[..., 2:])
@@ -63,11 +63,11 @@ def draw_lines(image: np.ndarray, lines: np.ndarray) -> np.ndarray:
 
 
 def draw_floor(image: np.ndarray, camera: CameraConfig, to_image: np.ndarray | None = None) -> np.ndarray:
-    """Draw the floor that a camera sees on an image, see :func:`floor_lines`.
+    """Draw on an image the floor that a camera sees, see :func:`floor_lines`.
 
     Args:
         image: (H, W, 3) uint8 RGB; not changed.
-        camera: a focal length in pixels is one of this image.
+        camera: a focal length in pixels refers to this image.
         to_image: (3, 3) homography from pixels of the camera to those of the image; None if they are the same.
 
     Returns:

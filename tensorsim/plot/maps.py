@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from tensorsim.config import RadarConfig
     from tensorsim.radar.simulator import RadarSimulator
 
-#: One colour per ridge, of which there are 6 at most: far from each other, and from what is strong on the colour maps.
+#: One colour per ridge, of which there are 6 at most: distinct from each other and from the strong end of colour maps.
 RIDGE_COLOURS = ("white", "magenta", "black", "blue", "cyan", "#ff9ccb")
 
-#: Pictures show this much below the peak.
+#: Pictures show levels down to this far below the peak.
 DYNAMIC_RANGE_DB = 50.0
 
 ColormapName = Literal["turbo", "viridis", "jet", "parula", "gray"]
 
-#: Colours at equal steps of a map from dark blue through green to yellow, of steadily rising lightness, in the
-#: manner of the one that MATLAB calls parula.
+#: Colours at equal steps of a map from dark blue through green to yellow, of steadily rising lightness, similar to
+#: MATLAB's parula.
 _PARULA_LIKE = ("#2f2d8c", "#2a5bdc", "#1a88dc", "#12a6c0", "#3cb88c", "#93bf57", "#e8bc3e", "#f8f02c")
 _MAX_COLUMNS = 2000
-#: A ridge is hidden where the map around it is lower than this part of the picture: dots would cover it.
+#: A ridge is hidden where the map around it is narrower than this fraction of the picture: dots would cover it.
 _LEAST_HEIGHT = 0.03
 
 
@@ -81,11 +81,11 @@ def decibels(magnitude: np.ndarray, dynamic_range_db: float, peak: float | None 
 def person_peaks(simulator: RadarSimulator) -> dict[str, float]:
     """Peaks of the maps of a target of 1 m^2 at 3 m that approaches at 1 m/s: about those of one person.
 
-    It is nearer or farther where the range bins do not reach to 3 m, and slower where 1 m/s is more than half of the
-    unambiguous speed or more than 1 m of way.
+    It is nearer or farther if the range bins do not include 3 m, and slower if 1 m/s is more than half the unambiguous
+    speed or would move it by more than 1 m.
 
-    An empty scene has no echo of its own to refer to; drawn relative to these peaks, its noise is seen as weak as
-    it is. The random generator is left as it was.
+    An empty scene has no echo of its own to refer to; drawn relative to these peaks, its noise appears as weak as it
+    is. The state of the random generator is left unchanged.
 
     Returns:
         By name: ``range_time``, ``range_time_mti`` and ``doppler_time``.
@@ -99,7 +99,7 @@ def person_peaks(simulator: RadarSimulator) -> dict[str, float]:
     positions = bins.new_tensor(radar.middle_m, dtype=torch.float32).repeat(time_s.shape[0], 1, 1)
     positions[:, 0, 1] += distance_m - speed_m_s * time_s
     with torch.random.fork_rng(), torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", TensorsimWarning)  # of a target that nobody put there
+        warnings.simplefilter("ignore", TensorsimWarning)  # about a target that is not the user's
         maps = simulator(positions, torch.ones(1, device=bins.device))
     return {
         name: float(getattr(maps, name).max()) for name in ("range_time", "range_time_mti", "doppler_time")
@@ -107,8 +107,8 @@ def person_peaks(simulator: RadarSimulator) -> dict[str, float]:
 
 
 def caption(radar: RadarConfig, label: str | None = None, film: str | os.PathLike[str] | None = None) -> str:
-    """One line below the title of a picture: the film, the radar, and the label it was given, as far as known."""
-    # Names need not be UTF-8; matplotlib draws nothing else.
+    """One line below the title of a picture: the film if given, the radar, and the label if given."""
+    # File names need not be UTF-8, but matplotlib draws nothing else.
     parts = [] if film is None else [Path(film).name.encode(errors="replace").decode()]
     parts.append(
         f"{radar.carrier_hz / 1e9:.4g} GHz, sweep {radar.bandwidth_hz / 1e9:.3g} GHz, PRF {radar.prf_hz:.5g} Hz"
@@ -117,7 +117,7 @@ def caption(radar: RadarConfig, label: str | None = None, film: str | os.PathLik
 
 
 def thin_columns(magnitude: np.ndarray) -> np.ndarray:
-    """Reduce the time axis to about 2000 columns by power averages: more than a picture can show only aliases."""
+    """Reduce the time axis to about 2000 columns by averaging power: more than a picture can show would alias."""
     block = magnitude.shape[1] // _MAX_COLUMNS
     if block < 2:
         return magnitude
@@ -143,7 +143,7 @@ def map_figure(
     peak: float | None = None,
     note: str | None = None,
 ) -> Figure:
-    """Draw a map (rows, columns) in dB below its peak, and beside it the one of the true motion.
+    """Draw a map (rows, columns) in dB below its peak and, if given, beside it that of the true motion.
 
     Args:
         magnitude: (R or F, K) linear magnitude.
@@ -160,7 +160,7 @@ def map_figure(
         style: colours, dynamic range, and whether ridges are drawn.
         subtitle: a line below the title, see :func:`caption`.
         peak: the magnitude of 0 dB; by default each map's own. For an empty scene take :func:`person_peaks`.
-        note: words to write over the map, such as "no person in the scene".
+        note: text to write over the map, such as "no person in the scene".
     """
     style = MapStyle() if style is None else style
     panels = [(magnitude, ridges, title)]
@@ -219,9 +219,9 @@ def map_figure(
 def doppler_span(
     magnitude: np.ndarray, doppler_hz: np.ndarray, dynamic_range_db: float = DYNAMIC_RANGE_DB
 ) -> float:
-    """Half of the part of the Doppler axis in which a Doppler-time map (F, K) has something to show, in Hz.
+    """Largest Doppler in Hz, either way, up to which a Doppler-time map (F, K) has something to show, with a margin.
 
-    Noise may be above the floor of the colours. Rows of it stand out neither from other rows nor over time.
+    Noise may be above the floor of the colours, but rows of noise stand out neither from other rows nor over time.
     """
     levels = decibels(magnitude, 120.0)
     strongest = levels.max(1)
@@ -231,13 +231,13 @@ def doppler_span(
 
 
 def _write_note(axes: Axes, note: str) -> None:
-    """Words in the middle of a map."""
+    """Write text in the middle of a map."""
     box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none"}
     axes.text(0.5, 0.5, note, transform=axes.transAxes, ha="center", va="center", color="white", bbox=box)
 
 
 def _add_speed_axis(axes: Axes, speed_per_axis: float) -> None:
-    """A second scale on the right; a twin, because the layout leaves room for that and not for a secondary axis."""
+    """A second scale on the right: a twin, because the layout leaves room for that but not for a secondary axis."""
     right = axes.twinx()
     low, high = axes.get_ylim()
     right.set_ylim(low * speed_per_axis, high * speed_per_axis)
@@ -257,8 +257,8 @@ def drawn_ridges(
     Args:
         ridges, axis: see :func:`clear_ridges`.
         magnitude: of the map.
-        height: of the part of the axis that is in the picture.
-        dynamic_range_db, peak: of its colours, see :func:`decibels`.
+        height: of the visible part of the axis.
+        dynamic_range_db, peak: of the picture's colours, see :func:`decibels`.
     """
     shown = decibels(magnitude, dynamic_range_db, peak) > -dynamic_range_db
     return clear_ridges(ridges, axis, shown, _LEAST_HEIGHT * height)

@@ -21,11 +21,11 @@ def overview_figure(folder: Path, style: MapStyle | None = None) -> Figure:
     """A frame of the overlay film, the range-time map and the Doppler-time map of a run, side by side.
 
     Args:
-        folder: what ``tensorsim simulate`` or ``tensorsim demo`` wrote.
+        folder: written by ``tensorsim simulate`` or ``tensorsim demo``.
         style: of the maps; by default turbo with 40 dB.
 
     Raises:
-        TensorsimError: files that are missing.
+        TensorsimError: missing files.
     """
     from tensorsim.data.clip import read_video
 
@@ -75,7 +75,7 @@ def overview_figure(folder: Path, style: MapStyle | None = None) -> Figure:
 
 
 def save_small(figure: Figure, path: Path) -> None:
-    """Write a PNG of 256 colours: a third of the bytes, for pages."""
+    """Write a PNG with 256 colours, a third of the size, for web pages."""
     from io import BytesIO
 
     from PIL import Image

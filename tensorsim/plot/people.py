@@ -28,7 +28,7 @@ PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189),
 
 #: Nothing is drawn further outside a picture; OpenCV takes 32-bit coordinates.
 _FAR_PX = 10_000
-#: No joint is further than this from the middle of its hips; one that is was placed wrongly.
+#: A joint further than this from the middle of its hips has been misplaced.
 _LIMB_REACH_M = 1.5
 
 
@@ -41,16 +41,16 @@ def skeleton_figure(
     subtitle: str | None = None,
     radar_m: Vector = (0.0, 0.0, 1.5),
 ) -> Figure:
-    """Draw people in the coordinates of the radar at a few moments spread over each one's time in the scene.
+    """Draw people in the coordinates of the radar at a few moments spread over each person's time in the scene.
 
-    All joints are drawn. The axes hold every joint within reach of its body; below the picture it says how many are
-    further away, and how far feet are below the floor.
+    All joints are drawn. The axes include every joint within reach of its body; text below the picture says how many
+    are further away, and how far the lowest joint is below the floor.
 
     Args:
         joints_m: (P, T, 14, 3) world metres.
         valid: (P, T) bool, whether the person is in the scene.
         fps: frames per second.
-        poses: moments to draw of each person.
+        poses: number of moments to draw per person.
         subtitle: a line below the title, see :func:`caption`.
         radar_m: the middle of the antennas, ``RadarConfig.middle_m``.
     """
@@ -74,7 +74,7 @@ def skeleton_figure(
     low, high = points.min(axis=0), points.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low)
-    # All axes have one scale: the longest says how far apart labels have to be.
+    # All axes have the same scale: the longest determines how far apart labels have to be.
     longest = (high - low).max()
     steps = (step * 10**power for power in count() for step in (0.5, 1.0, 2.0))
     least = next(step for step in steps if step >= longest / 16)
@@ -86,7 +86,7 @@ def skeleton_figure(
         scale.set_major_locator(MultipleLocator(max(spacing, least)))
         scale.set_tick_params(labelsize="small")
         scale.set_label_text(f"{label} in m")
-    # Names are moved away from their axis by shares of the other one; the labels of y are on a slope.
+    # The shorter the other axis, the further an axis name is moved away; the labels of y are on a slope.
     axes.xaxis.labelpad = 5.0 * longest / (high[1] - low[1])
     axes.yaxis.labelpad = max(12.0, 5.0 * longest / (high[0] - low[0]))
     axes.set_title("skeletons in radar coordinates")
@@ -107,7 +107,7 @@ def skeleton_figure(
 def _draw_person(
     axes: Any, person: int, joints: np.ndarray, frames: np.ndarray, chosen: np.ndarray, fps: float
 ) -> None:
-    """Poses of ``chosen`` frames, the later the stronger, and the way of the hips on the floor in all ``frames``."""
+    """Draw poses of ``chosen`` frames, later ones stronger, and the path of the hips on the floor in all ``frames``."""
     from matplotlib.patheffects import withStroke
 
     colour = np.array(PERSON_COLOURS[person % len(PERSON_COLOURS)]) / 255
@@ -118,7 +118,7 @@ def _draw_person(
         bones = np.pad(joints[frame][np.array(BODY_BONES)], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         axes.plot(*bones.reshape(-1, 3).T, color=colour, alpha=shade, linewidth=1.8)
         top = joints[frame, 0] + (0, 0, 0.15)
-        # Somebody who stays in place has the times of all poses in the legend only.
+        # A pose close to a labelled one gets no time: for a person who stays in place, the legend has the time span.
         if (np.linalg.norm(labelled - top, axis=1) > 0.4).all():
             outline = [withStroke(linewidth=2.0, foreground="white")]
             axes.text(*top, f"{frame / fps:.1f} s", color=colour, fontsize=7, zorder=10, path_effects=outline)

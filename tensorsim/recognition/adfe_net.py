@@ -1,9 +1,9 @@
 """TWR-ADFE-Net: an enhanced Doppler-time map, and the 3DCA-ConvMixer that reads it.
 
 Source: L. Tang, S. Guo, J. Li, J. Zhu, G. Cui, L. Kong, X. Yang. Published: the steps and the sizes of an open
-reproduction, which this follows and which says of itself that its channel gate stands for the original's attention
-along height, width and channels. Reconstructed: the width of the two weights at other pulse repetition frequencies
-than 200 Hz; the original's weights adapt to the data and are not published.
+reproduction, which this module follows and whose channel gate, it states, stands in for the original's attention along
+height, width and channels. Reconstructed: the width of the two weights at pulse repetition frequencies other than
+200 Hz; the original's weights adapt to the data and are not published.
 """
 
 import torch
@@ -20,7 +20,7 @@ def fuse_doppler(cancelled: Tensor, centred: Tensor, doppler_hz: Tensor, sigma_h
     """Two Doppler-time maps of one clip as one: fast motion from the first, slow motion from the second.
 
     ``W cancelled / max + (1 - W) centred / max`` with ``W = 1 - exp(-f^2 / (2 sigma^2))``, over its own maximum. A
-    two-pulse canceller suppresses slow motion as well as what stands still; the mean over the clip leaves it.
+    two-pulse canceller suppresses slow motion as well as static echoes; subtracting the mean over the clip keeps it.
 
     Args:
         cancelled: (..., F, K) magnitude after two-pulse cancellation.
@@ -47,14 +47,14 @@ class DopplerEnhancement(DopplerFrames):
     The magnitudes of the transforms of the range bins are added, not their powers.
 
     Args:
-        radar, window_s, overlap: see :class:`~tensorsim.radar.processing.doppler.DopplerFrames`; the source has a
+        radar, window_s, overlap: see :class:`~tensorsim.radar.processing.doppler.DopplerFrames`; the source uses a
             Hamming window of 0.1 s and an overlap of 0.9.
         sigma_hz: None is a twentieth of the pulse repetition frequency, 10 Hz at the source's 200 Hz.
 
     Shapes: (..., M, R) complex -> (..., F, K) in [0, 1], Doppler ascending, positive = approaching. Differentiable.
 
     Raises:
-        TensorsimError: a width that is not positive; real profiles, fewer pulses than one window and one more.
+        TensorsimError: a width that is not positive; real profiles, fewer pulses than one window plus one.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ Network = TypeVar("Network", bound="ImageClassifier")
 
 
 def centred(pictures: Tensor, mean: Tensor, name: str) -> Tensor:
-    """Images (..., C, H, W) as a batch (B, C, H, W), less the mean (C,) of each channel.
+    """Images (..., C, H, W) as a batch (B, C, H, W), minus the mean (C,) of each channel.
 
     Raises:
         TensorsimError: another number of channels, dtype or device than that of the mean, no images, NaN.
@@ -159,7 +159,7 @@ class ImageClassifier(nn.Module):
 
     @classmethod
     def arguments(cls, weights: dict[str, Tensor]) -> dict[str, Any]:
-        """Arguments of the constructor for these weights; raises KeyError or IndexError for those of others."""
+        """Arguments of the constructor for these weights; KeyError or IndexError for weights of another network."""
         return {"num_classes": weights["head.weight"].shape[0], "in_channels": weights["mean"].shape[0]}
 
     @classmethod

@@ -27,7 +27,7 @@ def _check(logits: Tensor, labels: Tensor) -> None:
 def fit_temperature(logits: Tensor, labels: Tensor) -> float:
     """The temperature T for which ``softmax(logits / T)`` gives held-out labels the highest likelihood.
 
-    One number for all classes, so the most probable class stays (Guo et al., "On calibration of modern neural
+    One number for all classes, so the most probable class stays the same (Guo et al., "On calibration of modern neural
     networks", ICML 2017). The negative log-likelihood has one minimum in ``1 / T``; it is found by golden section on
     ``log T`` between 0.05 and 20.
 
@@ -36,7 +36,7 @@ def fit_temperature(logits: Tensor, labels: Tensor) -> float:
         labels: (N,) int64.
 
     Raises:
-        TensorsimError: shapes that do not go together, no samples, logits that are not finite, or labels out of range.
+        TensorsimError: shapes that do not match, no samples, logits that are not finite, or labels out of range.
     """
     _check(logits, labels)
     logits = logits.detach().double()
@@ -61,11 +61,11 @@ def fit_temperature(logits: Tensor, labels: Tensor) -> float:
 
 
 class Reliability(NamedTuple):
-    """Bins of equal width of the confidence, from 0 to 1; empty ones are 0.
+    """Bins of equal width of the confidence, from 0 to 1; values of empty bins are 0.
 
     Attributes:
-        samples: (bins,) their number.
-        confidence, accuracy: (bins,) float64, means over them.
+        samples: (bins,) number of samples.
+        confidence, accuracy: (bins,) float64, means over these samples.
     """
 
     samples: Tensor
@@ -79,10 +79,10 @@ def reliability(probabilities: Tensor, labels: Tensor, bins: int = 10) -> Reliab
     Args:
         probabilities: (N, classes), from 0 to 1.
         labels: (N,) int64.
-        bins: their number.
+        bins: number of bins.
 
     Raises:
-        TensorsimError: shapes that do not go together, no samples, probabilities or labels out of their range, or fewer
+        TensorsimError: shapes that do not match, no samples, probabilities or labels out of their range, or fewer
             than one bin.
     """
     _check(probabilities, labels)

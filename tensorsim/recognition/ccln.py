@@ -1,9 +1,9 @@
-"""CCLN: convolutions whose mean and whose course in time, read by an LSTM, are concatenated.
+"""CCLN: convolutional features whose mean and whose course over time, read by an LSTM, are concatenated.
 
 Source: Xiong, Ren, Yuan, Zahid, Abbasi, Imran, "Human Motion Recognition by Micro-Doppler Features and Concatenated
 CNN-LSTM Network", IEEE Sensors Journal 25 (2025), doi 10.1109/JSEN.2024.3447790. Published (abstract): a 2D
 convolutional network concatenated with an LSTM. Reconstructed: all sizes. The clutter filter of the source, an adaptive
-threshold on the echo, comes before the map and is not part of this.
+threshold on the echo, comes before the map and is not included here.
 """
 
 import torch

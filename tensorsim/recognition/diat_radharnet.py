@@ -3,7 +3,7 @@
 Source: M. Chakraborty, H. C. Kumawat, S. V. Dhavale, A. A. B. Raj, "DIAT-RadHARNet: A Lightweight DCNN for Radar Based
 Classification of Human Suspicious Activities", IEEE Transactions on Instrumentation and Measurement 71 (2022), doi
 10.1109/TIM.2022.3154832. Published (abstract): depthwise separable convolutions, kernels of several sizes on the same
-input, weights of channels, 213 793 parameters for 6 classes. Reconstructed: all sizes, chosen to come to 213 783.
+input, channel weights, 213 793 parameters for 6 classes. Reconstructed: all sizes, chosen to give 213 783 parameters.
 """
 
 import itertools

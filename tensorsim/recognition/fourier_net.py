@@ -73,7 +73,7 @@ class FourierNet(ImageClassifier):
     12 classes, 3 channels and 256x256 pixels, of which 1 835 008 in filters.
 
     Raises:
-        TensorsimError: see the base class; a size that is no multiple of 16, images of another size.
+        TensorsimError: see the base class; a size that is not a multiple of 16, images of another size.
     """
 
     def __init__(self, num_classes: int = 12, in_channels: int = 1, size: int = 256) -> None:
@@ -95,7 +95,7 @@ class FourierNet(ImageClassifier):
         x = self.stem(x)
         top, bottom = same_padding(x.shape[-2], 3, 2)
         left, right = same_padding(x.shape[-1], 3, 2)
-        # After a ReLU zeros pad as minus infinity does.
+        # After a ReLU, padding with zeros equals padding with minus infinity.
         x = F.max_pool2d(F.pad(x, [left, right, top, bottom]), 3, 2)
         return self.head(self.body(x).mean((-2, -1)))
 
@@ -146,7 +146,7 @@ class GlobalFilterNet(ImageClassifier):
     tiny, 12 classes, 3 channels and 224x224 pixels.
 
     Raises:
-        TensorsimError: see the base class; an unknown version, a size that is no multiple of 16, images of another
+        TensorsimError: see the base class; an unknown version, a size that is not a multiple of 16, images of another
             size.
     """
 

@@ -41,7 +41,7 @@ class LabelSet:
         return iter(self.names)
 
     def to_text(self) -> str:
-        """As the header of a weight file stores it."""
+        """The text that the header of a weight file stores."""
         return json.dumps(list(self.names))
 
     @classmethod
@@ -49,7 +49,7 @@ class LabelSet:
         """The inverse of :meth:`to_text`.
 
         Raises:
-            TensorsimError: something else.
+            TensorsimError: any other text.
         """
         try:
             names: Iterable[str] = json.loads(text)

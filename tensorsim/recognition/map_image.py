@@ -26,7 +26,7 @@ def area_weights(start: Tensor, width: float, low: float, high: float, size: int
     """Matrix (size, N) that averages N cells over ``size`` equal pixels between ``low`` and ``high``.
 
     Cell n covers ``start[n]`` to ``start[n] + width``. Row i contains the overlap of pixel i with each cell, divided by
-    the sum of the row; a pixel outside of all cells has a row of zeros.
+    the sum of the row; a pixel outside all cells has a row of zeros.
     """
     pixel = (high - low) / size
     left = low + pixel * torch.arange(size, dtype=start.dtype, device=start.device).unsqueeze(-1)
@@ -40,7 +40,7 @@ def area_weights(start: Tensor, width: float, low: float, high: float, size: int
 def scaled(power: Tensor, scale: str, range_db: float) -> Tensor:
     """Power (..., H, W) to pixels in [0, 1], each image normalised by its own peak; an image of zeros stays 0.
 
-    ``"linear"``: magnitude over peak. ``"db"``: decibels below the peak, ``range_db`` and more below it is 0.
+    ``"linear"``: magnitude over peak. ``"db"``: decibels below the peak, with 0 at ``range_db`` or more below it.
     """
     peak = power.amax((-2, -1), keepdim=True)
     level = power / torch.where(peak > 0, peak, torch.ones_like(peak))
@@ -59,9 +59,9 @@ class MapToImage(nn.Module):
 
     Args:
         axis: (F,) value of each bin, ascending in equal steps; each bin covers a step around its value.
-        any_bins: maps may divide the extent of the axis into other numbers of bins, as spectra do, the first of which
+        any_bins: maps may divide the extent of the axis into another number of bins, as spectra do; the first bin
             keeps its value.
-        span: (low, high) limits of the image on the axis. Outside of the axis the image is 0.
+        span: (low, high) limits of the image on the axis. Outside the axis the image is 0.
         size: height and width in pixels.
         scale, range_db: see :func:`scaled`.
 
@@ -174,10 +174,10 @@ class MapToImage(nn.Module):
 def ridge_map(indices: Tensor, magnitudes: Tensor, bins: int) -> Tensor:
     """Doppler-time map of ridges alone: bins and magnitudes (..., C, K) -> (..., ``bins``, K), 0 elsewhere.
 
-    Where two ridges meet, the larger magnitude is used. Differentiable by the magnitudes.
+    Where two ridges meet, the larger magnitude is used. Differentiable with respect to the magnitudes.
 
     Raises:
-        TensorsimError: shapes that differ, or bins outside of the map.
+        TensorsimError: shapes that differ, or bins outside the map.
     """
     if indices.shape != magnitudes.shape or indices.dim() < 2:
         raise TensorsimError(

@@ -1,6 +1,6 @@
 """MC-GCLU: masked concatenation, then gated convolutions and a gated linear unit.
 
-Inspired by the name alone: RadHARSimulator V2 (arXiv 2511.09022) compares with a "masked concatenation with gated
+Based on the name alone: RadHARSimulator V2 (arXiv 2511.09022) compares with a "masked concatenation with gated
 convolution and linear unit", of which no publication was found. Everything here is a reconstruction.
 """
 
@@ -53,7 +53,7 @@ class MCGCLU(ImageClassifier):
         self.head = nn.Linear(256, num_classes)
 
     def mask(self, x: Tensor) -> Tensor:
-        """What is seen of images (B, C, H, W): (B, 1, H, W) of 0 and 1."""
+        """Mask of the visible pixels of images (B, C, H, W): (B, 1, H, W) of 0 and 1."""
         height, width = x.shape[-2], x.shape[-1]
         if not self.training:
             return torch.ones_like(x[:, :1])

@@ -3,7 +3,7 @@
 Source: Sensors 25 (2025) 197, doi 10.3390/s25010197. Published (abstract): parallel large-, medium- and small-scale
 residual networks, weights over time and channels, contrastive pre-training and fine-tuning with few labels.
 Reconstructed: kernels 7, 5 and 3, widths 16 to 128, two layers per residual block, the form of both weights. Trained
-here with labels alone, as in the comparison of RadHARSimulator V2; the contrastive stage is left out.
+here on labels alone, as in the comparison of RadHARSimulator V2; the contrastive stage is left out.
 """
 
 import torch

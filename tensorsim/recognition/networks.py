@@ -23,9 +23,9 @@ class Classifier:
     """A classifier of map images.
 
     Attributes:
-        title: what tables call it.
+        title: name in tables.
         make: (classes, channels) -> network; with ``size`` if ``sized``.
-        size: height and width of the pictures that its authors give it.
+        size: height and width of the pictures that its authors use.
         origin: "exact" if all layers are published, "reconstruction" otherwise; and what is left out.
         sized: whether the size of the pictures is part of the network.
     """
@@ -37,7 +37,7 @@ class Classifier:
     sized: bool = False
 
     def build(self, num_classes: int = 12, in_channels: int = 1, size: int | None = None) -> nn.Module:
-        """The network for pictures of ``size`` pixels; None is that of its authors."""
+        """The network for pictures of ``size`` pixels; None is the size that its authors use."""
         if not self.sized:
             return self.make(num_classes, in_channels)
         return self.make(num_classes, in_channels, size=self.size if size is None else size)

@@ -24,7 +24,7 @@ NETWORKS: dict[str, type[SPNet] | type[SPGNet]] = {"SPNet": SPNet, "SPGNet": SPG
 
 
 def stored_classifier(path: Path) -> tuple[SPNet | SPGNet, dict[str, str]]:
-    """The network of a weight file, and what the header of the file states.
+    """The network of a weight file, and the metadata in the header of the file.
 
     Raises:
         TensorsimError: no such file, or weights of neither network.
@@ -52,18 +52,18 @@ class ActivityRecognizer(nn.Module):
         class_names: of the network's outputs in their order; by default ``tensorsim.ACTIVITIES``.
         temperature: logits are divided by it for :meth:`probabilities` (Guo et al., "On calibration of modern neural
             networks", ICML 2017).
-        either_way: logits are the mean of those of the picture and of the one with approach and retreat exchanged, for
-            networks that learnt activities in every heading.
+        either_way: average the logits of the picture and of its copy with approach and retreat exchanged, for networks
+            that learnt activities in every heading.
 
-    Shapes: RadarMaps -> (..., classes). Differentiable by the maps.
+    Shapes: RadarMaps -> (..., classes). Differentiable with respect to the maps.
 
     Attributes:
         radar, class_names: as given.
         labels: the same as a :class:`LabelSet`.
 
     Raises:
-        TensorsimError: unknown inputs, ``either_way`` with ``"merged"`` ones, a network that is no module, has another
-            number of input channels, or another number of classes than names; maps that are no RadarMaps.
+        TensorsimError: unknown inputs, ``either_way`` with ``"merged"`` ones, a network that is not a module, has
+            another number of input channels, or another number of classes than names; maps that are not RadarMaps.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class ActivityRecognizer(nn.Module):
 
     @torch.jit.unused
     def save_pretrained(self, path: str | os.PathLike[str], class_names: Sequence[str] | None = None) -> None:
-        """Write weights, classes and what the pictures are, for :meth:`from_pretrained`.
+        """Write weights, class names and settings of the pictures, for :meth:`from_pretrained`.
 
         Args:
             path: ends in ``.safetensors``. Parameters are stored in float16.
@@ -186,7 +186,7 @@ class ActivityRecognizer(nn.Module):
                 SPGNet.
 
         Raises:
-            TensorsimError: no such file or name, or a file without these metadata.
+            TensorsimError: no such file or name, or a file without this metadata.
         """
         from tensorsim.registry import locate
 

@@ -1,8 +1,8 @@
-"""SPNet with blocks that are densely connected, as the prose of its paper says and its published layer list does not.
+"""SPNet with densely connected blocks, as the text of its paper describes but its published layer list does not.
 
 Source: RadHARSimulator V2 (arXiv 2511.09022): "densely connected" 3x3 convolutions, each fed with the concatenation of
-all before it, a 1x1 fusion and a residual addition, three times. Everything that the prose leaves open (six
-convolutions per block, the width of the block's input each, sizes of the rest) is that of
+all before it, a 1x1 fusion and a residual addition, three times. Everything that the text leaves open (six
+convolutions per block, each as wide as the block's input, the other sizes) is that of
 :class:`~tensorsim.recognition.SPNet`. There is no published figure of this form.
 """
 
@@ -38,7 +38,7 @@ class DenseBlock(nn.Module):
 
 
 class SPNetDense(ImageClassifier):
-    """SPNet with dense blocks; a reconstruction from the prose of the paper.
+    """SPNet with dense blocks; a reconstruction from the text of the paper.
 
     Args:
         num_classes: number of classes.

@@ -1,4 +1,4 @@
-"""Activities over time: a recognizer that is asked about windows of the maps."""
+"""Activities over time: a recognizer applied to windows of the maps."""
 
 import math
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from tensorsim.types import RadarMaps
 #: Length of the clips that the shipped networks were trained on.
 WINDOW_S = 4.0
 STEP_S = 1.0
-#: The label of a window whose most probable class has less than the probability that is asked for.
+#: The label of a window whose most probable class is less probable than required.
 NOT_SURE = "not sure"
 
 
@@ -21,7 +21,7 @@ class Window(NamedTuple):
     """The activity within a window of a scene.
 
     Attributes:
-        start_s, end_s: from the beginning of the maps.
+        start_s, end_s: seconds from the beginning of the maps.
         label: the most probable class, or :data:`NOT_SURE`.
         probabilities: of the classes of the recognizer, in their order.
         power: mean power of the columns of the Doppler-time map.
@@ -35,11 +35,11 @@ class Window(NamedTuple):
 
 
 def window_starts(duration_s: float, window_s: float = WINDOW_S, step_s: float = STEP_S) -> list[float]:
-    """Starts of windows that cover a duration: every ``step_s``, the last one at the end.
+    """Start times of windows that cover a duration: every ``step_s``, with the last window at the end.
 
-    It begins half to one and a half steps after the one before.
+    The last window starts half a step to one and a half steps after the one before.
 
-    A duration of less than a window and a step is one window, so that nobody is asked twice about nearly the same.
+    A duration shorter than a window and a step gives one window, so that nearly the same part is not labelled twice.
     """
     check_positive(window_s, "window_s")
     check_positive(step_s, "step_s")
@@ -63,13 +63,13 @@ def label_windows(
     """Label the windows of the maps of one scene.
 
     Args:
-        recognizer: of the radar of the maps.
+        recognizer: for the radar of the maps.
         maps: without batch dimensions.
         duration_s: of the scene; the columns of each map are spread over it evenly.
         window_s: length of a window.
         step_s: from one window to the next.
-        least_probability: a window whose most probable class has less is :data:`NOT_SURE`. The default, 0.0, always
-            gives the most probable class; the default of ``tensorsim simulate`` is 0.2.
+        least_probability: a window whose most probable class is less probable than this is :data:`NOT_SURE`. The
+            default, 0.0, always gives the most probable class; the default of ``tensorsim simulate`` is 0.2.
 
     Raises:
         TensorsimError: maps with batch dimensions, or a length that is not positive.
@@ -106,7 +106,7 @@ def windows_of(
 
 
 def _part(maps: RadarMaps, start: float, end: float) -> RadarMaps:
-    """The columns of maps between two shares of their length."""
+    """The columns of maps between two fractions of their length."""
 
     def cut(x: Tensor) -> Tensor:
         columns = x.shape[-1]
@@ -123,8 +123,8 @@ def _part(maps: RadarMaps, start: float, end: float) -> RadarMaps:
 def scene_probabilities(windows: list[Window]) -> Tensor:
     """Mean probabilities (classes,) over the windows of a scene, weighted by their power; the plain mean if it is 0.
 
-    The recognizer scales the picture of each window to its own peak, so that it does not see how weak an echo is. A
-    window in which somebody only stands still, or is gone after a fall, should say little of the scene.
+    The recognizer scales the picture of each window to its own peak, so it cannot see how weak an echo is. A window in
+    which a person only stands still, or is gone after a fall, should have little influence on the result.
     """
     probabilities = torch.tensor([window.probabilities for window in windows], dtype=torch.float64)
     power = torch.tensor([window.power for window in windows], dtype=torch.float64)
