@@ -151,7 +151,7 @@ class Recorder(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Profiles of pulses ``first`` onwards with all receiver effects, and the energy (B,) of the receiver noise.
 
-        ``echoes`` may hold noise-free profiles from :meth:`echoes`: the first are removed and used, not recomputed.
+        If ``echoes`` holds noise-free profiles, the first piece is removed from it and used instead of recomputed.
         """
         if self.front_end is not None:
             chunks: list[Tensor] = []

@@ -50,8 +50,8 @@ class PhaseNoise(nn.Module):
         piece of the clip it is processed. Differentiable.
 
     Raises:
-        TensorsimError: offsets that are not positive and ascending, not one finite level for each, an IF that is not
-            complex or has another number of samples.
+        TensorsimError: offsets that are not positive and ascending, levels that are not finite or not one per offset,
+            an IF that is not complex or has another number of samples.
     """
 
     deviation: Tensor
