@@ -37,15 +37,15 @@ from tensorsim.vision.smoothing.along_time import local_linear
 
 
 class CameraEstimate(NamedTuple):
-    """What the people of clips tell of their camera; standard deviations say how well.
+    """The cameras of clips as estimated from the people in them, with standard deviations.
 
     Attributes:
         pitch_rad: (...) upward tilt of the optical axis.
-        roll_rad: (...) about it, positive = clockwise as the camera sees it.
+        roll_rad: (...) about the optical axis, positive = clockwise as the camera sees it.
         height_m: (...) above the floor.
         horizontal_fov_rad: (...) field of view.
         pitch_sd_rad, roll_sd_rad, height_sd_m, horizontal_fov_sd_rad: (...) standard deviations.
-        frames: (...) int64 frames of upright people that it rests on; with 0 it is what is assumed beforehand.
+        frames: (...) int64 number of frames of upright people used; with 0 the estimate is the prior.
     """
 
     pitch_rad: Tensor
@@ -59,24 +59,24 @@ class CameraEstimate(NamedTuple):
     frames: Tensor
 
 
-#: Field of view of most cameras along the longer side of their pictures.
+#: Typical field of view of a camera along the longer side of its pictures.
 USUAL_FOV_RAD = math.radians(60.0)
 
 
 def horizontal_fov(along_longer_rad: Tensor, height: int, width: int) -> Tensor:
-    """Horizontal field of view in radians of pictures with this one along their longer side."""
+    """Horizontal field of view in radians, given the one along the longer side of pictures of this size."""
     return 2 * torch.atan(torch.tan(along_longer_rad / 2) * width / max(width, height))
 
 
 def with_reserve(
     found: CameraEstimate, height: int, width: int, good_rad: float = math.radians(5.0)
 ) -> CameraEstimate:
-    """Estimates drawn towards a level camera 1.5 m above the floor, the more the less is known of its tilt.
+    """Estimates shrunk towards a level camera 1.5 m above the floor, the more so the less certain their pitch.
 
-    A few steps may fit a camera that looks steeply down as well as one that is level. A tilt with a standard deviation
-    of ``good_rad`` or less stays as it is; beyond, tilt and roll shrink by ``(good_rad / deviation)^2``, and so do the
-    logarithm of the height against 1.5 m and the field of view against 60 degrees along the longer side of pictures of
-    ``height`` and ``width`` pixels.
+    A few steps of a walk may fit a camera that looks steeply down as well as a level one. An estimate whose pitch has
+    a standard deviation of ``good_rad`` or less stays as it is. Otherwise pitch and roll are multiplied by
+    ``(good_rad / deviation)^2``, and so are the deviations of the logarithm of the height from that of 1.5 m, and of
+    the field of view from 60 degrees along the longer side of pictures of ``height`` and ``width`` pixels.
     """
     share = (good_rad / found.pitch_sd_rad).square().clamp(max=1.0)
     usual_fov = horizontal_fov(found.pitch_rad.new_tensor(USUAL_FOV_RAD), height, width)
@@ -89,7 +89,7 @@ def with_reserve(
 
 
 def _across(cameras: Tensor, height: int, width: int) -> Tensor:
-    """Cameras (..., 4) whose last element is the field of view along the longer side, to the horizontal one."""
+    """Cameras (..., 4) with the last element, field of view along the longer side, made the horizontal one."""
     fov = horizontal_fov(cameras[..., 3:], height, width)
     return torch.cat([cameras[..., :3], fov], dim=-1)
 
@@ -98,7 +98,7 @@ def camera_config(found: CameraEstimate, radar_ahead_m: float = 0.0) -> CameraCo
     """The camera of one clip, looking along +y, above the radar at the origin or behind it.
 
     Args:
-        found: of one clip, fields of one element.
+        found: estimate of one clip; each field has one element.
         radar_ahead_m: how far in front of the camera the radar stands.
     """
     return CameraConfig(
@@ -110,7 +110,7 @@ def camera_config(found: CameraEstimate, radar_ahead_m: float = 0.0) -> CameraCo
 
 
 def camera_row(found: CameraEstimate | None) -> dict[str, Any] | None:
-    """What files of results say of the camera of one clip: degrees and metres, each with its standard deviation."""
+    """The camera of one clip as result files state it: degrees and metres, each with its standard deviation."""
     if found is None:
         return None
     row: dict[str, Any] = {"frames": int(found.frames)}
@@ -127,22 +127,21 @@ def camera_row(found: CameraEstimate | None) -> dict[str, Any] | None:
 class CameraCalibrator(nn.Module):
     """Tilt, roll, height and field of view of a still camera from people who stand and walk in its picture.
 
-    People are upright bodies of known or typical height on a level floor (see
-    :mod:`tensorsim.vision.calibration.camera_fit`). Where they tell little, the estimate stays near what is assumed
-    beforehand (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15 degrees
-    along the longer side of the picture); somebody who walks through the scene tells everything. The height of the
-    camera goes with that of the people. However long somebody stays at one place, that is one observation: errors of
-    key points there do not average out. Somebody that never moves while others do may be a thing that looks like a
-    person, and tells nothing.
+    People are modelled as upright bodies of known or typical height on a level floor (see
+    :mod:`tensorsim.vision.calibration.camera_fit`). Where they carry little information, the estimate stays near the
+    prior (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15 degrees
+    along the longer side of the picture); one person who walks through the scene is enough to determine everything.
+    The estimated camera height scales with the height of the people. However long somebody stays in one place, that
+    is one observation: errors of key points there do not average out. A person who never moves while others do may be
+    an object that looks like a person, and is ignored.
 
     Args:
-        person_height_m: standing heights by order of person; the last one applies to all further people.
+        person_height_m: standing heights in the order of the people; the last one applies to all further people.
         height_sd_m: standard deviation of these heights: 0.08 m for people of unknown height, less for known ones.
-        keypoint_threshold: score from which a key point counts. The usual 0.3 is too low for this: key points of low
-            scores err to one side (feet below the picture are found at its edge), and one camera is told from all
-            frames.
-        most_frames: of those in which somebody is upright that are used, at most: evenly spread, or windows of six
-            seconds that are.
+        keypoint_threshold: score from which a key point counts. The usual 0.3 is too low for this: key points with
+            low scores are biased (feet below the picture are found at its edge), and all frames share one camera.
+        most_frames: at most this many of the frames in which somebody is upright are used: evenly spread ones, or in
+            long films evenly spread windows of six seconds.
 
     Shapes:
         keypoints (..., P, T, 17, 2) pixels, scores (..., P, T, 17), valid (..., P, T) bool, image height and width in
@@ -178,11 +177,11 @@ class CameraCalibrator(nn.Module):
         self.lean, self.lean_spread = LEAN, LEAN_SPREAD
         self.pace, self.pace_spread = PACE, PACE_SPREAD
         self.walk_ratio, self.walk_ratio_spread = WALK_RATIO, WALK_RATIO_SPREAD
-        self.least_rhythm = 0.4  # share of a sinusoid in the steps from which a cadence is believed
-        self.correlation_s = 0.4  # after which the errors of a body are no longer those of before
+        self.least_rhythm = 0.4  # share of a sinusoid in the steps from which a cadence is trusted
+        self.correlation_s = 0.4  # after which the errors of a body are no longer correlated
         self.smoothing_s = 0.25
-        self.most_people = 12  # with the most independent observations; more tell hardly more of the camera
-        self.path = 0.25  # body heights in the image after which somebody is seen anew
+        self.most_people = 12  # with the most independent observations; further people add little
+        self.path = 0.25  # body heights moved in the image that count as a new observation
         # Pitch, roll, logarithm of the height, field of view along the longer side.
         mean = [0.0, 0.0, math.log(1.5), USUAL_FOV_RAD]
         deviation = [20 * degree, 3 * degree, 0.45, 15 * degree]
@@ -261,7 +260,7 @@ class CameraCalibrator(nn.Module):
         chosen, apart, every = self._looked_at(upright, fps)
         ends, upright, walking = ends[:, chosen], upright[:, chosen] & ~apart, walking[:, chosen]
         independent = self._independent(ends, upright, every / fps)
-        # Each person has parameters of their own, and time and memory grow with the square of their number.
+        # Each person has their own parameters, and time and memory grow with the square of the number of people.
         told = independent[:, 0, 0] * upright.sum(dim=-1)
         most = told.argsort(descending=True, stable=True)[: self.most_people].sort()[0]
 
@@ -298,22 +297,22 @@ class CameraCalibrator(nn.Module):
         return self._row(at[best, :4], torch.diagonal(covariance[best])[:4].sqrt(), count)
 
     def _expected(self, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """What is assumed beforehand of a camera with this picture, mean and deviation (4,), as the fit has it."""
+        """Prior mean and deviation (4,) of a camera with pictures of this size, in the parameters of the fit."""
         mean = _across(self.mean, height, width)
-        # The slope of the horizontal field of view by that along the longer side.
+        # Derivative of the horizontal field of view with respect to that along the longer side.
         slope = mean[3:].sin() / self.mean[3:].sin()
         return mean, torch.cat([self.deviation[:3], slope * self.deviation[3:]])
 
     def _looked_at(self, upright: Tensor, fps: float) -> tuple[Tensor, Tensor, int]:
-        """Frames to fit, of those in which somebody is upright and half a second about them.
+        """Frames to fit, out of those within half a second of a frame in which somebody is upright.
 
         Args:
             upright: (P, T) bool.
             fps: frames per second.
 
         Returns:
-            Indices (n,) of the frames in steps of at most a quarter of a second; which of these (n,) keep two windows
-            of a long film apart; and the step in frames.
+            Indices (n,) of the frames in steps of at most a quarter of a second; which of these (n,) only separate
+            two windows of a long film; and the step in frames.
         """
         about = int(0.5 * fps + 0.5)
         somebody = upright.any(dim=0).double()[None, None]
@@ -324,7 +323,7 @@ class CameraCalibrator(nn.Module):
         apart = torch.zeros_like(index, dtype=torch.bool)
         if index.shape[0] <= self.most_frames:
             return index, apart, every
-        # Of a long film windows of six seconds, the first of which only separates it from the window before.
+        # Windows of six seconds of a long film; the first second only separates each from the window before.
         length = min(int(6 * fps / every + 0.5), self.most_frames)
         windows = max(self.most_frames // length, 1)
         start = torch.linspace(0, index.shape[0] - length, windows, device=index.device).long()
@@ -338,7 +337,7 @@ class CameraCalibrator(nn.Module):
         return torch.cat([at[:2], height, at[3:], sd[:2], height * sd[2:3], sd[3:], count])
 
     def _independent(self, ends: Tensor, upright: Tensor, dt: float) -> Tensor:
-        """Independent observations per frame (P, 1, 1): one at the start, one for each :attr:`path` on the way.
+        """Independent observations per frame (P, 1, 1): one at the start, one for every :attr:`path` travelled.
 
         Args:
             ends: (P, T, 2, 2) pixels.

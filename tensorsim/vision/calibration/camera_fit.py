@@ -1,10 +1,11 @@
 """A still pinhole camera from upright bodies on a level floor: maximum a posteriori by Gauss-Newton.
 
-An upright body is a few points above each other at known heights (Lv, Zhao, Nevatia, "Camera calibration from video
-of a walking human", 2006, use feet and head). For a camera of given tilt, roll, height and field of view the spot
-on the floor that places them best in the image is linear least squares; what is left over tells the camera: sizes at
-several places the horizon, the lean of bodies beside the middle the nadir, both together the focal length. How broad
-trunks look tells nothing: people who walk past a camera turn them towards it, by up to 40 degrees.
+An upright body is modelled as a few points above each other at known heights (Lv, Zhao, Nevatia, "Camera calibration
+from video of a walking human", 2006, use feet and head). For a camera of given tilt, roll, height and field of view,
+the spot on the floor that best fits them to the image is a linear least-squares solution. The residuals determine the
+camera: sizes at several places give the horizon, the lean of bodies away from the middle the nadir, both together the
+focal length. The apparent width of trunks is not used: people who walk past a camera turn their trunks towards it, by
+up to 40 degrees.
 """
 
 import math
@@ -19,7 +20,7 @@ def camera_axes(pitch: Tensor, roll: Tensor) -> Tensor:
 
     Args:
         pitch: (...) radians, upward tilt of the optical axis.
-        roll: (...) radians about it, positive = clockwise as the camera sees it (people lean to its left).
+        roll: (...) radians about that axis, positive = clockwise as the camera sees it (people lean to its left).
     """
     zero, one = torch.zeros_like(pitch), torch.ones_like(pitch)
     forward = torch.stack([zero, torch.cos(pitch), torch.sin(pitch)], dim=-1)
@@ -40,7 +41,7 @@ def place_upright(
         focal: (...) in the unit of ``image``.
         image: (..., P, T, K, 2) points of bodies, from the principal point, v down.
         above_floor: (..., P, T, K) heights of the points above the floor, in the unit of ``height``.
-        beside: (..., P, T, K, 2) where the points are about the spot, right and ahead of it.
+        beside: (..., P, T, K, 2) offsets of the points from the spot, to its right and ahead of it.
 
     Returns:
         spots (..., P, T, 2) right of and in front of the camera, and the points there (..., P, T, K, 2).
@@ -87,8 +88,8 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
 
     Args:
         parameters: (..., 4 + 3 P): pitch, roll, logarithm of the height of the camera in m, horizontal field of view,
-            then for all people the logarithms of the factor on the body height and of the walking speed in m/s, and by
-            how many metres the shoulders are ahead of the ankles in a walk.
+            then, each for all people, the logarithm of the factor on the body height, that of the walking speed in
+            m/s, and by how many metres the shoulders are ahead of the ankles in a walk.
         bodies: what is seen.
         fps: frames per second.
 
@@ -105,7 +106,7 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     nowhere = torch.zeros_like(bodies.image)
     spot, _ = place_upright(axes, height, focal, bodies.image, above_floor, nowhere)
 
-    # Where people go, over one second: the first and last half second go as the frames beside them.
+    # Displacement over a window of one second; the first and last half second use the first and last window.
     span = max(min(int(fps + 0.5), frames - 1), 1)
     time = torch.arange(frames, device=spot.device)
     before = (time - span // 2).clamp(min=0, max=max(frames - 1 - span, 0))
@@ -114,7 +115,7 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     between = spot.index_select(-2, (before + after) // 2)
     way = end - start
     distance = torch.linalg.vector_norm(way, dim=-1)
-    # In two parts: whoever turns goes further than straight from start to end.
+    # In two parts: the path of a person who turns is longer than the straight line.
     path = torch.linalg.vector_norm(between - start, dim=-1) + torch.linalg.vector_norm(end - between, dim=-1)
     known = bodies.upright.index_select(-1, after) & bodies.upright.index_select(-1, before) & bodies.upright
     moves = bodies.walking * known.to(spot.dtype)
@@ -122,7 +123,7 @@ def misfit(parameters: Tensor, bodies: Bodies, fps: float) -> tuple[Tensor, Tens
     beside = torch.stack([torch.zeros_like(ahead), ahead], dim=-2)
     _, seen = place_upright(axes, height, focal, bodies.image, above_floor, beside)
 
-    # Whoever walks nobody knows where to leans nobody knows where to, by about twice the noise.
+    # A person walking in an unknown direction also leans in an unknown direction: up to twice the noise.
     lost = 1.0 + bodies.walking * (~known).to(spot.dtype)
     away = (seen - bodies.image) / (lost * bodies.noise)[..., None, None]
     away = torch.where(bodies.upright[..., None, None], away, 0.0).flatten(-2)
@@ -137,12 +138,12 @@ def residuals(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
 
 
 def jacobian(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
-    """Derivative (..., P, T, 5, 4 + 3 P) of :func:`residuals` by the parameters, by central differences."""
+    """Jacobian (..., P, T, 5, 4 + 3 P) of :func:`residuals` for the parameters, by central differences."""
     people, step = bodies.upright.shape[0], 1e-5
     columns: list[Tensor] = []
     each = torch.eye(people, dtype=parameters.dtype, device=parameters.device)[:, None, None, :]
     for i in range(4 + 3):
-        # One of the camera, or one of all people at once: each body depends on those of its own person only.
+        # One camera parameter, or one of all people at once: a body depends only on those of its own person.
         moved = torch.zeros(4 + 3 * people, dtype=parameters.dtype, device=parameters.device)
         if i < 4:
             moved[i] = step
@@ -155,7 +156,7 @@ def jacobian(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
 
 
 def robust(residual: Tensor, outlier: float) -> tuple[Tensor, Tensor]:
-    """Cauchy's loss (..., P, T, 2) of bodies and of speeds (..., P, T, 5), and the weights that it gives."""
+    """Cauchy loss (..., P, T, 2) of bodies and of speeds, from residuals (..., P, T, 5), and its weights."""
     squared = (
         torch.stack([residual[..., :4].square().sum(dim=-1), residual[..., 4].square()], dim=-1) / outlier**2
     )
@@ -176,16 +177,16 @@ def fit_camera(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt from several starts at once, with Cauchy's robust loss and normal priors.
 
-    Most starts come to the same end, so after a few steps only the best go on, until they hardly move.
+    Most starts converge to the same solution, so after a few steps only the best continue, until they hardly move.
 
     Args:
         start: (S, 4 + 3 P) parameters, see :func:`misfit`.
         mean, deviation: (4 + 3 P,) of the priors.
         bodies, fps: see :func:`misfit`.
         share: (P, 1, 1) how much each frame of a person counts; successive frames are not independent.
-        rounds: steps at most.
-        first_rounds: steps of all starts.
-        kept: how many of them, K, go on.
+        rounds: largest number of steps.
+        first_rounds: steps taken from all starts.
+        kept: K, how many starts continue after those.
         outlier: residual in standard deviations beyond which a body or a speed is doubted.
 
     Returns:
@@ -225,13 +226,13 @@ def fit_camera(
 def _cost(
     at: Tensor, residual: Tensor, mean: Tensor, deviation: Tensor, share: Tensor, outlier: float
 ) -> Tensor:
-    """Negative logarithm of the posterior (S,) but for a constant."""
+    """Negative log posterior (S,) up to a constant."""
     loss = (share * robust(residual, outlier)[0]).flatten(1).sum(dim=-1)
     return loss + 0.5 * ((at - mean) / deviation).square().sum(dim=-1)
 
 
 def _feasible(parameters: Tensor) -> Tensor:
-    """Cameras between 0.3 and 10 m above the floor with fields of view of 15 to 150 degrees, tilted below 80."""
+    """Cameras clamped to 0.3 to 10 m above the floor, fields of view of 15 to 150 degrees, pitch within 80."""
     low = [-1.4, -0.8, math.log(0.3), 0.26]
     high = [1.4, 0.8, math.log(10.0), 2.6]
     columns = [parameters[..., i : i + 1].clamp(low[i], high[i]) for i in range(4)]

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from tensorsim.errors import TensorsimWarning, check_positive
 
-#: Pictures are compared at this width at most, in pixels, and this many seconds apart.
+#: Pictures are compared at this width at most, in pixels, and at this interval in seconds.
 _WIDTH, _STEP_S = 320, 0.1
-#: Fewer corners than this, or fewer than half of them in one motion, tell nothing.
+#: With fewer corners than this, or a smaller share of them that agree on one motion, the motion is unclear.
 _LEAST_POINTS, _LEAST_SHARE = 12, 0.5
-#: Where the motion is not clear in more than this share of the pictures, nobody knows where the camera looks.
+#: If the motion is unclear in more than this share of the pictures, the camera's direction counts as unknown.
 _MOST_UNCLEAR = 0.1
 #: A camera moves if the background shifts by more than this share of the picture's width within a second.
 MOVING_SHARE = 0.02
@@ -23,10 +23,10 @@ MOVING_SHARE = 0.02
 class BackgroundMotion:
     """How far the background of a film shifts within a second, from pictures that are given one after the other.
 
-    Corners outside people's boxes are followed from picture to picture (pyramidal Lucas-Kanade, forth and back), and
-    one similarity (shift, turn, zoom) is fitted to them by RANSAC: things that move on their own are outliers. The
-    similarities of a second make one; its shift is the root mean square over the picture, so that turns and zooms
-    count as well. Pictures in which too few corners agree (a cut, a bare wall) are passed over.
+    Corners outside people's boxes are tracked from picture to picture (pyramidal Lucas-Kanade, forward and backward),
+    and one similarity (shift, turn, zoom) is fitted to them by RANSAC: things that move on their own are outliers. The
+    similarities of a second are composed; their shift is the root mean square over the picture, so that turns and
+    zooms count as well. Seconds with a picture in which too few corners agree (a cut, a bare wall) are skipped.
 
     Args:
         fps: frames per second of the film.
@@ -93,11 +93,11 @@ class BackgroundMotion:
             self.shift_px_s = max(shift, self.shift_px_s or 0.0)
 
     def steps(self) -> Tensor | None:
-        """How the background moves to each picture that was compared from the one before; None if that is not clear.
+        """How the background moves to each compared picture from the one before; None if that is unclear.
 
         Returns:
             (n, 4) float64 as :func:`~tensorsim.vision.calibration.stabilisation.camera_path` takes it, no motion where
-            too few corners agree. None if that is so in more than a tenth.
+            too few corners agree. None if that is so for more than a tenth of the steps.
         """
         unclear = sum(step is None for step in self._steps)
         if len(self._steps) == 0 or unclear > _MOST_UNCLEAR * len(self._steps):
@@ -119,7 +119,7 @@ class BackgroundMotion:
         return self.shift_px_s is not None and self.shift_px_s > MOVING_SHARE * self.width
 
     def warn(self, made_still: bool = False) -> None:
-        """Say it in a TensorsimWarning if the camera moves, and whether its turns and zooms are taken out."""
+        """Issue a TensorsimWarning if the camera moves; it says whether its turns and zooms are taken out."""
         if self.moves():
             effect = (
                 "its turns and zooms are taken out of the motion of people, but not where it is carried along"
@@ -137,7 +137,7 @@ class BackgroundMotion:
 def similarity_of(
     before: np.ndarray, background_before: np.ndarray, after: np.ndarray, background_after: np.ndarray
 ) -> np.ndarray | None:
-    """The similarity (3, 3) that takes the background of one picture to that of the next; None if it is not clear.
+    """The similarity (3, 3) that maps the background of one picture to that of the next; None if unclear.
 
     Args:
         before, after: (h, w) uint8 brightness.
@@ -149,7 +149,7 @@ def similarity_of(
     if corners is None or len(corners) < _LEAST_POINTS:
         return None
     how: Any = {"winSize": (15, 15), "maxLevel": 4}
-    no_guess: Any = None  # OpenCV's types know no flow without one
+    no_guess: Any = None  # OpenCV's type stubs do not allow None here
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, no_guess, **how)
     returned, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, no_guess, **how)
     good = (found[:, 0] == 1) & (found_back[:, 0] == 1)
@@ -167,7 +167,7 @@ def similarity_of(
 
 
 def _mean_shift(steps: list[np.ndarray], shape: tuple[int, ...]) -> float:
-    """Root mean square of how far four points inside a picture (h, w) are taken, in its pixels."""
+    """Root mean square displacement of four points inside a picture (h, w), in its pixels."""
     points = np.array([(x * shape[1], y * shape[0], 1.0) for x in (0.2, 0.8) for y in (0.2, 0.8)]).T
     moved = points
     for step in steps:

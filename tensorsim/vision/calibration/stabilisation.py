@@ -2,7 +2,7 @@
 
 A camera that turns about its optical centre, and zooms, maps the pixels of one picture to those of another by a
 homography ``K' R K^-1`` (Hartley and Zisserman, Multiple View Geometry, 8.4), whatever the depth of what it sees. A
-camera that moves along is taken for one that turns as much as the background does.
+camera that changes its place is treated as one that turns by as much as its background shifts.
 """
 
 import math
@@ -15,9 +15,10 @@ from torch import Tensor
 from tensorsim.types import Tracks
 from tensorsim.vision.smoothing.even_time import even_count
 
-#: A camera that turns by more than this from its mean direction is not made still: its pictures have no common plane.
+#: A camera that turns by more than this from its mean direction is not stabilised: its pictures share no image plane.
 MOST_TURN_RAD = math.radians(45)
-#: Nor where a corner of a picture has a smaller share of its depth along the mean direction: it would be far outside.
+#: Nor is one if a corner's depth along the mean direction is a smaller share than this of its depth in its own picture:
+#: it would land far outside.
 LEAST_DEPTH = 0.2
 #: Share of the picture's width and height at its left, right and lower edges where key points count as cut off.
 _BESIDE, _BELOW = 0.01, 0.03
@@ -31,7 +32,7 @@ class StillPicture(NamedTuple):
         keypoints: (1, P, T, 17, 2) pixels.
         scores: (1, P, T, 17); 0 where the film's own picture cuts a key point off.
         size: its height and width; its middle is where the middle of the film's picture is on average.
-        margin: (2,) pixels by which it is wider and higher than a picture of the film, left and above.
+        margin: (2,) pixels added to a picture of the film at the left and at the top (as many right and below).
         from_film: (T, 3, 3) homographies from homogeneous pixels of each frame to a still picture of the film's size.
     """
 
@@ -47,8 +48,8 @@ def camera_path(steps: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     """Where a camera looks in each frame.
 
     Args:
-        steps: (T, 4) how the background moves from the last frame to each one: right and down in pixels at the middle
-            of the picture, turn in radians (clockwise), logarithm of the zoom. The first row is not used.
+        steps: (T, 4) how the background moves from the previous frame to each one: right and down in pixels at the
+            middle of the picture, turn in radians (clockwise), logarithm of the zoom. The first row is not used.
         focal: focal length of the first frame in pixels.
 
     Returns:
@@ -73,7 +74,7 @@ def camera_path(steps: Tensor, focal: float) -> tuple[Tensor, Tensor]:
 
 
 def homographies(steps: Tensor, focal: float, size: tuple[int, int]) -> Tensor | None:
-    """Homographies (T, 3, 3) of :attr:`StillPicture.from_film`; None where the camera turns too far for its view.
+    """Homographies (T, 3, 3) of :attr:`StillPicture.from_film`; None if the camera turns too far for its view.
 
     Args:
         steps: see :func:`camera_path`.
@@ -102,7 +103,7 @@ def _corners(size: tuple[int, int]) -> Tensor:
 
 
 def _projected(points: Tensor, through: Tensor) -> Tensor:
-    """Points (..., T, N, 2) in pixels to homogeneous ones (..., T, N, 3) through homographies (T, 3, 3)."""
+    """Map points (..., T, N, 2) in pixels by homographies (T, 3, 3) to homogeneous ones (..., T, N, 3)."""
     whole = torch.cat([points.double(), torch.ones_like(points[..., :1]).double()], dim=-1)
     return whole @ through.to(points.device).mT
 
@@ -115,7 +116,7 @@ def _intrinsics(focals: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def at_even_times(steps: Tensor, times_s: Tensor, fps: float) -> Tensor:
-    """Steps (T, 4) of frames at times (T,), see :func:`camera_path`, at ``k / fps`` from the first to the last."""
+    """Steps (T, 4) of frames at times (T,), see :func:`camera_path`, resampled to times ``k / fps``."""
     since = (times_s - times_s[0]).double().numpy()
     even = np.arange(int(even_count(times_s[-1] - times_s[0], fps))) / fps
     way = steps.double().cumsum(dim=0).numpy()
@@ -124,13 +125,13 @@ def at_even_times(steps: Tensor, times_s: Tensor, fps: float) -> Tensor:
 
 
 def mapped(points: Tensor, through: Tensor) -> Tensor:
-    """Points (..., T, N, 2) in pixels through homographies (T, 3, 3), in float64 on the device of the points."""
+    """Map points (..., T, N, 2) in pixels by homographies (T, 3, 3), in float64 on the device of the points."""
     whole = _projected(points, through)
     return whole[..., :2] / whole[..., 2:]
 
 
 def _margin(size: tuple[int, int], through: Tensor) -> tuple[int, int]:
-    """Pixels to add left and above, and as many right and below, to a picture so that it holds all of a film."""
+    """Pixels to add at the left and top, and as many at the right and bottom, to hold all pictures of a film."""
     corners = mapped(_corners(size), through)
     outside = torch.cat([corners.amax(dim=(0, 1)), -corners.amin(dim=(0, 1))])
     beyond = outside - torch.tensor([size[1] - 0.5, size[0] - 0.5, 0.5, 0.5])
@@ -155,8 +156,8 @@ def still_picture(
         focal: mean focal length in pixels.
 
     Returns:
-        None where the camera turns by more than :data:`MOST_TURN_RAD` from its mean direction, or by so much that a
-        corner of a picture has less than :data:`LEAST_DEPTH`.
+        None if the camera turns by more than :data:`MOST_TURN_RAD` from its mean direction, or so far that a corner
+        of a picture has a depth below :data:`LEAST_DEPTH`.
     """
     through = homographies(steps, focal, size)
     if through is None:
@@ -169,7 +170,7 @@ def still_picture(
     cut_off = (keypoints[..., 0] < _BESIDE * width) | (keypoints[..., 0] > (1 - _BESIDE) * width)
     cut_off = cut_off | (keypoints[..., 1] > (1 - _BELOW) * height)
     boxes = tracks.boxes
-    # A box of the same shape about where its middle is.
+    # A box of the same shape about its mapped middle.
     middle = (boxes[..., :2] + boxes[..., 2:])[..., None, :] / 2
     ends = torch.cat([middle, middle + torch.tensor([1.0, 0.0]).to(middle)], dim=-2)
     at, by_one = mapped(ends, through).unbind(-2)

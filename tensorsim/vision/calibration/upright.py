@@ -8,19 +8,20 @@ from torch import Tensor
 from tensorsim.body.skeleton import coco_to_body
 from tensorsim.vision.smoothing.along_time import fill_gaps, local_linear
 
-#: Heights of the ankles' and the shoulders' middle over the standing height: of somebody who stands, and the mean over
-#: a walk, in which a foot is lifted and the knees are bent (generated and captured walks agree within 0.01).
+#: Heights of the middle of the ankles and of the shoulders, as shares of the standing height: of a standing person, and
+#: the mean over a walk, in which a foot is lifted and the knees are bent (generated and captured walks agree within
+#: 0.01).
 STANDING = (0.039, 0.818)
 WALKING = (0.075, 0.798)
-#: How far the shoulders are ahead of the ankles in a walk over the standing height (0.01 to 0.06), and its standard
-#: deviation.
+#: How far the shoulders are ahead of the ankles in a walk, as a share of the standing height (0.01 to 0.06), and its
+#: standard deviation.
 LEAN, LEAN_SPREAD = 0.035, 0.02
 #: Walking speed in standing heights per second, and the standard deviation of its logarithm.
 PACE, PACE_SPREAD = 0.7, 0.2
-#: Walking speed in standing heights per second over the square of the cycles per second, and the standard deviation of
-#: its logarithm: steps lengthen in proportion to their rate (Sekiya and Nagasaki, "Reproducibility of the walking
-#: patterns of normal young adults", 1998, 0.0065 m per step and minute; Boulic's gait 0.89, captured walks 0.82 to
-#: 0.95; the deviation is wider than theirs, as habits of walking differ more than in these few people).
+#: Walking speed in standing heights per second, divided by the square of the cycles per second, and the standard
+#: deviation of its logarithm: steps lengthen in proportion to their rate (Sekiya and Nagasaki, "Reproducibility of the
+#: walking patterns of normal young adults", 1998, 0.0065 m per step and minute; Boulic's gait 0.89, captured walks 0.82
+#: to 0.95; the deviation is wider than theirs, as walking habits vary more than among these few people).
 WALK_RATIO, WALK_RATIO_SPREAD = 0.9, 0.08
 
 
@@ -34,8 +35,8 @@ def is_upright(keypoints: Tensor, scores: Tensor, threshold: float) -> Tensor:
     """Whether ankles, knees, hips and shoulders are seen and lie as in an upright body.
 
     Trunk and legs point down within 45 degrees and agree within 30, no leg is bent so far that its bones are 35 %
-    longer than from hip to ankle, and the trunk is 0.4 to 1.1 times as long as the legs (0.6 for a camera at the
-    height of the body; it looks longer from above).
+    longer than the line from hip to ankle, and the trunk is 0.4 to 1.1 times as long as the legs (0.6 for a camera at
+    the height of the body; it looks longer from above).
 
     Args:
         keypoints: (..., 17, 2) COCO key points, v down.
@@ -65,9 +66,9 @@ def is_upright(keypoints: Tensor, scores: Tensor, threshold: float) -> Tensor:
 
 
 def steadily(upright: Tensor, valid: Tensor, fps: float, share: float = 0.8) -> Tensor:
-    """Frames (..., T) bool in which a body is upright, as it is in most valid frames within 0.4 s.
+    """Frames (..., T) bool in which a body is upright, as in at least ``share`` of the valid ones within 0.4 s.
 
-    Somebody who sits looks upright in a frame here and there.
+    A sitting person looks upright in a frame here and there.
     """
     radius = int(0.4 * fps)
     ones = torch.ones(1, 1, 2 * radius + 1, dtype=torch.float64, device=upright.device)
@@ -78,10 +79,10 @@ def steadily(upright: Tensor, valid: Tensor, fps: float, share: float = 0.8) -> 
 
 
 def still_beside_others(ends: Tensor, valid: Tensor, least: float = 0.04) -> Tensor:
-    """Which people never move while others do: things, or pictures of people, that look like a person.
+    """Which people never move while others do: objects, or pictures of people, taken for a person.
 
-    Ankles and shoulders of a body stay within ``least`` of its size in the image about one place in nine of ten frames.
-    Where nobody moves more than that, nobody is said to be still.
+    Their ankles and shoulders stay within ``least`` of their size in the image of one place in nine of ten frames.
+    If nobody moves more than that, nobody counts as still.
 
     Args:
         ends: (P, T, 2, 2) pixels, see :func:`ends_of_body`.
@@ -102,7 +103,7 @@ def still_beside_others(ends: Tensor, valid: Tensor, least: float = 0.04) -> Ten
 
 
 def ankles_apart(keypoints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Neck (..., 2) and size (...) of bodies in pixels, and the way (..., 2) from right to left ankle in such sizes."""
+    """Neck (..., 2) and size (...) of bodies in pixels, and the vector (..., 2) from right to left ankle in sizes."""
     neck = (keypoints[..., 5, :] + keypoints[..., 6, :]) / 2
     ankles = (keypoints[..., 15, :] + keypoints[..., 16, :]) / 2
     size = torch.linalg.vector_norm(neck - ankles, dim=-1).clamp(min=1.0)
@@ -110,11 +111,11 @@ def ankles_apart(keypoints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
-    """How much people walk: 0 standing to 1 walking, from how the ankles move against each other within a second.
+    """How much people walk: 0 standing to 1 walking, from how the ankles move relative to each other in a second.
 
-    Whoever stays in place, as in a fight, does not walk: within the second the neck moves by less than 0.2 of the
-    body's size in the image, and that size changes by less than 5 %. Of somebody who walks straight away from the
-    camera, or towards it, the ankles hardly move against each other: little more than errors of key points do counts.
+    A person who stays in place, as in a fight, does not walk: within the second the neck moves by less than 0.2 of the
+    body's size in the image, and that size changes by less than 5 %. If somebody walks straight away from the camera,
+    or towards it, the ankles hardly move relative to each other, so little more than key-point errors already counts.
 
     Args:
         keypoints: (..., T, 17, 2).
@@ -143,7 +144,7 @@ def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
     way = neck.index_select(-2, after) - neck.index_select(-2, before)
     growth = (size.index_select(-1, after) / size.index_select(-1, before)).log().abs()
     goes = (torch.linalg.vector_norm(way, dim=-1) > 0.2 * size) | (growth > 0.05)
-    # In the half second beside a gap or an end of the film people go on as they did or will do.
+    # Within half a second of a gap or an end of the film the nearest frame with a full second decides.
     known = inside & upright & upright.index_select(-1, after) & upright.index_select(-1, before)
     goes = fill_gaps(goes.to(size.dtype), known) * (upright & known.any(dim=-1, keepdim=True)).to(size.dtype)
     return ((spread.clamp(min=0.0).sqrt() - 0.03) / 0.02).clamp(0.0, 1.0) * goes
@@ -152,23 +153,23 @@ def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
 def cadence(
     keypoints: Tensor, walking: Tensor, fps: float, least_hz: float = 0.5, most_hz: float = 1.3
 ) -> tuple[Tensor, Tensor]:
-    """Cycles of two steps per second, from how far the ankles are apart in the picture.
+    """Gait cycles (of two steps each) per second, from how far the ankles are apart in the picture.
 
-    That distance, squared, has two periods a cycle, whichever ankle is ahead: networks confuse left and right, and
-    people that turn round swap them. The cadence is the peak of its periodogram.
+    That distance, squared, has two periods per cycle, whichever ankle is ahead: networks confuse left and right, and
+    people who turn round swap them. The cadence is the peak of its periodogram.
 
     Args:
         keypoints: (..., T, 17, 2).
         walking: (..., T) in [0, 1], see :func:`walking_share`.
         fps: frames per second.
-        least_hz, most_hz: the band in which the peak is looked for.
+        least_hz, most_hz: the band that is searched for the peak.
 
     Returns:
-        Hertz (...), and the share (...) of the power in [0, 1] that a sinusoid of this frequency takes: 0 where nobody
-        walks for a second, or the peak is at an end of the band.
+        Hertz (...), and the share (...) of the power in [0, 1] that a sinusoid of this frequency explains: 0 if the
+        person walks for less than a second, or the peak is at an end of the band.
     """
     _, _, apart = ankles_apart(keypoints)
-    # What changes in a second and more, such as the heading, is not of the steps.
+    # Changes over a second or more, such as of the heading, do not come from the steps.
     slow = torch.stack([local_linear(apart[..., axis], walking, 0.5 * fps) for axis in range(2)], dim=-1)
     squared = (apart - slow).square().sum(dim=-1)
     steps = walking * (squared - local_linear(squared, walking, 0.5 * fps))
@@ -176,7 +177,7 @@ def cadence(
     hertz = torch.linspace(least_hz, most_hz, 161, dtype=steps.dtype, device=steps.device)
     power = torch.zeros_like(steps[..., :1] * hertz)
     total = torch.zeros_like(steps[..., 0])
-    # In windows of a second's standard deviation: after a pause the steps go on in another phase.
+    # In windows with a standard deviation of one second: after a pause the steps resume with another phase.
     for middle_s in range(math.ceil(frames / fps)):
         first, last = max(int((middle_s - 5) * fps), 0), min(int((middle_s + 5) * fps) + 1, frames)
         time = torch.arange(first, last, dtype=steps.dtype, device=steps.device) / fps - middle_s

@@ -43,7 +43,7 @@ def fill_gaps(x: Tensor, valid: Tensor) -> Tensor:
 
 
 def where_any(preferred: Tensor, fallback: Tensor) -> Tensor:
-    """``preferred`` (..., T) bool of tracks that have such a frame, ``fallback`` (..., T) of the others."""
+    """``preferred`` (..., T) bool for tracks in which it has any frame, ``fallback`` (..., T) for the others."""
     return torch.where(preferred.any(dim=-1, keepdim=True), preferred, fallback)
 
 
@@ -71,7 +71,7 @@ def crossed_within(position: Tensor, seen: Tensor, step: float) -> Tensor:
 
 
 def gaps_with(event: Tensor, seen: Tensor) -> Tensor:
-    """Frames (..., T) between two seen ones between which there is an ``event`` (..., T) bool in a frame not seen."""
+    """Unseen frames (..., T) of gaps between two seen ones in which an ``event`` (..., T) bool happens."""
     before, after = seen_beside(seen)
     last = seen.shape[-1] - 1
     inside = (before >= 0) & (after <= last) & ~seen
@@ -80,7 +80,7 @@ def gaps_with(event: Tensor, seen: Tensor) -> Tensor:
 
 
 def seen_beside(seen: Tensor) -> tuple[Tensor, Tensor]:
-    """The last seen frame up to each one and the first from it on (..., T): -T and 2 T where there is none."""
+    """For each frame, the last seen one up to it and the first from it on (..., T); -T and 2 T if there is none."""
     frames = seen.shape[-1]
     time = torch.arange(frames, device=seen.device).expand(seen.shape)
     never = torch.full_like(time, -frames)
@@ -99,7 +99,7 @@ def _kernel(sigma: float, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
 def _convolved(rows: Tensor, kernels: Tensor, most: int = 2**23) -> Tensor:
     """``F.conv1d`` of rows (R, 1, T) with odd kernels (C, 1, K), zero beyond the ends: (R, C, T).
 
-    Torch copies K values for every one in double precision; pieces of the rows have ``most`` copies at a time.
+    In double precision, torch makes K copies of every value; the rows are cut into pieces with ``most`` copies each.
     """
     frames, radius = rows.shape[-1], kernels.shape[-1] // 2
     if is_exporting() or rows.numel() * kernels.shape[-1] <= most:
@@ -147,9 +147,9 @@ def local_linear(x: Tensor, weights: Tensor, sigma: float, ridge: Tensor | None 
 
 
 def ridge_in_gaps(weights: Tensor, sigma: float) -> Tensor:
-    """Ridge (..., T) of :func:`local_linear` where less than half of the weight is there that all 1 would give.
+    """Ridge (..., T) for :func:`local_linear` where there is less than half the weight that all 1 would give.
 
-    A line does not go on through a long gap: with a hundredth of the weight it loses a tenth of its slope.
+    So lines do not continue through a long gap: with a hundredth of the weight they lose a tenth of their slope.
 
     Args:
         weights: (..., T) > 0.
@@ -188,7 +188,7 @@ def robust_smooth(
         (..., T), continued over invalid frames. Differentiable.
     """
     x = fill_gaps(x, valid)
-    # Filled gaps have a small weight, for gaps longer than the kernel.
+    # Filled values get a small weight, in case a gap is longer than the kernel.
     base = valid.to(x.dtype)
     unit = torch.ones_like(x)
     if precision is not None:
@@ -213,7 +213,7 @@ def running_quantile(x: Tensor, window: int, quantile: float) -> Tensor:
         quantile: 0 is the running minimum, 1 the maximum.
 
     Returns:
-        (..., T). Differentiable where it takes a value.
+        (..., T). The gradient goes to the value that is taken.
     """
     half = min(window // 2, x.shape[-1] - 1)
     padded = F.pad(x, [half, half], value=float("inf"))

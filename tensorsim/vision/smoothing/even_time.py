@@ -8,7 +8,7 @@ from tensorsim.types import Tracks
 
 
 def even_count(duration_s: Tensor, fps: float) -> Tensor:
-    """How many times ``k / fps`` there are from 0 to durations (...) in seconds, up to rounding: (...) int64."""
+    """Number of times ``k / fps`` from 0 to durations (...) in seconds, allowing for rounding: (...) int64."""
     return torch.floor(duration_s.double() * fps + 1e-3).long() + 1
 
 
@@ -17,21 +17,21 @@ def to_even_time(
 ) -> tuple[Tracks, Tensor, Tensor]:
     """Interpolate boxes and key points linearly in time, from the times of the frames to ``k / fps``.
 
-    Between two frames somebody is there if they are there in both, and a key point has the lower of its two scores.
-    At the time of a frame its values stay. During a pause, in which the film shows one frame for long, people move
-    evenly to where the next frame has them.
+    Between two frames a person is valid if valid in both, and a key point has the lower of its two scores. At the time
+    of a frame its values are kept. During a pause, in which the film shows one frame for a long time, people move
+    evenly to where they are in the next frame.
 
     Args:
         tracks: boxes (B, P, T, 4), validity and matches (B, P, T).
         keypoints: (B, P, T, 17, 2) pixels.
         scores: (B, P, T, 17).
-        times_s: (B, T) seconds, increasing; only differences count. Clips that are padded go on increasing.
+        times_s: (B, T) seconds, increasing, also in the padding of a clip; only differences count.
         fps: frames per second of the result.
 
     Returns:
         Tracks, key points and scores at the ``T' = floor(duration * fps) + 1`` even times of the longest clip, the
-        first of which is that of the first frame. After the last frame of its clip nobody is valid. Differentiable by
-        boxes, key points and scores.
+        first of which is that of the first frame. After the last frame of a clip nobody is valid. Differentiable with
+        respect to boxes, key points and scores.
 
     Raises:
         TensorsimError: times of another shape, not finite or not increasing, fewer than 2 frames, fps not positive.
@@ -70,7 +70,7 @@ def _at(x: Tensor, frame: Tensor) -> Tensor:
 
 
 def _like(share: Tensor, x: Tensor) -> Tensor:
-    """Shares (B, T') shaped to go with (B, P, T, ...)."""
+    """Shares (B, T') reshaped to broadcast with (B, P, T', ...)."""
     return share.view([share.shape[0], 1, share.shape[1]] + [1] * (x.dim() - 3))
 
 
@@ -79,6 +79,6 @@ def _linear(x: Tensor, after: Tensor, share: Tensor) -> Tensor:
 
 
 def _both(x: Tensor, after: Tensor, share: Tensor) -> Tensor:
-    """The lower value of the two frames, or that of the frame whose time it is."""
+    """The lower value of the two frames, or at the time of a frame its own value."""
     first, second, at = _at(x, after - 1), _at(x, after), _like(share, x)
     return torch.where(at == 0.0, first, torch.where(at == 1.0, second, torch.minimum(first, second)))

@@ -133,9 +133,9 @@ def smooth_constant_velocity(
 
     Args:
         measured: (..., T, D) positions; ignored where not valid.
-        valid: (..., T) bool, the measured frames. Others are predicted; a point never measured is zeros.
-        process_noise: density q of the acceleration noise, unit^2 / time^3, that leads up to a frame; broadcast
-            to (..., T, D) or (..., T, 1), as the next.
+        valid: (..., T) bool, the measured frames. Others are predicted; a point never measured is all zeros.
+        process_noise: density q of the acceleration noise, unit^2 / time^3, that leads up to a frame; like
+            ``measurement_noise``, it broadcasts to (..., T, D) or (..., T, 1).
         measurement_noise: variance r of a measured coordinate, unit^2.
         initial_speed: prior standard deviation of the velocity, unit / time.
         dt: time between frames.
@@ -153,7 +153,7 @@ def smooth_constant_velocity(
     r = measurement_noise.to(torch.float64) * torch.ones_like(seen)
     first = valid.to(torch.uint8).argmax(-1, keepdim=True).unsqueeze(-1)
     x = z.take_along_dim(first, dim=-2).squeeze(-2)
-    p00 = 1e4 * r[..., 0, :] + torch.zeros_like(q[..., 0, :])  # wide: the first measurement stands
+    p00 = 1e4 * r[..., 0, :] + torch.zeros_like(q[..., 0, :])  # wide: the first measurement dominates
     state = KalmanState(
         x, torch.zeros_like(x), p00, torch.zeros_like(p00), torch.full_like(p00, initial_speed**2)
     )
@@ -180,30 +180,30 @@ def smooth_constant_velocity(
 class KalmanSmoother(nn.Module):
     """Smooths joints along time, each on its own, with the constant-velocity model; missing joints are predicted.
 
-    Input ``joints`` (..., T, J, 3) in metres, ``valid`` (..., T, J) bool (None: all measured), ``fps`` and, where
-    something is known of the errors, ``noise_std_m``, their standard deviation in metres, (..., T, J, 3) or (..., T,
-    J, 1); output (..., T, J, 3) in the dtype of the input, finite everywhere. Differentiable by ``joints`` (with
+    Input ``joints`` (..., T, J, 3) in metres, ``valid`` (..., T, J) bool (None: all measured), ``fps`` and, if the
+    size of the errors is known, ``noise_std_m``, their standard deviation in metres, (..., T, J, 3) or (..., T, J, 1);
+    output (..., T, J, 3) in the dtype of the input, finite everywhere. Differentiable with respect to ``joints`` (with
     zero gradient where not valid); float32 input is computed in float64 and cast back.
 
-    By default both noises are estimated from the joints, so that exact ones pass and noisy ones are smoothed:
+    By default both noises are estimated from the joints, so that exact joints pass through and noisy ones are smoothed:
 
     - measurement noise, per joint and coordinate, from its sixth differences
       (:func:`~tensorsim.vision.smoothing.noise.jitter`, whose variance counts 1.5 times, as errors are rarely white),
-      but at least 0.5 mm and at least ``noise_std_m``. That is the place of slow errors, which look like motion, and of
-      depths, see :func:`~tensorsim.vision.smoothing.noise.noise_with_depth`;
+      but at least 0.5 mm and at least ``noise_std_m``. Use that for slow errors, which look like motion, and for those
+      of depths, see :func:`~tensorsim.vision.smoothing.noise.noise_with_depth`;
     - process noise, per joint and frame, from its second differences over 0.13 s
       (:func:`~tensorsim.vision.smoothing.noise.acceleration_density`), at least 0.3 m^2/s^3: a body that stands
       still has about that, a wrist that punches a thousand times as much.
 
-    With exact joints the gain is above 0.9 up to 5 Hz at 30 fps. Given noises hold for all joints and frames; then
-    "rts" is a zero-phase low-pass away from the ends, with the gain ``q / (q + r dt w^4)`` to first order. They are
-    stated per frame at 30 fps, as in the original's panel, so that the bandwidth in Hz hardly depends on the frame
+    With exact joints the gain is above 0.9 up to 5 Hz at 30 fps. Noises that are given apply to all joints and frames;
+    then "rts" is a zero-phase low-pass away from the ends, with the gain ``q / (q + r dt w^4)`` to first order. They
+    are stated per frame at 30 fps, as in the original's panel, so that the bandwidth in Hz hardly depends on the frame
     rate: the acceleration density is ``q = process_noise * 30**3`` m^2/s^3, and ``dt = 1 / fps``. The panel's 0.001
     and 0.01 have -3 dB at 2.15 Hz and -6 dB at 2.7 Hz at 30 fps.
 
     Missing frames between measured ones are bridged. Frames before the first are extrapolated backwards by
-    "rts", the speed fading into its prior, and hold the first measurement under "forward"; frames after the
-    last continue at the last velocity. A joint never measured is zeros.
+    "rts", the speed fading into its prior, and hold the first measurement with "forward"; frames after the
+    last continue at the last velocity. A joint never measured is all zeros.
 
     Args:
         process_noise: m^2 per frame^3 at 30 fps; None estimates it.
@@ -288,7 +288,7 @@ class KalmanSmoother(nn.Module):
             return torch.full([1], given, dtype=torch.float64, device=tracks.device)
         points = torch.where(valid.unsqueeze(-1), tracks, 0.0).to(torch.float64)
         deviation = jitter(points, valid)
-        # A joint that is never seen long enough is as noisy as the noisiest of the body.
+        # A joint that is never seen for long enough is taken to be as noisy as the noisiest one of the body.
         deviation = torch.where(deviation > 0, deviation, deviation.amax(dim=-2, keepdim=True))
         r = self.jitter_factor * deviation.square().unsqueeze(-2) + self.least_noise_m2
         if noise_std_m is not None:

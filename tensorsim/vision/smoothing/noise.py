@@ -1,7 +1,7 @@
 """Noise of tracks, estimated from the tracks themselves: of the measurement and of the motion.
 
-Both estimates compare differences along time over a short and a long span: measurement noise is alike in all of
-them, motion grows with the span.
+The estimates use differences along time over a short and a long span: measurement noise is the same in both, while
+motion grows with the span.
 """
 
 import math
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tensorsim.vision.smoothing.along_time import masked_median
 
-#: Share of the spread of depths that the smoother takes for noise. All of it lowers the peaks of punches by a fifth.
+#: Share of the spread of depths that the smoother treats as noise. All of it would lower peaks of punches by a fifth.
 DEPTH_NOISE = 0.25
 
 
@@ -53,9 +53,9 @@ def acceleration_density(
         valid: (..., T) bool.
         noise: (..., T, D) variance of a measured coordinate, m^2.
         fps: frames per second.
-        span_s: m in seconds. Long spans resolve slow motion in noise; what repeats after half a span is missed.
+        span_s: m in seconds. Long spans resolve slow motion in noise; motion that repeats after a span is missed.
         window_s: standard deviation of the window.
-        least: smallest result; it also counts as one more frame of every window, so it is that of a long gap.
+        least: smallest result; it also counts as one more frame of every window, so a long gap has this density.
 
     Returns:
         (..., T, 1) m^2/s^3. Differentiable.
@@ -106,9 +106,9 @@ def noise_with_depth(
 ) -> Tensor:
     """Standard deviation of joints along world axes whose depth is less certain than their place in the picture.
 
-    Errors of depth move a joint along its line of sight. They are alike in neighbouring frames, which no filter
-    removes, so that only a ``share`` of the spread counts as noise. Only the diagonal of the covariance is
-    kept, as the smoother takes coordinates for independent.
+    Errors of depth move a joint along its line of sight. They are similar in neighbouring frames, so no filter
+    removes them, and only a ``share`` of the spread counts as noise. Only the diagonal of the covariance is
+    kept, as the smoother treats coordinates as independent.
 
     Args:
         noise: (..., J, 1) metres, across the line of sight, of :func:`keypoint_noise`.

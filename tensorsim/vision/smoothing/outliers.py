@@ -1,4 +1,4 @@
-"""Joints that jump: positions that no body reaches are taken out before smoothing, and speeds limited after it."""
+"""Joints that jump: positions that no body can reach are removed before smoothing, and speeds limited after it."""
 
 import torch
 from torch import Tensor
@@ -13,14 +13,14 @@ def reachable_chain(
     ``reach_s`` the point may be anywhere.
 
     Args:
-        positions: (N, T, 3) metres; those of frames that are not valid do not count.
+        positions: (N, T, 3) metres; ignored in frames that are not valid.
         valid: (N, T) bool.
         fps: frames per second.
         top_speed: m/s.
         reach_s: seconds that a chain looks back.
 
     Returns:
-        (N, T) bool, true in frames of the chain, a subset of ``valid``. Of equal chains the one that ends first.
+        (N, T) bool, true in frames of the chain, a subset of ``valid``. Of equally long chains the one that ends first.
     """
     points, frames = positions.shape[0], positions.shape[1]
     window = max(int(reach_s * fps), 1)
@@ -28,7 +28,7 @@ def reachable_chain(
         points, frames + 1, device=positions.device
     )  # links of the best chain that ends at a frame
     before = torch.full((points, frames + 1), frames, dtype=torch.int64, device=positions.device)
-    # The best chain that ended too long ago to matter; the last column stands for no chain at all.
+    # The best chain that ended too long ago for its position to matter; the last column stands for no chain at all.
     old_count = torch.zeros(points, device=positions.device)
     old = torch.full((points,), frames, dtype=torch.int64, device=positions.device)
     for t in range(frames):
@@ -58,7 +58,7 @@ def reachable_chain(
 
 
 def without_jumps(joints: Tensor, valid: Tensor, fps: float, top_speed: float) -> Tensor:
-    """Which joints to believe, (..., T, J) bool: see :func:`reachable_chain`, joint by joint.
+    """Which joints to trust, (..., T, J) bool: :func:`reachable_chain` for each joint.
 
     Args:
         joints: (..., T, J, 3) metres.

@@ -1,7 +1,7 @@
 """Left and right of people over time: limbs that a network exchanges for some frames are exchanged back.
 
-Networks confuse the sides of people seen from behind or from the side, for single frames or for long. What they
-exchange jumps: the vector from the right to the left ankle turns round from one frame to the next.
+Networks confuse the sides of people seen from behind or from the side, for single frames or for longer. Exchanged
+limbs jump: the vector from the right to the left ankle turns round from one frame to the next.
 """
 
 import torch
@@ -30,7 +30,7 @@ def viterbi_two_states(stay: Tensor, change: Tensor, second: float) -> Tensor:
         same, different = stay[:, t : t + 1], change[:, t : t + 1]
         a, b = usual + same, other + different
         c, d = usual + different, other + same
-        from_usual.append(b < a)  # whether the best way to the usual state comes from the other one
+        from_usual.append(b < a)  # whether the cheapest path to the usual state comes from the other one
         from_other.append(d <= c)
         usual, other = torch.minimum(a, b), torch.minimum(c, d) + second
     at = other < usual
@@ -46,19 +46,19 @@ class SteadySides(nn.Module):
     """Exchanges left and right key points where that makes limbs move steadily.
 
     Arms (with the shoulders) and legs (with the hips) are two chains of two states, as found or exchanged. From one
-    frame to the next each pair of points, left and right, costs the squared change of the vector between them in
-    sizes of the person, times the lower one of its scores. A change of state costs ``change``: the ankles of a walk
-    seen from the side, which pass each other in a few frames, cost less. The path of least cost is taken (Viterbi, IEEE
-    Trans. Inf. Theory 13, 1967). Each exchanged frame costs a little, so that the sides found most of the time stay.
+    frame to the next each pair of points, left and right, costs the squared change of the vector between them, in
+    sizes of the person, times the lowest of its scores. A change of state costs ``change``: the ankles of a walk seen
+    from the side, which pass each other in a few frames, cost less. The path of least cost is taken (Viterbi, IEEE
+    Trans. Inf. Theory 13, 1967). Each exchanged frame costs a little, so the sides found most of the time are kept.
 
     Args:
         change: squared sizes of the person at 30 frames per second; twice that at 15 and below.
-        exchanged: cost of an exchanged frame at up to 30 frames per second; per second it is the same above.
+        exchanged: cost of an exchanged frame at up to 30 frames per second; above, the cost per second is constant.
         threshold: score from which a point counts.
 
     Shapes:
         COCO key points (..., T, 17, 2) pixels, scores (..., T, 17), valid (..., T) bool, frames per second -> key
-        points and scores. Differentiable; which are exchanged is not.
+        points and scores. Differentiable, except for the choice of those to exchange.
 
     Raises:
         TensorsimError: costs that are not positive, wrong shapes, NaN.
