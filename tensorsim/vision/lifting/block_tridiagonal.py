@@ -1,4 +1,4 @@
-"""Linear systems along time: frames that are tied to their neighbours only."""
+"""Linear systems along time in which frames are coupled only to their neighbours."""
 
 import torch
 from torch import Tensor

@@ -1,12 +1,12 @@
 """Which end of each bone is nearer to the camera.
 
-If one joint of a bone of known length is known, one camera leaves two positions for the other: in front of the plane
-parallel to the image and behind it (C. J. Taylor, "Reconstruction of articulated objects from point
+If one joint of a bone of known length is known, a single view leaves two positions for the other: in front of the
+plane parallel to the image and behind it (C. J. Taylor, "Reconstruction of articulated objects from point
 correspondences in a single uncalibrated image", 2000). A body of twelve bones has 4096 poses in every frame with the
-same projection. Over time most of them have large accelerations: where a bone is parallel to the image both positions
-coincide, and the smoothest sequence continues on the other side. Sequences are found by exact dynamic programming over
-pairs of frames, first for the four signs of the trunk (hips, spine, shoulders, head) and then, given it, for the two
-of each arm and leg.
+same projection. Over time most sequences of them have large accelerations: where a bone is parallel to the image both
+positions coincide, and the smoothest sequence continues on the other side. Sequences are found by exact dynamic
+programming over pairs of frames, first for the four signs of the trunk (hips, spine, shoulders, head) and then, given
+the trunk, for the two of each arm and leg.
 """
 
 import torch
@@ -46,7 +46,7 @@ def smoothest_sequence(places: Tensor, cost: Tensor, weight: float) -> Tensor:
 def reach(line: Tensor, start: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
     """Where a line of sight is at a given distance from a point: at ``middle - half`` and ``middle + half``.
 
-    Where it stays further away, both are its nearest point.
+    If the line stays further away than that, both are its nearest point.
 
     Args:
         line: (..., 3) direction, not necessarily of unit length.
@@ -85,7 +85,7 @@ def unlikely(
     Args:
         places, expected: distances along lines of sight.
         trust, spread_m: weight and deviation of expected ones, under Cauchy's loss.
-        height: (N, T, J, 2) of joints over where they rest: at distance 0, and its increase per metre.
+        height: (N, T, J, 2) of joints above where they rest on the floor: at distance 0, and the increase per metre.
         floor_m: deviation of joints below it.
     """
     cost = trust * torch.log1p(((places - expected[:, :, None]) / spread_m).square())

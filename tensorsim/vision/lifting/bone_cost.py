@@ -1,13 +1,13 @@
 """The cost of distances along lines of sight for a body whose bones keep their length.
 
-With r(t, j) the distance of joint j from the camera, r' that of the lifter, h the same of the middle of the hips,
+With r(t, j) the distance of joint j from the camera, r' that of the lifter, h that of the middle of the hips,
 unknown bone lengths L and Cauchy's loss c(x) = log(1 + x^2), which limits the influence of large errors of the lifter:
 
     sum over t  sum over bones (|Xa - Xb| - L)^2 / sb^2  +  |r(t-1) - 2 r(t) + r(t+1)|^2 / (sa(t, j) dt^2)^2
                 + w c(((r - h) - (r' - h')) / sl)  +  w c((h - h') / sh)       + sum over lengths log(L / L0)^2 / sL^2
 
-Where height and tilt of the camera are known, joints below the floor cost as well, and the distance of the lowest one
-from the height at which it rests.
+If height and tilt of the camera are known, joints below the floor cost as well, and so does the distance of the lowest
+joint from the height at which it rests.
 """
 
 import math
@@ -41,7 +41,7 @@ FREE_JOINTS = (0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13)
 
 
 def expected_acceleration(across: Tensor, noise: Tensor, fps: float, least: float, ratio: float) -> Tensor:
-    """Accelerations to be expected of joints along their lines of sight, from those across.
+    """Expected accelerations of joints along their lines of sight, from those across.
 
     Args:
         across: (S, T, J, 3) positions in metres, of which the component along the line of sight is unknown, T >= 3.
@@ -67,13 +67,13 @@ def expected_acceleration(across: Tensor, noise: Tensor, fps: float, least: floa
 
 
 class BoneClip(NamedTuple):
-    """What is known of S people in T frames, for the 13 joints of ``FREE_JOINTS``.
+    """What is known about S people in T frames, for the 13 joints of ``FREE_JOINTS``.
 
     Attributes:
         lines: (S, T, 13, 3) unit lines of sight.
         given: (S, T, 13) distances of the lifter.
         lengths: (S, 8) expected lengths in metres, in the order of ``LENGTH_SHARES``.
-        height: (S, T, 13, 2) of joints over where they rest: at distance 0, and its increase per metre.
+        height: (S, T, 13, 2) of joints above where they rest on the floor: at distance 0, and the increase per metre.
         stiffness: (S, T + 2, 13) weights of squared second differences that end in a frame; 0 where there is none.
         footing: (S, T, 13) weights of squared heights of the lowest joint; 0 for hidden joints.
         hidden: (S, T, 12) additional variance in m^2 of bones to hidden joints.
@@ -165,7 +165,7 @@ class BoneCost(nn.Module):
         """Half the gradient and the diagonal of the Hessian (S, T, 13) of heights over the floor, and cost (S)."""
         over = clip.height[..., 0] + clip.height[..., 1] * r
         square = (over / self.floor_reach_m).square()
-        # Geman and McClure's loss for the lowest joint, as in a jump none rests; others count below the floor only.
+        # Geman and McClure's loss for the lowest joint, as none rests in a jump; others count only below the floor.
         lowest = F.one_hot(over.argmin(dim=-1), 13) * clip.footing
         sunk = ((over < 0) & (clip.footing > 0)).to(r.dtype) / self.floor_m**2
         weight = lowest / (1 + square).square() + sunk

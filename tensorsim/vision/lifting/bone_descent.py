@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on :class:`~tensorsim.vision.lifting.bone_cost.BoneCost`.
 
-The normal equations couple a frame to the two before it and are solved by pairs of frames, so the work grows linearly
+The normal equations couple a frame to the two before it and are solved in pairs of frames, so the work grows linearly
 with the length of the clip. The lengths of bones, which all frames share, are eliminated by a Schur complement.
 """
 
@@ -13,7 +13,7 @@ from tensorsim.vision.lifting.bone_cost import BoneClip, BoneCost
 
 
 def second_difference_hessian(stiffness: Tensor, frames: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Hessian of squared second differences along T frames, by pairs of frames; the last pair may be half empty.
+    """Hessian of squared second differences along T frames, in pairs of frames; the last pair may be half empty.
 
     Args:
         stiffness: (S, T + 2, J) weights, 0 at both ends.
@@ -118,8 +118,8 @@ class BoneDescent(nn.Module):
     def _distance_terms(
         self, clip: BoneClip, r: Tensor, stretch: Tensor, bone_m: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Half the gradient (S, T, 13) and Hessian (S, T, 13, 13) by distances, without second differences in the
-        latter, and the Jacobian (S, T, 12, 13 + 8) of the errors of bones (S, T, 12) by distances and lengths."""
+        """Half the gradient (S, T, 13) and Hessian (S, T, 13, 13) in the distances, without second differences in the
+        latter, and the Jacobian (S, T, 12, 13 + 8) of bone errors in distances and lengths, and these (S, T, 12)."""
         directions, expected, error, deviation = self.cost.bone_errors(clip, r, stretch, bone_m)
         along = torch.matmul(directions, clip.lines.transpose(-1, -2))
         by_distance = along * self.cost.bones / deviation[..., None]

@@ -4,16 +4,16 @@ A visible joint lies on its line of sight; one camera does not give its distance
 both sides are equally long, accelerations are limited and nobody is below the floor. The most likely distances
 under these (C. J. Taylor, "Reconstruction of articulated objects from point correspondences in a single uncalibrated
 image", 2000, from a single frame) are a sparse least-squares problem over the clip:
-:mod:`tensorsim.vision.lifting.bone_cost`. The expected acceleration of a joint along its line of sight follows from
-its own across it and that of the whole body. A standing foot rests to 2 mm, a moving one may have its heel up. Hidden
-joints do not count for bones and floor: they stay near the place that the lifter gave them.
+:mod:`tensorsim.vision.lifting.bone_cost`. The expected acceleration of a joint along its line of sight is derived from
+its acceleration across it and from that of the whole body. A standing foot rests to within 2 mm, a moving one may have
+its heel up. Hidden joints hardly count for bones, and not for the floor: they stay near where the lifter placed them.
 
 Levenberg-Marquardt from the lifter's distances finds a local minimum. There are many, one for each bone that may point
 towards the camera or away from it; :func:`tensorsim.vision.lifting.bone_branches.choose_branches` proposes others as
 long as that lowers the cost.
 
-Made for keypoints that are exact but for noise that differs from frame to frame: labelled ones, markers. The errors of
-networks last for seconds, and bend depths more than this corrects.
+Made for key points that are exact except for noise that is independent from frame to frame, such as labels or markers.
+Errors of networks last for seconds, and distort depths more than this corrects.
 """
 
 import torch
@@ -48,24 +48,24 @@ class BoneFit(nn.Module):
 
     Args:
         camera_m: (3,) position of the camera.
-        person_height_m: standing heights by order of person; the last one applies to all further people.
-        calibrated: height and tilt of the camera are known well, so that the floor determines distances.
+        person_height_m: standing heights in the order of the people; the last one applies to all further people.
+        calibrated: whether height and tilt of the camera are known well, so that the floor determines distances.
         bone_m: standard deviation of the lengths of a bone over time, besides the noise of the keypoints.
         length_share: relative deviation of bodies from mean proportions.
         acceleration_m_s2: expected acceleration of joints that rest in the image.
         acceleration_ratio: see :func:`~tensorsim.vision.lifting.bone_cost.expected_acceleration`.
         depth_m: standard deviation of the given depths relative to the hips.
         range_m: standard deviation of the given distance of the hips.
-        trust: weight of the given distances; below 1, as their errors are alike in several frames.
+        trust: weight of the given distances; below 1, as their errors are correlated between frames.
         floor_m: standard deviation of the height of the lowest joint over the floor; for ankles see ``standing_m``.
-        steps: of Levenberg-Marquardt, while bones may still stretch much and when they no longer may.
-        rounds: how often other branches are tried, at most.
+        steps: Levenberg-Marquardt steps while bones may still stretch considerably, and once they no longer may.
+        rounds: largest number of times that other branches are tried.
 
     Shapes:
         joints (..., P, T, 14, 3) in world metres, seen (..., P, T, 14) bool and frames per second -> joints, moved
-        along their lines of sight; the neck comes out in the middle of the shoulders. Frames in which nothing is
-        seen and clips of fewer than 4 frames stay. Computed in float64. Differentiable by joints, but for the
-        choice of branches.
+        along their lines of sight; the neck is placed in the middle of the shoulders. Frames in which nothing is
+        seen and clips of fewer than 4 frames are unchanged. Computed in float64. Differentiable with respect to
+        joints, except for the choice of branches.
 
     Raises:
         TensorsimError: settings that are not positive, wrong shapes, NaN.
@@ -142,7 +142,7 @@ class BoneFit(nn.Module):
         return torch.where(valid[..., None, None], fitted, joints)
 
     def _clip(self, joints: Tensor, seen: Tensor, fps: float) -> tuple[BoneClip, Tensor]:
-        """What is known of S people, and the standard deviation (S) in m of the noise of their bones."""
+        """What is known about S people, and the standard deviation (S) in m of the noise of their bones."""
         people, frames = joints.shape[-4], joints.shape[-3]
         sight = joints.reshape(-1, frames, 14, 3).double() - self.camera
         distance = sight.square().sum(dim=-1).sqrt().clamp(min=1e-3)

@@ -1,8 +1,8 @@
-"""The floor under people: whoever stands, kneels or lies on it is as far away as the floor is there.
+"""The floor under people: its distance gives that of a person who stands, kneels or lies on it.
 
-The size of a body in the image tells its distance while it is upright. Of somebody who crouches, falls or lies it
-tells little, as many poses look alike. There the floor helps: the lowest joint of a body rests on it, and it is as high
-as it was under the feet of the same person before. Heights of the floor are those of a standing ankle; any other joint
+The size of a body in the image gives its distance while it is upright. For somebody who crouches, falls or lies it says
+little, as many poses look alike. There the floor helps: the lowest joint of a body rests on it, and it is as high as
+where the same person last stood or will stand next. Heights of the floor are those of a standing ankle; any other joint
 that rests on the floor has about as much flesh around it.
 """
 
@@ -19,7 +19,7 @@ def lowered(joints: Tensor, drop: Tensor) -> Tensor:
 
 
 def upright_share(joints: Tensor, height: Tensor) -> Tensor:
-    """How upright bodies are: 1 from a vertical extent of 0.78 standing heights (0.88 in a stand), 0 below 0.6.
+    """How upright bodies are: 1 from a vertical extent of 0.78 standing heights (0.88 when standing), 0 below 0.6.
 
     Args:
         joints: (..., 14, 3) m.
@@ -30,11 +30,12 @@ def upright_share(joints: Tensor, height: Tensor) -> Tensor:
 
 
 def looks_bent(image: Tensor, seen: Tensor) -> Tensor:
-    """Whether legs and trunk, all seen, do not look like those of a body that stands.
+    """Whether legs and trunk, all seen, do not look like those of a standing body.
 
-    In a stand the trunk is 0.6 times as long as the legs, 0.4 to 0.9 with cameras that look down, steps and leaning; it
-    is in line with them within 40 degrees, and the legs are straight: thigh and shank are not more than 1.25 times as
-    long as from hip to ankle. A lifter may take a crouch for a stand of somebody further away; this does not ask it.
+    In a standing body the trunk is 0.6 times as long as the legs (0.4 to 0.9 with steps, leaning and cameras that look
+    down), is in line with them within 40 degrees, and at least one leg is straight: thigh and shank together are at
+    most 1.25 times as long as the line from hip to ankle. This does not rely on the lifter, which may mistake a crouch
+    for somebody who stands further away.
 
     Args:
         image: (..., 14, 2) joints in pixels of a camera without roll.
@@ -64,18 +65,18 @@ def looks_bent(image: Tensor, seen: Tensor) -> Tensor:
 def range_on_floor(rise: Tensor, depth: Tensor, floor: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     """Depth of the hips at which the lowest joint of a body rests on the floor.
 
-    With the hips at depth y joint j is at ``rise_j (y + depth_j)`` above the camera; the largest y at which no joint is
-    below the floor makes one rest on it.
+    With the hips at depth y, joint j is at ``rise_j (y + depth_j)`` above the camera; at the largest y with no joint
+    below the floor, one rests on it.
 
     Args:
         rise: (..., 14) by how much the line of sight of a joint rises per metre along the optical axis.
-        depth: (..., 14) of the joints about the hips, m.
+        depth: (..., 14) of the joints relative to the hips, m.
         floor: (...) height above the camera (so negative), m.
         seen: (..., 14) bool, the joints that count.
 
     Returns:
-        (...) metres, and by how much it changes with the height of the floor, (...) positive; infinite where no line
-        of sight leads down to the floor.
+        (...) metres, and by how many metres it changes per metre of floor height, (...) positive; both infinite where
+        no line of sight leads down to the floor.
     """
     down = seen & (rise < -0.03) & (floor < 0.0)[..., None]
     slope = torch.where(down, rise, torch.full_like(rise, -1.0))
@@ -88,20 +89,20 @@ def range_on_floor(rise: Tensor, depth: Tensor, floor: Tensor, seen: Tensor) -> 
 def fused_range(
     by_size: Tensor, upright: Tensor, by_floor: Tensor, gain: Tensor, stood: Tensor, height: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean of the ranges that the size of a body, the floor, and where the person stood tell, each with its precision.
+    """Mean, weighted by precision, of the ranges from body size, from the floor and from where the person stood.
 
-    The size of an upright body is good to 3 %, and taken alone; of any other to 15 %, with the long tails of a Cauchy
-    distribution about the place where the person stood: somebody who lies may seem twice as far away. The height of the
-    floor is good to 6 cm where the person stood, and to 12 cm more per metre from there (the camera's tilt, a
-    mattress). Hips are within three tenths of the standing height from there (standard deviations). All three change
-    smoothly, so that nobody who lies still jumps from one range to another.
+    The range from the size of an upright body is accurate to 3 %, and used alone; otherwise to 15 %, with the long
+    tails of a Cauchy distribution about where the person stood: somebody who lies may seem twice as far away. The
+    height of the floor is accurate to 6 cm where the person stood, with 12 cm more per metre from there (the camera's
+    tilt, a mattress). Hips are within three tenths of the standing height from there. All these are standard
+    deviations. The weights change smoothly, so that a person who lies still does not jump from one range to another.
 
     Args:
         by_size: (...) metres.
         upright: (...) of :func:`upright_share`.
         by_floor, gain: (...) of :func:`range_on_floor`.
-        stood: (...) metres, in the nearest frame in which the person stood; infinite where nobody knows, and no floor
-            is known then.
+        stood: (...) metres, in the nearest frame in which the person stood; infinite if there is none, and then the
+            floor is not used either.
         height: (...) standing heights, m.
 
     Returns:
@@ -128,7 +129,7 @@ def floor_under(joints: Tensor, valid: Tensor, fps: float, window_s: float) -> T
 
     Args:
         joints: (..., T, 14, 3) m.
-        valid: (..., T) bool, the frames that tell the floor; the others take that of the nearest one.
+        valid: (..., T) bool, the frames that determine the floor; the others take that of the nearest one.
         fps: frames per second.
         window_s: of the quantile; longer than a jump.
     """
@@ -139,9 +140,9 @@ def floor_under(joints: Tensor, valid: Tensor, fps: float, window_s: float) -> T
 
 
 def on_the_same_floor(floor: Tensor, hips_range: Tensor, valid: Tensor) -> Tensor:
-    """Whether people stand on the same floor as the nearest one, with room for a tilt of the camera that is wrong.
+    """Whether people stand on the same floor as the nearest one, allowing for an error of the camera's tilt.
 
-    A small object that is taken for a person, such as a post, seems far away by its size, and then its feet are far
+    A small object mistaken for a person, such as a post, seems far away because of its size, so its feet would be far
     below the floor: by more than two metres, and so far that on the floor it would be less than a third as tall as a
     person. A child, half as tall as an adult, is kept.
 
@@ -151,7 +152,7 @@ def on_the_same_floor(floor: Tensor, hips_range: Tensor, valid: Tensor) -> Tenso
         valid: (..., P, T) bool.
 
     Returns:
-        (..., P) bool. True of the nearest one, and of all if its feet are above the camera.
+        (..., P) bool. True for the nearest one, and for all if its feet are above the camera.
     """
     if valid.shape[-2] == 0:
         return valid.any(dim=-1)

@@ -1,4 +1,4 @@
-"""Legs beyond the edge of the picture: whoever moves along walks, though no camera sees the steps."""
+"""Legs beyond the edge of the picture: a person who moves along walks, though the camera does not see the steps."""
 
 import math
 from typing import Final
@@ -19,19 +19,19 @@ _SPEEDS, _PER_SPEED = 25, 10.0
 
 
 class HiddenLegs(nn.Module):
-    """Gives legs that nobody sees the steps of a gait at the speed of the hips.
+    """Gives unseen legs the steps of a gait at the speed of the hips.
 
-    A lifter knows nothing of the phase of legs beyond the picture, and gives them the mean of all phases: they hang
-    without a swing, and the radar would see somebody glide. Where neither knees nor ankles are seen and the hips of an
-    upright body move along, thighs and shanks turn in the direction of travel as in the gait of Boulic,
+    A lifter does not know the phase of legs beyond the picture, and gives them the mean of all phases: they hang
+    without swinging, and the radar would see somebody glide. Where neither knees nor ankles are seen and the hips of an
+    upright body move along, thighs and shanks swing in the direction of travel as in the gait of Boulic,
     Magnenat-Thalmann and Thalmann (1990, :func:`tensorsim.body.gait.boulic_gait`), whose cadence follows from the
-    speed; the phase is arbitrary. Which way a body with hidden legs faces is known badly, so it matters only where the
-    person clearly walks backwards. Bones keep their lengths but for half a second at both ends, where old and new legs
-    are blended.
+    speed; the phase is arbitrary. Which way a body with hidden legs faces is poorly known, so it matters only where the
+    person clearly walks backwards. Bones keep their lengths except for half a second at both ends, where old and new
+    legs are blended.
 
     Args:
-        slow_m_s, walking_m_s: speeds of the hips below which nothing is changed and from which all is a gait.
-        blend_s: seconds for which legs are hidden before they begin to step, and over which they come to do so.
+        slow_m_s, walking_m_s: speeds of the hips below which nothing changes, and from which legs follow the gait only.
+        blend_s: half of the seconds over which legs begin to step once they are hidden, and stop before they are seen.
 
     Shapes:
         joints (..., T, 14, 3) in metres, z up, seen (..., T, 14) bool, valid (..., T) bool, frames per second ->
@@ -84,7 +84,7 @@ class HiddenLegs(nn.Module):
         hidden = valid & ~(seen[..., 9:11].any(dim=-1) | seen[..., 12:14].any(dim=-1))
         share = hidden.to(joints.dtype)
         share = share * ((speed - self.slow_m_s) / (self.walking_m_s - self.slow_m_s)).clamp(0.0, 1.0)
-        # Whoever bends down or lies does not walk. No legs step where forwards turns into backwards: they would jump.
+        # A person who bends down or lies does not walk. Where forwards turns into backwards, stepping legs would jump.
         share = (
             share * ((upright - 0.7) / 0.15).clamp(0.0, 1.0) * ((forwards + 0.7).abs() / 0.15).clamp(0.0, 1.0)
         )
@@ -126,7 +126,7 @@ class HiddenLegs(nn.Module):
         return (smooth.index_select(-2, after) - smooth.index_select(-2, before)) / seconds[:, None]
 
     def _blended(self, share: Tensor, fps: float) -> Tensor:
-        """The smallest share (..., T) nearby, and the mean of that: zero wherever it was, and steady."""
+        """Mean of the smallest share (..., T) nearby: zero wherever it was, and changing steadily."""
         half = max(int(self.blend_s * fps), 1)
         rows = share.reshape(-1, 1, share.shape[-1])
         least = -F.max_pool1d(-rows, 2 * half + 1, 1, half)

@@ -51,7 +51,7 @@ def fit_poses(keypoints: Tensor, weights: Tensor, poses: Tensor) -> tuple[Tensor
 
 
 def check_to_lift(keypoints: Tensor, weights: Tensor) -> None:
-    """Refuse joints (..., T, 14, 2) and weights (..., T, 14) that no lifter takes.
+    """Refuse joints (..., T, 14, 2) and weights (..., T, 14) that no lifter accepts.
 
     Raises:
         TensorsimError: other shapes, NaN, negative weights, or no frames.
@@ -113,14 +113,14 @@ class NearestPoseLifter(nn.Module):
         library: (L, 14, 3) poses in any unit of length (x right, y away, z up); None is the shipped pool.
         yaws: headings at which each pose of the pool is tried; 1 for a pool that has all headings already.
         neighbours: candidates per frame.
-        search_joints: a frame with fewer joints takes its candidates from the nearest frame with as many.
+        search_joints: a frame with fewer joints takes its candidates from the nearest frame with at least as many.
         tolerance: relative error (square root of ``distance``) at which a candidate loses its weight; more where even
             the nearest pose fits badly.
         temporal: weight of the change of pose and size from frame to frame, in units of a change by 0.03
-            body heights and by 1 % of the size; 0 treats frames alone.
+            body heights and by 1 % of the size; 0 treats frames independently.
         chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair.
         pitch_rad: upward tilt of the camera; depths are along its optical axis.
-        roll_rad: turn of the camera about it, see :class:`tensorsim.CameraConfig`.
+        roll_rad: turn of the camera about that axis, see :class:`tensorsim.CameraConfig`.
 
     Shapes:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
@@ -170,7 +170,7 @@ class NearestPoseLifter(nn.Module):
         self.roll_rad = float(roll_rad)
 
     def tilted(self, pitch_rad: float, roll_rad: float = 0.0) -> "NearestPoseLifter":
-        """The same for a camera of another tilt and roll."""
+        """A copy for a camera with another tilt and roll."""
         other = copy.copy(self)
         other._modules = {"search": self.search.tilted(pitch_rad)}
         other.roll_rad = float(roll_rad)
@@ -212,7 +212,7 @@ class NearestPoseLifter(nn.Module):
 
     def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:
         """Weight of each candidate, (S, T, K) summing to one; only frames (S, T) that are ``placeable`` count."""
-        # Where even the nearest pose fits badly, such as behind wrong key points, the others are hardly worse.
+        # Where even the nearest pose fits badly, as with wrong key points, the others are hardly worse.
         misfit = distance.amin(dim=-1, keepdim=True)
         emission = -0.5 * distance / (self.tolerance**2 + self.reserve * misfit)
         if self.temporal == 0.0 or self.neighbours == 1:

@@ -107,14 +107,14 @@ class MetricPose(nn.Module):
     pixels, and the lifter gives s for any pose, so the hips are at range ``y = f H / s - d``, d the mean depth of the
     joints relative to the hips; y is smoothed along time by its precision, robustly, because 2 % at 4 m are 8 cm.
     While a foot stands on the floor, changes of y follow the pose (:mod:`tensorsim.vision.lifting.standing_feet`).
-    The less upright a body is, the more its range depends on where the person stood last, and on the range at which its
-    lowest joint rests on the floor (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on its line of sight at its
-    own depth. Frames with fewer than eight visible joints, or whose pose the lifter does not know (people who lie), do
-    not give a reliable size: they take that of the others, and one of few joints that would make a body of less than
-    0.65 of it is discarded (a leg at the edge of the picture, taken for a whole person). The floor is a low running
-    quantile of the height of the lower ankle where they stand, so that it stays through a jump and an outlier does not
-    move it. Where ranges come from sizes, whatever would stand far below the floor of the nearest person is a small
-    object, not a person, and none of its joints counts as seen.
+    The less upright a body is, the more its range depends on where the person last stood or stands next, and on the
+    range at which its lowest joint rests on the floor (:mod:`tensorsim.vision.lifting.floor`). Each joint lies on its
+    line of sight at its own depth. Frames with fewer than eight visible joints, or with a pose that the lifter does not
+    know (people lying down), do not give a reliable size: they take that of the other frames. A frame with few joints
+    is discarded if its body would be smaller than 0.65 of that (a leg at the edge of the picture, taken for a whole
+    person). The floor is a low running quantile of the height of the lower ankle in frames where the person stands, so
+    that neither a jump nor an outlier moves it. Where ranges come from sizes, anything that would stand far below the
+    floor of the nearest person is taken for a small object, not a person, and none of its joints counts as seen.
 
     ``mode="paper"``: metres per pixel ``alpha = H / pixel height`` of the current frame (the extent of the
     joints), depths times ``alpha * 0.2`` (library depth in pixels of the frame), the hips moved sideways by the
@@ -124,25 +124,25 @@ class MetricPose(nn.Module):
 
     Args:
         camera: pinhole camera; None is the default one, at the radar.
-        person_height_m: standing heights by order of person; the last one applies to all further people.
-        initial_distance_m: range of each person in its first half second, likewise by order. In the camera
-            mode it replaces the focal length, person by person. None takes the camera's focal length (in the
+        person_height_m: standing heights in the order of the people; the last one applies to all further people.
+        initial_distance_m: range of each person in their first half second, in the same order. In the camera
+            mode it determines the focal length, person by person. None takes the camera's focal length (in the
             paper's mode the panel's 4.00 and 0.50 m).
         keypoint_threshold: score from which a joint counts as seen.
         mode: ``"camera"`` or ``"paper"``.
         range_smoothing_s: standard deviation of the smoothing kernel of the range.
         floor_window_s: window of the quantile that gives the floor; longer than a jump.
-        calibrated: height and tilt of the camera are known well: no floor is estimated, joints keep the heights that
-            the camera gives.
+        calibrated: whether height and tilt of the camera are known well: then no floor is estimated, and joints keep
+            the heights that the camera gives.
 
     Shapes:
         joints (..., P, T, 14, 2) pixels, scores (..., P, T, 14), their :class:`tensorsim.types.Lifted`, valid
-        (..., P, T) bool, image height and width in pixels, frames per second, where the camera moves its
-        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward), and where it is known the
-        people cut off by its left or right edge (..., P, T) bool, whose size does not count -> world joints
+        (..., P, T) bool, image height and width in pixels, frames per second, for a moving camera its
+        world-from-camera poses (..., T, 3, 4) (camera axes right, down, forward), and optionally which people are
+        cut off by the left or right edge of the picture (..., P, T) bool, whose size does not count -> world joints
         (..., P, T, 14, 3) in metres and whether each was seen (..., P, T, 14). What was not seen is filled: a
         hidden joint from the pose that the lifter found, an invalid or discarded frame from the nearest other one;
-        people without any are zeros. Differentiable.
+        people without any valid frame are all zeros. Differentiable.
 
     Raises:
         TensorsimError: heights or distances that are not positive, an unknown mode, wrong shapes, NaN, or a
@@ -188,7 +188,7 @@ class MetricPose(nn.Module):
         self.register_buffer("distances", torch.tensor(distances, dtype=torch.float64), persistent=False)
 
     def seen_by(self, camera: CameraConfig) -> "MetricPose":
-        """The same for another camera."""
+        """A copy for another camera."""
         distances = tuple(self.distances.tolist()) if self.distance_gives_focal else None
         return MetricPose(
             camera, tuple(self.heights.tolist()), distances, self.keypoint_threshold, self.mode,
@@ -253,7 +253,7 @@ class MetricPose(nn.Module):
         pose: Tensor,
         cut_off: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """World joints (..., P, T, 14, 3), which are seen, and frames that show a person: what is left of both."""
+        """World joints (..., P, T, 14, 3), which of them are seen, and which frames still show a person."""
         weights = scores.clamp(min=0.0)
         weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
         # The fitted scale is that at the mean depth of the joints, not of the hips.
@@ -266,7 +266,7 @@ class MetricPose(nn.Module):
         # The size of a body that is half out of the picture, or in a pose that the lifter does not know, is not
         # reliable: those frames follow the others.
         many = seen.sum(dim=-1) >= self.whole_body_joints
-        # Where the left or right edge of the picture cuts a body off, the network puts what is beyond at the edge.
+        # Where the left or right edge of the picture cuts a body off, the network puts joints beyond it at the edge.
         across = keypoints[..., 0] / max(image_width - 1, 1)
         beside = (across < 0.01) | (across > 0.99)
         beyond = (seen & beside).any(dim=-1)
@@ -278,7 +278,7 @@ class MetricPose(nn.Module):
         hips_range = camera_range(focal, height, scale) - height * offset
         image = torch.where(seen[..., None], keypoints, lifted.keypoints)
         depth = height[..., None] * lifted.depth
-        # What is found at the lower edge of the picture is cut off by it, and no foot on the floor.
+        # A joint found at the lower edge of the picture is cut off by it, not a foot on the floor.
         inside = seen & (keypoints[..., 1] < 0.97 * image_height)
         hips_range, whole, stands, precision = self._on_floor(
             hips_range, image, depth, focal, center, pose, height, inside, whole, fps
@@ -344,7 +344,7 @@ class MetricPose(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Range of the hips (..., P, T) from the size of the body or, where it is not upright, from the floor.
 
-        Also which frames tell it, in which of them the person stands, and how precise it is.
+        Also which frames give a reliable range, in which ones the person stands, and how precise the range is.
         """
         bent = looks_bent(image, seen)
         straight = where_any(whole & ~bent, whole)
@@ -352,7 +352,7 @@ class MetricPose(nn.Module):
         smooth = torch.where(straight, smooth, by_size)
         joints = back_project(image, smooth[..., None] + depth, focal, center, pose)
         upright = upright_share(joints, height.expand_as(by_size)) * (~bent).to(joints.dtype)
-        # Without feet the lowest joint that is seen may be anything.
+        # If no foot is seen, the lowest visible joint may be any joint.
         feet = seen[..., 10] | seen[..., 13]
         # The floor is where this person stood last, or will stand next.
         stands = whole & (upright >= 0.9)

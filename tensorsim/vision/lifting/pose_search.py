@@ -1,8 +1,8 @@
 """Exact search of a large pool of poses for those whose projections fit key points best.
 
-The pool is sorted once into blocks of similar poses. A frame looks only into blocks that the triangle inequality
-does not rule out, there with matrix products in bfloat16 whose rounding error is bounded, and computes in float64
-what the bound does not exclude: the result equals that of a full search.
+The pool is sorted once into blocks of similar poses. A frame is compared only with blocks that the triangle inequality
+does not rule out, by matrix products in bfloat16 (float32 for unequal weights) whose rounding error is bounded. What
+the bound does not exclude is computed in float64: the result equals that of a full search.
 """
 
 import math
@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from tensorsim.errors import is_exporting
 from tensorsim.vision.lifting.pose_library import all_headings, seen_from, turn
 
-#: Poses of a block at most; half as many at least, in a pool that needs more than one.
+#: Largest number of poses in a block; in a pool that needs more than one, about half as many is the smallest.
 BLOCK = 8192
 #: Poses that an exported graph compares at once.
 EXPORTED = 2**17
 #: Cosines in float32 may be this much too low.
 ROUNDING = 1e-5
-#: Blocks but the last hold a multiple of this many.
+#: All blocks but the last hold a multiple of this many poses.
 _STRIDE = 64
 
 
@@ -161,9 +161,9 @@ def columns_of_largest(score: Tensor, count: int) -> Tensor:
 
 
 def best_per_frame(frame: Tensor, pose: Tensor, cosine: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pairs (P,) of frame and pose the ``count`` with the largest cosines per frame, best first.
+    """The ``count`` pairs of frame and pose, out of (P,), with the largest cosines per frame, best first.
 
-    Equal cosines go by the number of the pose, the lower one first.
+    Of equal cosines, the one with the lower pose number comes first.
     """
     order = pose.argsort()
     order = order[torch.sort(cosine[order], stable=True, descending=True)[1]]
@@ -195,8 +195,8 @@ class PoseSearch(nn.Module):
         library: (L, 14, 3) standardised poses, see :func:`tensorsim.vision.lifting.pose_library.standardise_poses`.
         yaws: headings at which each is tried.
         neighbours: how many to return.
-        chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair. Blocks of 8192
-            poses are its least.
+        chunk: frame-pose pairs compared at once, which bounds the memory: up to 24 bytes a pair; at least one frame
+            with one block of 8192 poses.
         pitch_rad: upward tilt of the camera; poses are compared, and given, in its axes right, forward, up.
         blocks: order and starts of another search of the same poses, whose blocks are nearly as good for another
             tilt; None sorts anew.
@@ -263,7 +263,7 @@ class PoseSearch(nn.Module):
 
     @torch.jit.unused
     def tilted(self, pitch_rad: float) -> "PoseSearch":
-        """The same for a camera of another tilt."""
+        """A copy for a camera with another tilt."""
         blocks = self.order, self.starts
         other = PoseSearch(self.library, self.yaws, self.neighbours, self.chunk, pitch_rad, blocks)
         return other.to(self.library.device)
@@ -326,7 +326,7 @@ class PoseSearch(nn.Module):
             rows = torch.nonzero(alive[:, block])[:, 0]
             if uniform:
                 score, slack = self._coarse_scores(block, moment[rows])
-                # Scores are cosines less one; they and the threshold are rounded by 2^-8 of themselves at most.
+                # Scores are cosines minus one; they and the threshold are rounded by 2^-8 of themselves at most.
                 threshold = ((least[rows] - 1.0 - slack) * (1.0 + 2.0**-6)).to(score.dtype)
             else:
                 floor = least[rows].clamp(min=0.0)
@@ -362,7 +362,7 @@ class PoseSearch(nn.Module):
         return self.seen[self.starts[block] : self.starts[block + 1]]
 
     def _coarse_scores(self, block: int, moment: Tensor) -> tuple[Tensor, Tensor]:
-        """Cosines less one of frames of equal weights with a block's poses, and by how much they may be too low."""
+        """Cosines minus one of frames of equal weights with a block's poses, and how much too low they may be."""
         rows = slice(self.starts[block], self.starts[block + 1])
         centre = self.centres[block]
         point = math.sqrt(14.0) * moment
@@ -377,7 +377,7 @@ class PoseSearch(nn.Module):
         score = torch.mm(rounded, self.coarse[rows].t()).to(moment.dtype)
         slack = torch.linalg.vector_norm(offset - short, dim=-1) * self.radius[block]
         slack = slack + torch.linalg.vector_norm(short.to(offset.dtype), dim=-1) * self.rounding[block]
-        # What is left of a number in two parts, and float32 sums.
+        # For the residue of numbers split into two parts, and for float32 sums.
         slack = slack + 6e-5
         return score, slack
 

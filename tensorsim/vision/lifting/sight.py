@@ -2,7 +2,7 @@
 
 Lines of sight are turned into a frame whose z axis is vertical and whose y axis points horizontally towards the
 person. A point at (x, y, z) is then seen at ``a = x / y`` and ``e = z / y``: upright bodies stay upright whatever the
-tilt. Positions are taken from the direction of the person and divided by the angular size of the body, both averaged
+tilt. Positions are relative to the direction of the person and divided by the angular size of the body, both averaged
 over a few frames, so that the same pose looks the same wherever it is in the picture.
 """
 
@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-#: Numbers per frame that :meth:`features` gives.
+#: Numbers per frame in :attr:`Sight.features`.
 FEATURES = 67
 #: Frames to each side over which direction and size are averaged.
 RADIUS = 10
@@ -23,7 +23,7 @@ class Sight(NamedTuple):
 
     Attributes:
         features: (S, T, FEATURES) for the network.
-        joints: (S, T, 14, 2) of the joints, in units of ``size`` from the direction of the person; 0 where not seen.
+        joints: (S, T, 14, 2) of the joints, in units of ``size`` from the direction of the person; 0 if not seen.
         elevation: (S, T) ``e`` of the direction of the person.
         size: (S, T) angular size: root mean square of the visible key points' ``a`` and ``e`` about their mean.
         azimuth: (S, T, 2) cosine and sine of the angle from world +y to the person, towards +x.
@@ -37,12 +37,12 @@ class Sight(NamedTuple):
 
 
 def mirror_image(sight: Sight, other_keypoint: Tensor, other_joint: Tensor) -> Sight:
-    """The same people with left and right exchanged, each where they are.
+    """The same people with left and right exchanged, each in the same place.
 
     Args:
         sight: of the people.
         other_keypoint: (17,) int64, for each key point the one that takes its place in a mirror image.
-        other_joint: (14,) int64, the same of the joints.
+        other_joint: (14,) int64, the same for joints.
     """
     turn = torch.tensor([-1.0, 1.0], dtype=sight.joints.dtype, device=sight.joints.device)
     spot, scores, edges, room, rest = sight.features.split([34, 17, 4, 4, 8], dim=-1)
@@ -84,7 +84,7 @@ def world_rays(image: Tensor, focal: Tensor, center: Tensor, rotation: Tensor) -
 
 
 def plane(rays: Tensor, azimuth: Tensor) -> Tensor:
-    """Where rays (S, T, N, 3) pass the vertical plane one metre away that faces the person: ``a`` and ``e``."""
+    """Where rays (S, T, N, 3) meet the vertical plane one metre away towards the person: ``a`` and ``e``."""
     cos, sin = azimuth[..., None, 0], azimuth[..., None, 1]
     away = (rays[..., 0] * sin + rays[..., 1] * cos).clamp(min=0.05)
     a = (rays[..., 0] * cos - rays[..., 1] * sin) / away
@@ -113,7 +113,7 @@ def level_sight(
     camera_height: Tensor,
     threshold: float = 0.3,
 ) -> Sight:
-    """What the network needs to know of S tracks.
+    """What the network needs to know about S tracks.
 
     Args:
         keypoints: (S, T, 17, 2) COCO key points in pixels.
@@ -121,7 +121,7 @@ def level_sight(
         joints: (S, T, 14, 2) joints in pixels, see :func:`tensorsim.body.skeleton.coco_to_body`.
         joint_scores: (S, T, 14).
         boxes: (S, T, 4) ``xyxy`` pixels.
-        valid: (S, T) bool, frames in which the person is followed.
+        valid: (S, T) bool, frames in which the person is tracked.
         focal: (S,) pixels.
         center: (S, 2) principal point in pixels.
         rotation: (S, 3, 3) from camera axes to world axes.
@@ -147,7 +147,7 @@ def level_sight(
     count = seen.sum(dim=-1)
     unit = F.normalize(rays[..., :17, :], dim=-1)
     mean = (unit * seen[..., None]).sum(dim=-2) / count.clamp(min=1.0)[..., None]
-    ahead = rotation[:, None, :, 2]  # where nobody is for long
+    ahead = rotation[:, None, :, 2]  # used where nobody is seen for a long time
     direction = windowed_mean(mean, (count >= 3).to(there.dtype)) + 1e-6 * ahead
     flat = direction[..., :2].square().sum(dim=-1).clamp(min=1e-18).sqrt()  # well below 1e-6 squared
     azimuth = torch.stack([direction[..., 1] / flat, direction[..., 0] / flat], dim=-1)
@@ -176,8 +176,8 @@ def level_sight(
         dim=-1,
     ).clamp(0.0, 1.0) * there[..., None]  # fmt: skip
     rate = (30.0 / fps)[:, None].expand_as(elevation)
-    # Whoever stands, sits or lies touches the floor with what is lowest: a point of the floor at a distance d is seen
-    # at e = -h / d. So -e / (h size) is the size over that of the body at one body height.
+    # The lowest point of a person who stands, sits or lies touches the floor, and a floor point at distance d is seen
+    # at e = -h / d. So -e / (h size) is one over the angular size that the body has at a distance of one body height.
     above = camera_height[:, None].clamp(0.1, 10.0)
     lowest = torch.where(seen > 0, spot[..., 1], torch.full_like(seen, 8.0)).amin(dim=-1)
     under = torch.stack([lowest, edges[..., 3]], dim=-1) + (elevation / size)[..., None]

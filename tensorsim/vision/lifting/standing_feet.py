@@ -32,19 +32,19 @@ def range_over_feet(
 ) -> Tensor:
     """Correct how ranges change while a foot stands on the floor or the whole body is at rest.
 
-    If a foot at depth d about the hips stands, ``y(t + 1) - y(t) = d(t) - d(t + 1)``. A foot is taken to stand if it is
-    slow in the picture (0.15 standing heights per second) and also along the line of sight, where its speed is that of
-    the given range and of d together (0.4 m/s, more where the range is less precise): both feet of somebody who walks
-    straight towards the camera are slow in the picture. While only one foot stands, half of its change and half of
-    the given one are taken, because the near and the far leg are easily mistaken for each other in a step. A body is at
-    rest, and y does not change, if all joints but two are slow (0.08 heights per second) and the given range is too
-    (0.2 m/s). All these limits are standard deviations of Gaussian weights. The sum of the changes drifts away from the
-    given ranges; their mean difference over 1.5 s is added, so that slow changes of the given ranges remain.
+    While a foot at depth d relative to the hips stands, ``y(t + 1) - y(t) = d(t) - d(t + 1)``. A foot counts as
+    standing if it is slow in the picture (0.15 standing heights per second) and also along the line of sight, where its
+    speed is that of the given range and d together (0.4 m/s, more where the range is less precise): both feet of
+    somebody who walks straight towards the camera are slow in the picture. While only one foot stands, half of its
+    change and half of the given one are used, because the near and the far leg are easily confused during a step. A
+    body is at rest, and y does not change, if all joints but two are slow (0.08 heights per second) and so is the given
+    range (0.2 m/s). All these limits are standard deviations of Gaussian weights. The sum of the changes drifts away
+    from the given ranges; their mean difference over 1.5 s is added, so that slow changes of the given ranges remain.
 
     Args:
         hips_range: (..., T) m, from size and floor, smoothed.
         image: (..., T, 14, 2) joints in pixels.
-        depth: (..., T, 14) of the joints about the hips, m.
+        depth: (..., T, 14) of the joints relative to the hips, m.
         seen: (..., T, 14) bool, the joints that are seen inside the picture.
         body_px: (..., T) standing heights in pixels.
         precision: (..., T) positive, of the given range: 1 for an upright body.
@@ -80,6 +80,6 @@ def range_over_feet(
     believed = torch.maximum(believed, rests)
 
     way = F.pad((steps + believed * (change - steps)).cumsum(dim=-1), [1, 0])
-    # The ridge leaves a mean without a slope: a steady drift of somebody who stands is an error of the size as well.
+    # The ridge makes this a mean without slope: a steady drift of a standing person is an error of the size as well.
     level = torch.full_like(way, 30.0)
     return way + local_linear(hips_range - way, precision, 1.5 * fps, ridge=level)

@@ -1,7 +1,8 @@
 """Lifting by a network that sees a window of time: key points to joints, position and their uncertainty.
 
-The key points are seen as by a level camera (:mod:`tensorsim.vision.lifting.sight`), a network of dilated convolutions
-along time (:mod:`tensorsim.vision.lifting.temporal_net`) finds depths, distance and corrections of the key points.
+The key points are seen as by a level camera (:mod:`tensorsim.vision.lifting.sight`), and a network of dilated
+convolutions along time (:mod:`tensorsim.vision.lifting.temporal_net`) finds depths, distance and corrections of the key
+points.
 """
 
 import math
@@ -40,7 +41,7 @@ from tensorsim.vision.lifting.sight import (
 from tensorsim.vision.lifting.temporal_net import DILATIONS, Located, TemporalNet
 from tensorsim.vision.smoothing.along_time import raised_slowly
 
-#: Lengths of all bones together, in standing heights; between people they differ by 2 %.
+#: Total length of all bones, in standing heights; it differs by 2 % between people.
 _ALL_BONES = 2.39
 
 
@@ -75,25 +76,25 @@ def along_axes(across: Tensor, along: Tensor, azimuth: Tensor) -> Tensor:
 class TemporalLifter(nn.Module):
     """Key points of tracked people over time -> joints about the hips, position of the hips, standard deviations.
 
-    The network sees the people and their mirror images, and the mean of both counts: a mirrored film gives the mirrored
-    motion.
+    The network sees the people and their mirror images, and both results are averaged: a mirrored film gives the
+    mirrored motion.
 
     Args:
         network: with its weights; None is an untrained one. :meth:`from_pretrained` loads the shipped one.
         camera: where the camera stands, its tilt and focal length; None is the default one, at the radar.
-        person_height_m: standing heights by order of person; the last one applies to all further people.
+        person_height_m: standing heights in the order of the people; the last one applies to all further people.
         keypoint_threshold: score from which a key point counts as seen.
-        frames_per_block: frames that go through the network at once, of the tracks with somebody in or near them,
-            which bounds time and memory; the result, where somebody is followed, does not depend on it.
-        camera_known: False for a camera that was estimated. The network sees where the floor is and takes the distance
-            of those who lie or sit from it, which a tilt that is wrong by some degrees moves by a metre. Then people
-            are put where their bones have the lengths that they should have.
+        frames_per_block: frames that go through the network at once, for tracks with somebody in or near them, which
+            bounds time and memory; results where somebody is tracked do not depend on it.
+        camera_known: False for an estimated camera. The network sees where the floor is and derives the distance of
+            people who lie or sit from it; a tilt that is a few degrees off shifts that by a metre. With False, people
+            are placed where their bones have the expected lengths.
 
     Shapes:
         COCO key points (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
         valid (..., P, T) bool, height and width of the picture, frames per second -> :class:`TemporalPose`. Frames
-        in which nobody is followed are filled from those around them, those far from anybody with the camera's place.
-        Differentiable.
+        in which nobody is tracked are filled from those around them, or far from any of those with the camera's
+        position. Differentiable.
 
     Raises:
         TensorsimError: heights that are not positive, wrong shapes, NaN, no frames.
@@ -120,12 +121,12 @@ class TemporalLifter(nn.Module):
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
         self.camera_known, self.log_bones = camera_known, math.log(_ALL_BONES)
-        #: Body heights within which a key point counts as right; at twice as much it is wrong.
+        #: Body heights within which a key point counts as right; from twice as much on it is wrong.
         self.near = 0.06
-        #: Seconds in which a joint goes from its key point to where the network has it.
+        #: Seconds in which a joint moves from its key point to where the network places it.
         self.gives_way_s = 0.2
-        #: Frames before and after one that have a say in its result.
-        # The size of the body is about its averaged direction, that of its bones is averaged afterwards.
+        #: Frames before and after a frame that affect its result.
+        # Three averages in a row: the direction, the size about it, and later the length of the bones.
         self.reach = self.network.reach + 3 * RADIUS
         self.pinhole = Pinhole(CameraConfig() if camera is None else camera)
         self.register_buffer("heights", torch.tensor(person_height_m, dtype=torch.float64), persistent=False)
@@ -136,7 +137,7 @@ class TemporalLifter(nn.Module):
     def seen_by(
         self, camera: CameraConfig, person_height_m: tuple[float, ...] | None = None, known: bool = True
     ) -> "TemporalLifter":
-        """The same, with the same network, for another camera, known or estimated, and, unless None, other people."""
+        """A copy with the same network for another camera, known or estimated, and, unless None, other people."""
         heights = tuple(self.heights.tolist()) if person_height_m is None else person_height_m
         other = TemporalLifter(
             self.network, camera, heights, self.keypoint_threshold, self.frames_per_block, known
@@ -160,8 +161,8 @@ class TemporalLifter(nn.Module):
         lead, frames = keypoints.shape[:-3], keypoints.shape[-3]
         people = keypoints[..., 0, 0, 0].numel()
         dtype = self.network.leave.weight.dtype
-        # The window of the network is a number of frames, of films of up to 45 frames per second: it sees a faster one
-        # as several, each of about 30.
+        # The network's window is a number of frames and suits films of up to 45 frames per second: a faster film is
+        # split into several of about 30 each.
         films = times_as_fast(fps)
         tracks, fps = films * people, fps / films
         k = _interleaved(keypoints.reshape(people, frames, 17, 2).to(dtype), films)
@@ -190,7 +191,7 @@ class TemporalLifter(nn.Module):
         azimuth = torch.cat(turns, dim=1)
         points = height[..., None, None] * turned_back(torch.cat(joints, dim=1), azimuth)
         root = mid_hips(points)
-        # Errors have Laplace's distribution, whose deviation is that many times the mean.
+        # Errors have a Laplace distribution, whose standard deviation is sqrt(2) times the mean absolute error.
         spread = math.sqrt(2.0) * height[..., None, None] * torch.cat(spreads, dim=1).exp()
         off = math.sqrt(2.0) * torch.cat(ranges, dim=1).exp() * root[..., :2].square().sum(dim=-1).sqrt()
         deviation = along_axes(spread[..., 0], spread[..., 1], azimuth[..., None, :])
@@ -210,10 +211,10 @@ class TemporalLifter(nn.Module):
     ) -> Lifted:
         """The pose as :class:`~tensorsim.vision.lifting.metric_pose.MetricPose` takes it.
 
-        A joint that is seen stays at its key point as long as the network has it nearby, so that fast motion is not
-        smoothed; one that is not, or seems to be wrong, is where the network has it. Between the two a joint moves
-        over :attr:`gives_way_s`, and key points beside a wrong one give way as well: a foot that is taken for the other
-        one in some frames would jump there and back.
+        A joint that is seen stays at its key point as long as the network places it nearby, so that fast motion is not
+        smoothed; one that is not seen, or seems to be wrong, is where the network places it. A joint moves between the
+        two over :attr:`gives_way_s`, and its key points in frames next to a wrong one are replaced as well: a foot that
+        is mistaken for the other one in some frames would jump there and back.
 
         Args:
             found: of :meth:`forward`.
@@ -241,7 +242,7 @@ class TemporalLifter(nn.Module):
         wrong = raised_slowly(wrong.transpose(-1, -2), reach_frames).transpose(-1, -2)
         image = keypoints + wrong[..., None] * (pixels - keypoints)
         none = torch.zeros_like(middle)
-        # What it says of its errors is of joints in the world, see :class:`TemporalPose`, not of depths.
+        # The network's deviations are those of joints in the world, see :class:`TemporalPose`, not of depths.
         return Lifted(depth, scale, image, none.to(torch.int64), none, torch.zeros_like(depth))
 
     def _block(
@@ -315,7 +316,7 @@ class TemporalLifter(nn.Module):
         """The lifter with trained weights, in evaluation mode.
 
         It computes in float32, whose rounding moves joints by micrometres from frame to frame. A radar at 77 GHz sees
-        that: the pipeline takes ``from_pretrained().double()``.
+        that, so the pipeline uses ``from_pretrained().double()``.
 
         Args:
             source: a path, a name from ``tensorsim models list``, or None for the shipped weights.
@@ -341,19 +342,19 @@ class TemporalLifter(nn.Module):
 
 
 def _interleaved(x: Tensor, films: int) -> Tensor:
-    """Every n-th frame of (S, T, ...), from each of the first n on, as tracks of their own: (S n, ceil(T / n), ...)."""
+    """Every n-th frame of (S, T, ...), from each of the first n on, as separate tracks: (S n, ceil(T / n), ...)."""
     lacking = x.new_zeros([x.shape[0], -x.shape[1] % films] + list(x.shape[2:]))  # noqa: RUF005
     padded = torch.cat([x, lacking], dim=1)
     return padded.unflatten(1, [-1, films]).transpose(1, 2).flatten(0, 1)
 
 
 def _in_order(x: Tensor, films: int) -> Tensor:
-    """Tracks (S n, T, ...) of :func:`_interleaved` in the order of time, (S, T n, ...)."""
+    """Tracks (S n, T, ...) of :func:`_interleaved` back in time order, (S, T n, ...)."""
     return x.unflatten(0, [-1, films]).transpose(1, 2).flatten(1, 2)
 
 
 def _in_rows(found: Tensor, rows: Tensor, tracks: int) -> Tensor:
-    """What was found of some tracks, (n, T, ...), in the ``rows`` (n,) of all of them, zeros elsewhere."""
+    """Results of some tracks, (n, T, ...), placed in their ``rows`` (n,) among all tracks, zeros elsewhere."""
     return found.new_zeros([tracks] + list(found.shape[1:])).index_copy(0, rows, found)  # noqa: RUF005
 
 

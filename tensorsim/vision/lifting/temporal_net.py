@@ -16,7 +16,7 @@ _MEAN_SIZE = 0.26
 
 
 class Located(NamedTuple):
-    """Joints before the camera, in the frame that faces the person, in body heights.
+    """Joints in front of the camera, in the frame that faces the person, in body heights.
 
     Attributes:
         joints: (S, T, 14, 3) from the camera: to the right, away along the floor, up.
@@ -31,7 +31,7 @@ class Located(NamedTuple):
 
 
 class _Block(nn.Module):
-    """A convolution over three frames, ``dilation`` apart, and a product per frame, with a shortcut."""
+    """A convolution over three frames, ``dilation`` apart, and a linear layer per frame, with a shortcut."""
 
     def __init__(self, channels: int, dilation: int) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class _Block(nn.Module):
 
 
 class TemporalNet(nn.Module):
-    """Tracks as a level camera sees them to joints in body heights; see :class:`Located`.
+    """Maps tracks as a level camera sees them to joints in body heights; see :class:`Located`.
 
     Every joint lies on its line of sight, which the network may move a little (much where the key point is hidden or
     wrong), at the depth that the network gives. Each frame is estimated from ``reach`` frames before and after it.
@@ -74,7 +74,7 @@ class TemporalNet(nn.Module):
 
     def forward(self, sight: Sight) -> Located:
         """Sight to Located."""
-        # Sums of the blocks keep their digits where products have few.
+        # Sums over the blocks keep full precision where matrix products have a reduced one.
         x = self.enter(sight.features).to(sight.size.dtype)
         for block in self.blocks:
             x = block(x)

@@ -27,7 +27,7 @@ from tensorsim.types import Lifted
 from tensorsim.vision.lifting.lifter import check_to_lift, fit_poses
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
-#: Joints of Human3.6M in its order, those of the published networks in and out.
+#: Joints of Human3.6M in its order, which the published networks take and give.
 H36M_JOINTS = (
     "pelvis",
     "right_hip",
@@ -114,7 +114,7 @@ class VideoPose3D(nn.Module):
     Args:
         kernels: odd lengths of the convolutions; dilations are such that each input frame counts once.
         channels: width of the network.
-        dropout: in training.
+        dropout: rate of dropout in training.
 
     Raises:
         TensorsimError: no kernels, or an even one; no channels; joints that are not (..., T, 17, 2).
@@ -203,16 +203,16 @@ def h36m_to_body(joints: Tensor) -> Tensor:
 
 
 class VideoPoseLifter(nn.Module):
-    """:class:`VideoPose3D` in the place of :class:`~tensorsim.vision.NearestPoseLifter` (the TCN of the paper).
+    """:class:`VideoPose3D` in place of :class:`~tensorsim.vision.NearestPoseLifter` (the TCN of the paper).
 
     Args:
         network: with its weights.
-        image_height, image_width: of the picture in pixels: the network takes coordinates about its centre.
+        image_height, image_width: of the picture in pixels: the network takes coordinates relative to its centre.
 
     Shapes:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) -> :class:`tensorsim.types.Lifted`,
-        without a deviation. A frame with fewer than two weighted joints takes the nearest other frame; the network
-        knows no weights and sees hidden joints where they are given. Differentiable.
+        with zero deviation. A frame with fewer than two weighted joints takes the nearest other frame; the network
+        does not see the weights, and takes hidden joints where they are given. Differentiable.
 
     Raises:
         TensorsimError: other shapes, NaN, negative weights, no frames, or a picture without pixels.
@@ -235,10 +235,10 @@ class VideoPoseLifter(nn.Module):
         u = (joints[..., 0] - (self.image_width - 1) / 2) / (self.image_width / 2)
         v = (joints[..., 1] - (self.image_height - 1) / 2) / (self.image_width / 2)
         found = torch.zeros(joints.shape[:-1] + (3,), dtype=joints.dtype, device=joints.device)  # noqa: RUF005  # as TorchScript has it
-        if joints.numel() > 0:  # the network refuses tracks of nobody
+        if joints.numel() > 0:  # the network refuses empty input
             found = self.network(torch.stack([u, v], dim=-1))
         right_down_away = h36m_to_body(found)
-        # Axes of the pool of poses: x right, y away, z up; in heights of this body about the hips.
+        # Axes of the pool of poses: x right, y away, z up; relative to the hips, in heights of this body.
         pose = torch.stack(
             [right_down_away[..., 0], right_down_away[..., 2], -right_down_away[..., 1]], dim=-1
         )

@@ -27,7 +27,7 @@ def assign(cost: Tensor, allowed: Tensor, unassigned_cost: float) -> Tensor:
 
     Returns:
         (n,) int64 column of each row, -1 where unassigned, on the device of ``cost``. Which of several
-        matchings of equal cost it is, is not specified, but always the same.
+        matchings of equal cost is returned is unspecified but deterministic.
 
     Raises:
         TensorsimError: wrong rank, dtype or shapes, or a cost that is not finite.

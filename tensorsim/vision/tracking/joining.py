@@ -1,4 +1,4 @@
-"""Tracks that are one person: those that follow two parts of a body, and those that go on where another ended."""
+"""Tracks that are one person: those that follow two parts of a body, and those that continue where another ended."""
 
 import torch
 from torch import Tensor
@@ -19,21 +19,22 @@ def join_tracks(
 
     Two tracks are one person if
 
-    - both are there at a time, the smaller box mostly inside the other (median of :func:`contained` at least 0.6),
-      and in at most a quarter of these frames both have detections of ``strong_score``: two people who hug are both
-      detected, a body that crouches is once found whole and once in part; or
+    - both are present at the same time, the smaller box mostly inside the other (median of :func:`contained` at least
+      0.6), and in at most a quarter of these frames both have detections of ``strong_score``: two people who hug are
+      both detected, while a crouching body is found once whole and once in part; or
     - one starts at most ``longest_gap`` observed frames after the other ended, or while it ends (in the first quarter
-      of its own frames), and the last box of the one and the next one of the other cover each other by half. Somebody
-      who falls changes the shape of the box at once.
+      of its own frames), and of the last box of the one and the next box of the other, one covers at least half of the
+      smaller one. The box of somebody who falls changes its shape abruptly.
 
-    In frames of both the detection with the better score is taken. Tracks are joined until no pair is left.
+    In frames where both have a detection, the one with the better score is kept. Tracks are joined until no pair is
+    left.
 
     Args:
         table: (I, T) int64 detection of each track in each frame, -1 for none.
         boxes: (T, K, 4) xyxy.
         scores: (T, K).
         looked: (T,) bool, the frames that were observed.
-        strong_score: from which a detection is sure.
+        strong_score: score from which a detection is certain.
         longest_gap: in observed frames.
 
     Returns:
@@ -79,7 +80,7 @@ def _same(
             return True
     if int(last) < int(first):
         return False
-    # Frames of both: a track stays at its last box for a frame in which only the other is matched.
+    # Frames during both: a track stays at its last box in a frame in which only the other is matched.
     stop = torch.minimum(at_a[-1], at_b[-1])
     time = torch.arange(a.shape[0], device=a.device)
     both = time[(time >= first) & (time <= stop) & ((a >= 0) | (b >= 0))]

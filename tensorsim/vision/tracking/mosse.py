@@ -5,7 +5,7 @@ filters", CVPR 2010. With F the Fourier transform of what is in the box and G th
 
     A = eta G conj(F) + (1 - eta) A,    B = eta F conj(F) + (1 - eta) B,    conj(H) = A / (B + epsilon)
 
-and the peak of the inverse transform of ``F conj(H)`` in the next frame is where the target went. The box
+and the peak of the inverse transform of ``F conj(H)`` in the next frame shows where the target went. The box
 keeps its size.
 """
 
@@ -29,7 +29,7 @@ from tensorsim.errors import (
 from tensorsim.geometry.boxes import center_to_xyxy, xyxy_to_center
 from tensorsim.types import Detections, Tracks
 
-#: Turn in radians and growth of the first box in the eight pictures that a filter starts from, besides the box itself.
+#: Rotation in radians and scale of the first box in the eight pictures that, besides itself, initialise a filter.
 _WARPS = (
     (0.05, 1.0), (-0.05, 1.0), (0.1, 1.0), (-0.1, 1.0), (0.0, 0.95), (0.0, 1.05), (0.05, 1.03), (-0.05, 0.97),
 )  # fmt: skip
@@ -37,7 +37,7 @@ _EPSILON = 1e-5
 
 
 def prepared(patches: Tensor, window: Tensor, epsilon: float = _EPSILON) -> Tensor:
-    """Grey patches (..., S, S) in [0, 1] as the filter takes them: logarithm, mean 0, norm 1, times a window (S, S)."""
+    """Grey patches (..., S, S) in [0, 1] prepared for the filter: logarithm, mean 0, norm 1, times a window (S, S)."""
     x = torch.log1p(255 * patches)
     x = x - x.mean((-2, -1), keepdim=True)
     norm = x.square().sum((-2, -1), keepdim=True).sqrt()

@@ -7,19 +7,20 @@ from tensorsim.body.skeleton import mid_hips
 from tensorsim.errors import TensorsimError
 from tensorsim.types import Pose
 
-#: Hips that leave a circle of this radius about their mean place, or hands that stray as far from theirs, are motion.
+#: Hips, a head or hands that get further than this from their median position count as motion.
 MOVING_M = 0.25
 
 
 def select_people(pose: Pose, mode: str, fps: float) -> Pose:
-    """The people of one clip that count; the others become invalid, and numbers stay.
+    """Select the people of one clip that count; the others become invalid, and numbers stay the same.
 
     Args:
         pose: of one clip (B = 1).
-        mode: ``"all"``; ``"moving"``, those whose hips, head or hands travel by more than :data:`MOVING_M` about where
-            they mostly are (bystanders that sit or stand are left out); ``"nearest"``, the one with the least mean
+        mode: ``"all"``; ``"moving"``, those whose hips, head or hands get more than :data:`MOVING_M` away from where
+            they mostly are (bystanders who sit or stand are left out); ``"nearest"``, the one with the smallest mean
             range; or the number of a person, from ``"1"``.
-        fps: frames per second; somebody there for less than a quarter of a second is not the nearest.
+        fps: frames per second; somebody present for less than a quarter of a second does not count as the nearest,
+            unless everybody is.
 
     Raises:
         TensorsimError: another mode, no such person, or several clips.

@@ -2,7 +2,7 @@
 
 The state of a track is its box (centre u, centre v, width, height) and their velocities, 8 numbers, moving
 with constant velocity. Noise is stated in sizes of the box (its longer side), so that pixels do not matter,
-and alike for the four coordinates, so that they share one 2 x 2 covariance. Frame by frame: Kalman prediction,
+and is the same for the four coordinates, so that they share one 2 x 2 covariance. Frame by frame: Kalman prediction,
 Hungarian assignment of detections to tracks, Kalman update, confirmation (M of N), deletion. As the whole clip is
 known, the boxes returned are then smoothed in both directions.
 """
@@ -79,24 +79,25 @@ class GNNTracker(nn.Module):
     2. Hungarian assignment in two passes (as in ByteTrack, Zhang et al., ECCV 2022), first of detections of at least
        ``start_score``, then of the others to the tracks that are left. The cost of a pair is ``(1 - IoU) + d^2 /
        assignment_threshold``, d the Mahalanobis distance of the detection to the predicted box, so that the distance
-       decides where boxes do not overlap, plus the share of ``delete_window`` since the last match, as the
-       covariance of a lost track admits much, plus ``1 - score``. A pair needs ``d^2 <= assignment_threshold``,
-       centres within ``reach`` sizes and areas within a factor of 4; in the second pass also an IoU of
-       ``weak_iou``, so that a lost person is not found in a piece of furniture, and a detection that is no
-       duplicate of a matched one. A confirmed track with a match in the last ``confirm_window`` observed frames
-       may there take one of ``faint_score`` whatever d, also if one box covers half of the other, unless a
-       fifth of it is covered by a matched one: somebody who lies down is found badly, in a box of another
-       shape. Any such pair is better than none.
+       decides where boxes do not overlap, plus the time since the last match as a share of ``delete_window``, as the
+       covariance of a lost track allows almost anything, plus ``1 - score``. A pair needs ``d^2 <=
+       assignment_threshold``, centres within ``reach`` sizes and areas within a factor of 4; in the second pass also
+       an IoU of at least ``weak_iou``, so that a lost person is not found in a piece of furniture, and a detection
+       that does not duplicate a matched one. In that pass a confirmed track with a match in the last
+       ``confirm_window`` observed frames may take a detection of at least ``faint_score`` with any d, also if instead
+       of the IoU one box covers half of the other, unless the detection and a matched one overlap by more than a
+       fifth of the smaller box: somebody who lies down is detected poorly, in a box of another shape. Any such pair is
+       better than none.
     3. An unmatched detection of at least ``start_score`` starts a track, unless it overlaps a better or
        matched one by an IoU above ``duplicate_iou``, or with more than ``duplicate_part`` of its own area:
        one person detected twice.
     4. A track is confirmed by ``confirm_hits`` within ``confirm_window`` observed frames (else dropped) and
        ends after ``delete_misses`` within ``delete_window``.
-    5. People are the confirmed tracks with at least ``min_hits`` detections of ``start_score`` or more (in a clip
-       with fewer observed frames: one in each), as tracks of low scores are mostly false. Of more than
-       ``max_tracks`` at a time the best, by sum of scores, are kept.
-    6. Tracks that follow one person, together or one after the other, are joined:
+    5. Confirmed tracks that follow one person, at the same time or one after the other, are joined:
        :func:`~tensorsim.vision.tracking.joining.join_tracks`.
+    6. People are the tracks with at least ``min_hits`` detections of ``start_score`` or more (in a clip with fewer
+       observed frames: one in each), as tracks of low scores are mostly false. If there are more than ``max_tracks``
+       at a time, the best by sum of scores are kept.
     7. A person is valid from first to last detection, gaps included, and in unobserved frames next to these.
        The boxes are Rauch-Tung-Striebel smoothed; they may reach beyond the image a little.
 
@@ -110,16 +111,16 @@ class GNNTracker(nn.Module):
         detection_threshold: smallest score of a detection that counts.
         min_box_px: smallest width and height of a detection that counts.
         start_score: score from which a detection starts a track, and is matched without overlap.
-        weak_iou: IoU with the predicted box that a detection of less needs.
-        faint_score: smallest score of a detection that continues a confirmed, recently matched track; it counts for
-            nothing else.
+        weak_iou: IoU with the predicted box that a detection below ``start_score`` needs.
+        faint_score: smallest score of a detection that continues a confirmed, recently matched track; below
+            ``detection_threshold`` it counts for nothing else.
         min_hits: detections of at least ``start_score`` from which a confirmed track is a person.
         process_noise: density of the acceleration noise, size^2 / frame^3.
         measurement_noise: variance of a detected coordinate, size^2.
         initial_speed: prior standard deviation of the velocities, sizes / frame.
         reach: largest distance of a detection from the predicted centre, in sizes of the box.
-        duplicate_iou: IoU with a better detection above which one starts no track.
-        duplicate_part: part of its area inside a better detection above which one starts no track.
+        duplicate_iou: IoU with a better detection above which a detection starts no track.
+        duplicate_part: share of its area inside a better detection above which a detection starts no track.
 
     Raises:
         TensorsimError: settings out of range; shapes that do not fit; boxes or scores not finite where valid.
@@ -184,7 +185,7 @@ class GNNTracker(nn.Module):
         self.min_box_px = float(min_box_px)
         self.start_score = max(float(start_score), float(detection_threshold))
         self.weak_iou = float(weak_iou)
-        # A detection that counts is never less sure than one that only continues a track.
+        # A detection that counts never has a lower score than one that only continues a track.
         self.faint_score = min(float(faint_score), float(detection_threshold))
         self.min_hits = min_hits
         self.process_noise = float(process_noise)
@@ -234,11 +235,11 @@ class GNNTracker(nn.Module):
         return Tracks(tracked.to(device, detections.boxes.dtype), valid.to(device), matched.to(device))
 
     def _associate(self, boxes: Tensor, scores: Tensor, usable: Tensor, looked: Tensor) -> Tensor:
-        """Which detection each confirmed track of one clip is in every frame (I, T), -1 where none."""
+        """Which detection each confirmed track of one clip has in every frame (I, T), -1 for none."""
         frames = boxes.shape[0]
         confirmed = torch.zeros(0, dtype=torch.bool)
         living = self._start(torch.zeros(0, dtype=torch.int64), boxes.new_zeros(0, 4))
-        # Which track was matched to which detection when, of all frames.
+        # Which track was matched to which detection in which frame, over all frames.
         rows, times, found = [living.rows], [living.rows], [living.rows]
         for t in range(frames):
             predicted = constant_velocity_predict(living.box, self._process_noise(), 1.0)
@@ -274,7 +275,7 @@ class GNNTracker(nn.Module):
         return table
 
     def _alive(self, living: Living, confirmed: Tensor) -> Tensor:
-        """(n,) bool, which tracks go on."""
+        """(n,) bool, which tracks continue."""
         misses = living.age.clamp(max=self.delete_window) - living.history[:, : self.delete_window].sum(-1)
         return torch.where(confirmed, misses < self.delete_misses, living.age < self.confirm_window)
 
@@ -322,7 +323,7 @@ class GNNTracker(nn.Module):
         column = assign(
             cost, near & (distance <= self.assignment_threshold) & (score >= self.start_score), 5.0
         )
-        # Second association: tracks and detections that are left, but none that shows somebody who was found.
+        # Second association: the remaining tracks and detections, without those that show a person already matched.
         left, taken = column < 0, column[column >= 0]
         free = ~self._double(box)[taken].any(0)
         free[taken] = False
