@@ -42,12 +42,12 @@ def cycle_s(relative_speed: Tensor) -> Tensor:
 
 
 def stance_share(relative_speed: Tensor) -> Tensor:
-    """The part of a cycle that a foot is on the floor: (0.752 Tc - 0.143 s) / Tc."""
+    """The share of a cycle for which a foot is on the floor: (0.752 Tc - 0.143 s) / Tc."""
     return 0.752 - 0.143 / cycle_s(relative_speed)
 
 
 def periodic_pchip(knots: Tensor, values: Tensor, phase: Tensor) -> Tensor:
-    """Shape-preserving piecewise cubic of period 1 (Fritsch and Butland 1984, as SciPy and MATLAB have it).
+    """Shape-preserving piecewise cubic of period 1 (Fritsch and Butland 1984, as in SciPy and MATLAB).
 
     Args:
         knots: (..., K) ascending, K >= 2, all within one period: last - first <= 1 (equal: the two are one point).
@@ -165,7 +165,7 @@ def boulic_gait(relative_speed: Tensor, phase: Tensor) -> Gait:
         A :class:`Gait` in the dtype of ``phase``. Differentiable.
 
     Raises:
-        TensorsimError: a speed outside of the model, or shapes that do not go together.
+        TensorsimError: a speed outside the range of the model, or shapes that do not fit together.
     """
     check_floating(phase, "phase")
     check_finite(phase, "phase")
@@ -191,7 +191,8 @@ def boulic_gait(relative_speed: Tensor, phase: Tensor) -> Gait:
         return torch.sin(2 * math.pi * cycles)
 
     quick = rv > 0.5
-    # The printed signs of slow sway and surge are the opposite: at 0.5 the body would jump by twice their size.
+    # The printed signs of slow sway and surge are the opposite: with them the body would jump by twice their size at
+    # a speed of 0.5.
     sway = torch.where(quick, -0.032, 0.128 * rv**2 - 0.128 * rv)
     surge = torch.where(quick, -0.021, 0.084 * rv**2 - 0.084 * rv)
     bow = torch.where(quick, 2.0, -8 * rv**2 + 8 * rv)

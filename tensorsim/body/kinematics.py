@@ -19,9 +19,9 @@ class BodyPose(NamedTuple):
         heading: (...) turn of the whole body about the vertical, counter-clockwise seen from above.
         lean: (...) tilt of the whole body, forward positive; 90 degrees is lying prone.
         roll: (...) tilt of the whole body to its right.
-        trunk: (..., 3) pitch (forward), roll (to the right), twist (counter-clockwise) against the body.
+        trunk: (..., 3) pitch (forward), roll (to the right), twist (counter-clockwise) relative to the body.
         pelvis: (..., 2) roll (right side down) and yaw (counter-clockwise).
-        head: (..., 2) pitch (down) and yaw (counter-clockwise) against the trunk.
+        head: (..., 2) pitch (down) and yaw (counter-clockwise) relative to the trunk.
         shoulder: (..., 2, 3) right then left: flexion (forward), abduction (sideways), rotation (inwards).
         elbow: (..., 2) flexion.
         hip: (..., 2, 2) right then left: flexion (forward), abduction (sideways).
@@ -111,7 +111,7 @@ def forward_kinematics(
 def rest_on_floor(joints: Tensor, height_m: Tensor | float = 1.0) -> Tensor:
     """Shift poses (..., 14, 3) vertically so that their lowest joint rests on z = 0.
 
-    Standing, that is an ankle at its anatomical height; lying or kneeling, a joint with flesh around it.
+    When standing, that is an ankle at its anatomical height; when lying or kneeling, a joint with flesh around it.
     """
     clearance = [ANKLE_HEIGHT if name.endswith("ankle") else FLESH for name in JOINTS]
     height = torch.as_tensor(height_m, dtype=joints.dtype, device=joints.device)

@@ -1,7 +1,7 @@
 """Lengths of the segments of a body as fractions of its height: the one place for these numbers.
 
 Winter, *Biomechanics and Motor Control of Human Movement*, after Drillis and Contini, except the half widths of
-shoulders and hips and the place of the nose, which are those of key points in pictures.
+shoulders and hips and the position of the nose, which are those of key points in pictures.
 """
 
 from typing import NamedTuple
@@ -16,10 +16,10 @@ HALF_HIPS = 0.06
 HALF_SHOULDERS = 0.105
 UPPER_ARM = 0.186
 FOREARM = 0.146
-#: The nose seen from the middle of the shoulders: forward and up.
+#: Position of the nose relative to the middle of the shoulders: forward and up.
 NOSE_FORWARD = 0.06
 NOSE_UP = 0.11
-#: Height over the floor of a joint that rests on it; ankles stand at their own height.
+#: Height above the floor of a joint that rests on it; ankles have their own height.
 FLESH = 0.045
 
 

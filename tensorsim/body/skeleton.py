@@ -40,7 +40,7 @@ def mid_hips(joints: Tensor) -> Tensor:
     """Middle of the hips, the root of the skeleton: (..., 14, D) -> (..., D)."""
     return 0.5 * (
         joints[..., 8, :] + joints[..., 11, :]
-    )  # literals: TorchScript reads no constants of modules
+    )  # literals: TorchScript cannot read module constants
 
 
 def lowest_ankle(joints: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ def bone_lengths(joints: Tensor, ends: Tensor) -> Tensor:
     """Lengths (..., 12) of the bones of bodies (..., 14, 3).
 
     Args:
-        joints: in any unit of length; below a thousandth of it a length is that.
+        joints: in any unit of length; lengths are at least a thousandth of it.
         ends: (2, 12) int64, ``torch.tensor(BONES).T``, which TorchScript cannot read here.
     """
     points = torch.cat([joints, mid_hips(joints)[..., None, :]], dim=-2)
@@ -85,10 +85,10 @@ def mirror(joints: Tensor) -> Tensor:
 
 
 class Marks(NamedTuple):
-    """Where people mark joints in pictures, and networks that learn from them, beside the centres of the joints.
+    """Where people, and networks trained on their marks, see joints in pictures, relative to the joint centres.
 
-    Hips, knees, ankles and elbows of COCO are not where the bones turn. Shares of the segment, to half a percent of it
-    the means of two networks that learnt from people's marks (``python -m tests.benchmarks.eval_key_points``).
+    Hips, knees, ankles and elbows of COCO are not where the bones turn. Offsets are shares of a segment, the means of
+    two networks trained on people's marks, to half a percent (``python -m tests.benchmarks.eval_key_points``).
 
     Attributes:
         elbow: above the joint, of the upper arm.
@@ -106,8 +106,8 @@ class Marks(NamedTuple):
 def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> tuple[Tensor, Tensor]:
     """The 14 joints of ``tensorsim.JOINTS`` from the 17 key points of COCO.
 
-    Elbows, hips, knees and ankles move from where COCO marks them to the joints (:class:`Marks`), as far as the
-    scores of the other key points that this takes reach ``threshold``.
+    Elbows, hips, knees and ankles move from where COCO marks them to the joints (:class:`Marks`): fully if the other
+    key points that this needs score ``threshold`` or more, less the lower they score.
 
     The head is the nose. From behind, the nose is hidden and its score low: as the score falls below
     ``threshold``, the head moves to the score-weighted mean of eyes and ears, which from behind lies where
@@ -116,7 +116,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
     Args:
         keypoints: (..., 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
         scores: (..., 17).
-        threshold: score from which the nose counts as visible.
+        threshold: score from which the nose, and the key points that others are moved by, count as visible.
 
     Returns:
         joints (..., 14, 2) in pixels and scores (..., 14). Differentiable.
@@ -169,7 +169,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
     return torch.cat(joints, dim=-2), torch.cat(joint_scores, dim=-1)
 
 
-#: Eyes and ears seen from the nose: sideways, backward and up, in body heights.
+#: Eyes and ears relative to the nose: sideways, backward and up, in body heights.
 _EYE = (0.018, 0.014, 0.019)
 _EAR = (0.043, 0.060, 0.010)
 
@@ -177,8 +177,8 @@ _EAR = (0.043, 0.060, 0.010)
 def body_to_coco(joints: Tensor) -> Tensor:
     """The 17 key points of COCO from the 14 joints of the radar body.
 
-    Eyes and ears are placed about the nose in a frame that neck and nose (which give its size too) and the
-    line of the shoulders span: they follow only a part of a rotation of the head relative to the trunk.
+    Eyes and ears are placed about the nose in a frame spanned by the line from neck to nose (which also sets its
+    size) and that of the shoulders: they follow only part of a rotation of the head relative to the trunk.
 
     Args:
         joints: (..., 14, 3) metres, order of ``tensorsim.JOINTS``, any frame with right-handed axes.

@@ -72,7 +72,7 @@ def letterbox(images: Tensor, side: int, grey: float = LETTERBOX_GREY) -> Tensor
     Returns:
         (B, C, side, side) int32 in 0 to 255.
     """
-    # Equal to cv2.resize and cv2.copyMakeBorder, which are not scripted: see OnnxDetector.
+    # Equal to cv2.resize and cv2.copyMakeBorder, which cannot be scripted: see OnnxDetector.
     height, width = letterbox_size(images.shape[-2], images.shape[-1], side)
     scaled = resize_8bit(images, height, width)
     return F.pad(scaled, [0, side - width, 0, side - height], value=grey)
@@ -154,9 +154,9 @@ def non_maximum_suppression(
 ) -> tuple[Tensor, Tensor]:
     """Greedy non-maximum suppression per class, exact, for a batch.
 
-    Takes the best box left, drops it and all of its class that overlap it by more than ``iou_threshold``, and
-    repeats. One step treats the whole batch and needs one row of the overlap matrix: to keep k of n boxes
-    costs O(k n) time and O(n) memory. Of equal scores the first box wins.
+    Takes the best remaining box, drops it and all of its class that overlap it by more than ``iou_threshold``, and
+    repeats. One step processes the whole batch and needs one row of the overlap matrix: keeping k of n boxes
+    costs O(k n) time and O(n) memory. Among equal scores the first box wins.
 
     Args:
         boxes: (B, n, 4).

@@ -12,7 +12,7 @@ NEAR_M = 0.1
 
 
 class Pinhole(nn.Module):
-    """A camera inside of stages, which script.
+    """A camera for use inside stages that are scripted.
 
     Args:
         camera: its configuration.
@@ -81,7 +81,7 @@ def project(points: Tensor, focal: float, center: tuple[float, float], pose: Ten
     # Equal to kornia.geometry.project_points after transform_points, which take more than twice as long.
     local = torch.matmul(points - pose[:, 3], pose[:, :3])
     depth = local[..., 2]
-    scale = focal / depth.clamp(min=0.1)  # NEAR_M: TorchScript reads no constants of modules
+    scale = focal / depth.clamp(min=0.1)  # NEAR_M: TorchScript cannot read module constants
     return local[..., :2] * scale[..., None] + torch.tensor(center).to(local), depth
 
 

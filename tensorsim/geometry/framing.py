@@ -12,8 +12,8 @@ from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, pri
 
 #: Extent of a body beyond its joints: above the nose and below the ankles.
 _ABOVE_M, _BELOW_M = 0.25, 0.10
-#: Shares of the longer side of an upright person's keypoints from the outermost ones to the left, top, right and bottom
-#: of the box that the detector finds, measured on rendered films.
+#: Margins from the outermost keypoints of an upright person to the left, top, right and bottom of the box that the
+#: detector finds, as shares of the longer side of the keypoints' extent; measured on rendered films.
 BOX_MARGINS = (0.045, 0.07, 0.045, 0.09)
 #: Smallest field of view, also for small motion.
 _NARROWEST_RAD = math.radians(40.0)
@@ -84,8 +84,8 @@ def seen_keypoints(
 def keypoint_boxes(keypoints: Tensor, scores: Tensor) -> Tensor:
     """Boxes (..., 4) ``xyxy`` about keypoints (..., 17, 2) with a score; zeros without any.
 
-    Keypoints lie inside of bodies: boxes are wider by :data:`BOX_MARGINS` of their longer side, as those of the
-    detector are.
+    Keypoints lie inside bodies, so boxes are enlarged by :data:`BOX_MARGINS` of their longer side, to be like those of
+    the detector.
     """
     visible = (scores > 0)[..., None]
     low = torch.where(visible, keypoints, math.inf).amin(dim=-2)

@@ -8,8 +8,8 @@ from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose, Runtime
 from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
-#: What runs the detector and what the pose network, by engine. The detector stays in float32: with boxes that move, in
-#: bfloat16 as in integers, key points would be several times as far off.
+#: What runs the detector and the pose network, by engine. The detector stays in float32: in bfloat16 or in integers its
+#: boxes would shift, and key points would be several times as far off.
 _RUNTIMES: dict[str, tuple[Runtime, Runtime]] = {
     "onnxruntime": ("onnxruntime", "onnxruntime"),
     "openvino": ("openvino", "openvino-bfloat16"),
@@ -19,7 +19,7 @@ ENGINES = (*_RUNTIMES, "torch")
 
 
 def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.Module]:
-    """The same two stages with their networks run by an engine, as far as they are of this package.
+    """The two stages with their networks run by an engine; stages that are not this package's are unchanged.
 
     Args:
         engine: ``"onnxruntime"`` runs both in float32; ``"int8"`` the pose network in 8-bit integers; ``"openvino"``

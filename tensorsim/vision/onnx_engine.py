@@ -1,8 +1,8 @@
-"""Networks of this package in ONNX Runtime or OpenVINO, which join convolutions with what follows them.
+"""Networks of this package in ONNX Runtime or OpenVINO, which fuse convolutions with what follows them.
 
 A network is exported once and kept in the user's cache, by its class, its weights, and the versions of torch and of
-this package. The pose network also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), in ranges that crops of
-rendered people have, or, in OpenVINO, in bfloat16.
+this package. The pose network also runs in 8-bit integers (:mod:`tensorsim.vision.quantise`), with ranges taken from
+crops of rendered people, or, in OpenVINO, in bfloat16.
 """
 
 import hashlib
@@ -29,10 +29,10 @@ from tensorsim.geometry.boxes import LETTERBOX_GREY, letterbox_size
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
 
-#: Held while a network is opened: parts of a film come in several threads, and the exporter stands only one.
+#: Held while a network is opened: parts of a film are processed in several threads, and the exporter allows only one.
 _OPENING = Lock()
 
-#: What runs a network: in float32 but for ``"int8"`` (ONNX Runtime, 8-bit integers) and ``"openvino-bfloat16"``.
+#: What runs a network: in float32, except ``"int8"`` (ONNX Runtime, 8-bit integers) and ``"openvino-bfloat16"``.
 Runtime = Literal["onnxruntime", "int8", "openvino", "openvino-bfloat16"]
 Images = npt.NDArray[np.float32]
 #: Images (N, 3, H, W) to outputs (N, ...).
@@ -42,13 +42,13 @@ Run = Callable[[Images], list[Images]]
 class OnnxEngine(nn.Module):
     """Runs a network (N, 3, H, W) -> one or several tensors (N, ...) in another runtime on the CPU.
 
-    Images on other devices, of another dtype or size, or with gradients are given to the network itself. The runtime
-    keeps the weights of its first call: where they change later, build a new engine. In float32 answers agree to
+    Images on other devices, of another dtype or size, or with gradients are passed to the network itself. The runtime
+    keeps the weights of its first call: if they change later, build a new engine. In float32 outputs agree to
     rounding (1e-5 of the largest), in bfloat16 and in 8-bit integers, for crops of people in [0, 1], to about 5 % of
     the largest. Bfloat16 is for processors with instructions for it; on others OpenVINO computes in float32.
 
     Args:
-        network: with static shapes but for N; it is put into evaluation mode.
+        network: with static shapes except for N; it is put into evaluation mode.
         size: (H, W).
         runtime: what runs it.
 
@@ -79,7 +79,7 @@ class OnnxEngine(nn.Module):
         return [torch.from_numpy(output) for output in self._run(images.contiguous().numpy())]
 
     def extra_repr(self) -> str:
-        """What runs it: results that are kept by the ``repr`` of a network are those of one runtime."""
+        """What runs it: results are cached by the ``repr`` of a network, so each runtime has its own."""
         return f"runtime={self.runtime!r}"
 
     def __getstate__(self) -> dict[str, Any]:
@@ -196,7 +196,7 @@ def _exported(network: nn.Module, size: tuple[int, int]) -> bytes:
     """The network as an ONNX file with any number of images."""
     example, file = torch.zeros(2, 3, *size), io.BytesIO()
     with torch.inference_mode(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter by tracing, which torch replaces with a slower one
+        warnings.simplefilter("ignore")  # of the tracing exporter, which torch is replacing with a slower one
         count = len(_flat(network(example)))
         names = [f"output_{index}" for index in range(count)]
         torch.onnx.export(
@@ -216,7 +216,7 @@ def _in_onnxruntime(model: bytes) -> Run:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
-    # Threads that spin while others work slow those down.
+    # Spinning threads slow down those that work.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     return lambda images: session.run(None, {"images": images})
@@ -229,14 +229,14 @@ def _in_openvino(model: bytes, threads: int, bfloat16: bool, cache: Path | None)
     core = openvino.Core()
     settings: dict[str, Any] = {
         "INFERENCE_PRECISION_HINT": "bf16" if bfloat16 else "f32",
-        # One thread for each of those that call.
+        # One stream and thread for each calling thread.
         "NUM_STREAMS": threads,
         "INFERENCE_NUM_THREADS": threads,
     }
     if cache is not None:  # compiled networks, which take a third of the time to open
         settings["CACHE_DIR"] = str(cache)
     compiled = core.compile_model(core.read_model(model), "CPU", settings)
-    # The first call of a process makes its table of NumPy types: two at a time would wait for each other forever.
+    # The first such call in a process builds the table of NumPy types; two at a time would deadlock.
     openvino.Type.f32.to_dtype()
     of_thread = local()
 

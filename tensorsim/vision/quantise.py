@@ -1,4 +1,4 @@
-"""Networks in 8-bit integers: weights by channel, values between layers by the range that examples have."""
+"""Networks in 8-bit integers: weights scaled by channel, values between layers by their range in examples."""
 
 import tempfile
 from pathlib import Path
@@ -10,7 +10,7 @@ from torch import Tensor
 def quantised(model: bytes, examples: Tensor) -> bytes:
     """An ONNX network whose convolutions are in 8 bits: half the time or less where the processor has VNNI.
 
-    Weights have 7 bits, because the sums of processors without VNNI overflow otherwise.
+    Weights have 7 bits, because sums would overflow on processors without VNNI otherwise.
 
     Args:
         model: with an input ``images``.

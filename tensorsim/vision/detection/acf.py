@@ -18,7 +18,7 @@ from tensorsim.vision.detection.acf_features import CELL, CHANNELS, pyramid
 #: Cells of a window, and pixels of the person in the middle of it.
 ROWS, COLUMNS = 32, 16
 PERSON_HEIGHT, PERSON_WIDTH = 100.0, 41.0
-#: Trees that are evaluated between two looks at which windows are left.
+#: Trees that are evaluated before rejected windows are dropped.
 _BLOCK = 32
 
 
@@ -31,7 +31,7 @@ def evaluate_trees(
     right-right.
 
     Args:
-        features: (C) values of a level, flat.
+        features: (C) values of a level, flattened.
         base: (W,) where each window begins in them.
         place: (T, 3) offsets of the features of the root and of its left and right child.
         threshold: (T, 3).
@@ -51,7 +51,7 @@ def evaluate_trees(
 def suppress(boxes: Tensor, scores: Tensor, overlap: float, most: int) -> Tensor:
     """Indices of boxes (N, 4), best first, at most ``most``.
 
-    None shares more than ``overlap`` of the area of the smaller of the two with a better one.
+    None overlaps a better one by more than ``overlap`` of the area of the smaller of the two.
     """
     order: list[int] = scores.argsort(dim=0, descending=True, stable=True).tolist()
     kept: list[int] = []
@@ -67,14 +67,14 @@ def suppress(boxes: Tensor, scores: Tensor, overlap: float, most: int) -> Tensor
 class AcfDetector(nn.Module):
     """Finds upright people, with the interface of :class:`~tensorsim.vision.RTMDet`.
 
-    Windows of 128x64 pixels, 4 apart, at eight scales per octave. A window is left as soon as the sum of its trees
+    Windows of 128x64 pixels, 4 apart, at eight scales per octave. A window is rejected as soon as the sum of its trees
     falls below ``cascade``. The score is ``sigmoid(sum - offset)``.
 
     Args:
         trees: number of trees; those of a new detector are empty, :meth:`from_pretrained` and training fill them.
-        cascade: the sum below which a window is left.
-        octaves_up: how often the image is doubled first: 0 finds people from 100 pixels of height on, 1 from 50.
-        overlap: part of the smaller of two boxes that both may share.
+        cascade: the sum below which a window is rejected.
+        octaves_up: how often the image is first doubled in size: 0 finds people from 100 pixels tall on, 1 from 50.
+        overlap: largest share of the smaller of two boxes that may overlap.
         score_threshold: detections score more than this.
         max_detections: K, the padded count.
 

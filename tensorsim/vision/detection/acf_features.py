@@ -13,7 +13,7 @@ from torch import Tensor
 
 #: L, u, v; the magnitude of the gradient; six orientations.
 CHANNELS = 10
-#: Pixels along a cell.
+#: Side of a cell in pixels.
 CELL = 4
 
 
@@ -42,7 +42,7 @@ def luv(images: Tensor) -> Tensor:
 
 
 def gradients(x: Tensor, radius: int = 5, constant: float = 0.005) -> tuple[Tensor, Tensor]:
-    """Magnitude, over its mean nearby, and orientation in [0, pi), of the strongest of channels.
+    """Magnitude, divided by its local mean, and orientation in [0, pi), of the channel with the strongest gradient.
 
     (B, C, H, W) to (B, H, W) each.
     """
@@ -71,9 +71,9 @@ def aggregate_channels(images: Tensor, cell: int = CELL) -> Tensor:
 
 
 def rescaled(channels: Tensor, height: int, width: int, ratio: float, exponent: float = 0.11) -> Tensor:
-    """Channels (B, 10, h, w) as they would be of the image ``ratio`` times as large.
+    """Channels (B, 10, h, w) as they would be for an image ``ratio`` times as large.
 
-    Gradients follow the power law with the published exponent, colour stays.
+    Gradients follow the power law with the published exponent, colour is only resampled.
     """
     moved = F.interpolate(channels, [height, width], mode="bilinear", align_corners=False)
     return torch.cat([moved[:, :3], moved[:, 3:] * ratio**-exponent], dim=1)
@@ -87,13 +87,13 @@ def pyramid(
     Args:
         images: (B, 3, H, W) RGB in [0, 1].
         rows, columns: cells of the smallest level.
-        octaves_up: how often the image is doubled first, for small people.
-        per_octave: levels per octave, of which one is computed.
-        cell: pixels along a cell.
+        octaves_up: how often the image is first doubled in size, for small people.
+        per_octave: levels per octave, of which one is computed and the others resampled.
+        cell: side of a cell in pixels.
 
     Returns:
-        Channels (B, 10, h, w) of each level, largest first, and image pixels of the level per pixel of the image; both
-        empty for an image that is smaller than a window.
+        Channels (B, 10, h, w) of each level, largest first, and its scale relative to the image; both empty for an
+        image that is smaller than a window.
     """
     height, width = images.shape[-2], images.shape[-1]
     levels: list[Tensor] = []

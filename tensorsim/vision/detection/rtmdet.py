@@ -23,7 +23,7 @@ class RTMDet(nn.Module):
     Letterbox, normalisation, network, decoding and class-aware non-maximum suppression are one graph of
     tensor operations. It scripts, and it goes through torch.export for one image size and (with a dynamic
     dimension) any batch; exported, suppression is unrolled to ``max_detections`` steps. Images are rounded to
-    8 bits, as the network was trained, so only :meth:`dense` is differentiable by its input.
+    8 bits, as the network was trained, so only :meth:`dense` is differentiable with respect to its input.
 
     A fresh module is in training mode; call ``eval()`` before use (``from_pretrained`` does).
 
@@ -111,7 +111,7 @@ class RTMDet(nn.Module):
 
         path = locate(source, cls.__name__)
         stated = read_metadata(path)
-        with reading(path, "weights of RTMDet"):  # of another network, they state other things
+        with reading(path, "weights of RTMDet"):  # those of other networks have other metadata
             kinds = {"input_size": int, "nms_iou": float}
             options = {name: kinds[name](stated[name]) for name in kinds if name in stated} | options
         if path.suffix == ".onnx":
@@ -218,7 +218,7 @@ def variant_of(state_dict: dict[str, Tensor], source: str | os.PathLike[str]) ->
         raise TensorsimError(
             f"{source}: got no backbone.stem.0 and bbox_head.rtm_cls.0, expected weights of RTMDet"
         )
-    # Every variant has depthwise 5x5 convolutions, 3x3 ones only those of separable convolutions throughout.
+    # Every variant has depthwise 5x5 convolutions; only those with separable convolutions throughout have 3x3 ones.
     depthwise = any(tensor.shape[1:] == (1, 3, 3) for tensor in state_dict.values())
     for variant, size in RTMDET_SIZES.items():
         if (stem.shape[0], head.shape[0], depthwise) == (

@@ -109,7 +109,7 @@ def _call_order(network: nn.Module) -> list[tuple[str, ConvModule | nn.Conv2d]]:
     called: list[tuple[str, ConvModule | nn.Conv2d]] = []
     handles = []
     for path, module in network.named_modules():
-        # The `conv` of a ConvModule counts with its owner, which is one per level where it is not.
+        # The `conv` of a ConvModule counts with the module, of which each level has its own even if `conv` is shared.
         if isinstance(module, (ConvModule, nn.Conv2d)) and not path.endswith(".conv"):
             handles.append(module.register_forward_hook(lambda m, x, y, path=path: called.append((path, m))))
     dense = cast(Callable[[Tensor], Any], network.dense)

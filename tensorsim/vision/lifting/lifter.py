@@ -125,8 +125,8 @@ class NearestPoseLifter(nn.Module):
     Shapes:
         joints (..., T, 14, 2) pixels and weights (..., T, 14) >= 0 (0 = not seen) ->
         :class:`tensorsim.types.Lifted`. A frame with fewer than two weighted joints takes the nearest other
-        frame. Differentiable by joints and weights through the fit and the shares of the candidates; the
-        search that finds the candidates is not.
+        frame. Differentiable with respect to joints and weights through the fit and the shares of the candidates;
+        the search that finds the candidates is not.
 
     Raises:
         TensorsimError: settings out of range, other shapes, NaN, negative weights, or no frames.

@@ -60,7 +60,7 @@ def mirror_image(sight: Sight, other_keypoint: Tensor, other_joint: Tensor) -> S
 
 def windowed_mean(x: Tensor, weight: Tensor) -> Tensor:
     """Weighted mean of x (S, T, D) over ``2 RADIUS + 1`` frames about each; weight (S, T) not negative."""
-    radius = 10  # RADIUS: TorchScript reads no constants of modules
+    radius = 10  # RADIUS: TorchScript cannot read module constants
     rows = torch.cat([x * weight[..., None], weight[..., None]], dim=-1).transpose(1, 2)
     sums = F.avg_pool1d(rows, 2 * radius + 1, 1, radius).transpose(1, 2)
     return sums[..., :-1] / sums[..., -1:].clamp(min=1e-6)

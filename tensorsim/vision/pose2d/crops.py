@@ -98,7 +98,7 @@ def sample_bilinear(images: Tensor, index: Tensor, u: Tensor, v: Tensor) -> Tens
 class BoxCrop(nn.Module):
     """Crops of boxes in a batch of images.
 
-    ``uint8`` images become [0, 1] floats. Differentiable by float images and by boxes. Samples are bilinear
+    ``uint8`` images become [0, 1] floats. Differentiable with respect to float images and boxes. Samples are bilinear
     without a low-pass filter, as in the pipelines that pose networks were trained with, so large boxes alias.
 
     Args:

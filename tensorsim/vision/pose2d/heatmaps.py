@@ -66,7 +66,7 @@ def decode_dark(maps: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Points (..., 2), ``uv`` in heat-map pixels, and scores (...), the heights of the peaks. Both are
-        differentiable by the maps, with the highest pixel held fixed.
+        differentiable with respect to the maps, with the highest pixel held fixed.
     """
     height, width = maps.shape[-2], maps.shape[-1]
     u, v, score = peak(maps)
@@ -117,12 +117,12 @@ def similarity(count: int, spread: float, like: Tensor) -> Tensor:
 def decode_expected(maps: Tensor, sharpness: float, tolerance: float) -> tuple[Tensor, Tensor]:
     """The place where a point is expected to be judged best: a Bayes decision instead of the highest pixel.
 
-    A map m tells how probable each pixel x is: ``p ~ exp(sharpness m) - 1``, nothing where it is zero or less. A point
-    found at q is as good as ``exp(-|x - q|^2 / (2 s^2))``, as object keypoint similarity has it, s being ``tolerance``
-    times the longer side of the map. The q with the highest mean of that over p is found, to a fraction of a pixel as
-    in :func:`decode_dark`. Where a map has one sharp peak, that is its peak; of a blunt one it is the middle, and of
-    several the one with the most about it. (J. O. Berger, "Statistical Decision Theory and Bayesian Analysis", 1985,
-    section 4.4.)
+    A map m gives the probability of each pixel x: ``p ~ exp(sharpness m) - 1``, zero where that is not positive. A
+    point found at q scores ``exp(-|x - q|^2 / (2 s^2))``, as in object keypoint similarity, with s ``tolerance`` times
+    the longer side of the map. The q with the highest mean of that over p is found, to a fraction of a pixel as in
+    :func:`decode_dark`. If a map has one sharp peak, that is its peak; for a blunt peak it is the middle, and for
+    several peaks the one with the most probability around it. (J. O. Berger, "Statistical Decision Theory and Bayesian
+    Analysis", 1985, section 4.4.)
 
     Args:
         maps: (..., h, w).
@@ -131,7 +131,7 @@ def decode_expected(maps: Tensor, sharpness: float, tolerance: float) -> tuple[T
 
     Returns:
         Points (..., 2), ``uv`` in heat-map pixels, and scores (...), the heights of the highest peaks. Both are
-        differentiable by the maps, with the pixel that is nearest to the point held fixed.
+        differentiable with respect to the maps, with the pixel that is nearest to the point held fixed.
     """
     # In half precision the top of a smooth map is flat.
     precise = maps if maps.dtype == torch.float64 else maps.float()
@@ -150,18 +150,18 @@ def decode_expected(maps: Tensor, sharpness: float, tolerance: float) -> tuple[T
 
 
 def sides_apart(maps: Tensor, left: Tensor, right: Tensor, share: float = 0.7, radius: float = 4.0) -> Tensor:
-    """Heat maps in which a left and a right point do not take the same place where there are two.
+    """Heat maps in which a left and a right point do not take the same place if there are two places.
 
-    Of somebody seen from the side a network knows where both ankles are and not which is the left one: both maps have
-    two peaks of nearly the same height, and the higher one may be the same in both. There one of the two maps loses
-    that peak: the one that makes the product of the heights of both points the largest. Points that do share a place,
-    as the ankles of a walker who passes one leg by the other, have maps with one peak, and keep it.
+    For a person seen from the side, a network finds both ankles but does not know which is the left one: both maps have
+    two peaks of nearly the same height, and the higher one may be the same in both. Then one of the two maps loses that
+    peak, chosen so that the product of the heights of both points is the largest. Points that do share a place, such as
+    the ankles of a walker when one leg passes the other, have maps with one peak, and keep it.
 
     Args:
         maps: (..., K, h, w).
         left, right: (M,) int64, the maps of each pair.
-        share: least height of the second peak over that of the first, mean of both maps: a thing that looks like a
-            foot to one of them is none.
+        share: least height of the second peak as a share of the first, averaged over both maps: something that looks
+            like a foot in only one of them is not one.
         radius: pixels of a map around a peak that belong to it.
 
     Returns:
@@ -173,7 +173,7 @@ def sides_apart(maps: Tensor, left: Tensor, right: Tensor, share: float = 0.7, r
     distance = (u.index_select(1, left) - u.index_select(1, right)).square()
     distance = distance + (v.index_select(1, left) - v.index_select(1, right)).square()
     shared = (distance <= (radius - 1.0) ** 2).nonzero()
-    # Of S pairs with one place: both maps and their peaks, left first.
+    # For S pairs that share one place: both maps and their peaks, left first.
     body = shared[:, :1]
     number = torch.stack([left, right], dim=-1).index_select(0, shared[:, 1])
     both, u, v, first = found[body, number], u[body, number], v[body, number], score[body, number]
@@ -213,7 +213,7 @@ class HeatmapDecoder(nn.Module):
 
     Raises:
         TensorsimError: another method, an even kernel, a stride below 1, a sharpness or tolerance that is not
-            positive, integer or empty maps, fewer maps than ``pairs`` speaks of.
+            positive, integer or empty maps, fewer maps than ``pairs`` refers to.
     """
 
     kernel: Tensor
@@ -274,6 +274,6 @@ class HeatmapDecoder(nn.Module):
         return self.stride * points, scores
 
     def extra_repr(self) -> str:
-        """What print shows, and by what kept key points are told apart from those of other settings."""
+        """What print shows, and what distinguishes cached key points from those of other settings."""
         spread = f", sharpness={self.sharpness:g}, tolerance={self.tolerance:g}" * (self.method == "expected")
         return f"{self.method}{spread}"

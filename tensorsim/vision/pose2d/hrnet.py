@@ -198,7 +198,7 @@ class _Transition(nn.ModuleList):
 
 
 class PresenceHead(nn.Module):
-    """How much of each heat map to believe, from the whole crop: little where its key point is not in the picture.
+    """How far to trust each heat map, from the whole crop: little if its key point is not in the picture.
 
     Where the picture ends within a person, a heat map still has a highest peak, at another part of the body or of
     somebody else. Two layers see the mean of the features in 4 x 4 parts of the crop, black edges included, and the

@@ -1,4 +1,4 @@
-"""What networks in ONNX files share: a session that is opened on first use, and no place in a scripted graph."""
+"""What networks in ONNX files have in common: a session that is opened on first use, and that they do not script."""
 
 import os
 from pathlib import Path
@@ -75,7 +75,7 @@ class OnnxFile(nn.Module):
         return [torch.from_numpy(np.concatenate(parts)).to(crops) for parts in zip(*found, strict=True)]
 
     def check_crops(self, crops: Tensor) -> tuple[int, int]:
-        """Refuse crops that the file does not take; their height and width."""
+        """Height and width of crops; refuses those that the file does not accept."""
         name = f"{type(self).__name__} crops"
         check_floating(crops, name)
         check_rank(crops, 4, name, "(N, 3, H, W) RGB in [0, 1]")
@@ -95,7 +95,7 @@ class OnnxFile(nn.Module):
 
 
 def is_size(size: Any, expected: int) -> bool:
-    """Whether a size of a file's input or output is this one, or left open."""
+    """Whether a size of a file's input or output is this one, or not fixed."""
     return not isinstance(size, int) or size == expected
 
 

@@ -1,4 +1,4 @@
-"""RTMPose and other SimCC networks in ONNX files: each coordinate is a class of its own.
+"""RTMPose and other SimCC networks in ONNX files: each coordinate is found by classification.
 
 T. Jiang et al., "RTMPose: Real-Time Multi-Person Pose Estimation based on MMPose" (arXiv 2303.07399); Y. Li et al.,
 "SimCC: a Simple Coordinate Classification Perspective for Human Pose Estimation" (ECCV 2022).
@@ -112,7 +112,7 @@ class OnnxSimcc(OnnxFile):
         return torch.cat([x, y], -1)
 
     def extra_repr(self) -> str:
-        """Whether mirror images count: not to be seen from the parts."""
+        """Whether mirror images are used, which the submodules do not show."""
         return f"flip_test={self.flip_test}"
 
 

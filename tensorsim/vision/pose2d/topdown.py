@@ -87,9 +87,9 @@ class TopDownPose(nn.Module):
         crop_size: (H, W) of the crops; None takes the ``input_size`` of the network, or (256, 192) if it has
             none.
         crops_per_batch: how many crops the network gets at once.
-        stand_up: whoever leans by more than 45 degrees is looked at again, turned by quarter turns to stand upright,
-            and the keypoints with the higher mean score are kept: networks have seen few people who lie. Shoulders and
-            hips must be seen: half a person, whose hips are beyond the picture, seems to lean at random.
+        stand_up: crops of people who lean by more than 45 degrees are evaluated again, turned upright by quarter turns,
+            and the keypoints with the higher mean score are kept: networks have seen few people lying down. A shoulder
+            and a hip must be seen: a person whose hips are outside the picture seems to lean at random.
 
     Raises:
         TensorsimError: arguments out of range; ranks or batch sizes that do not fit; integer boxes; valid boxes that
@@ -120,7 +120,7 @@ class TopDownPose(nn.Module):
         self.decoder = decode
         self.crops_per_batch = crops_per_batch
         self.stand_up = stand_up
-        self.least_trunk_score = 0.3  # of a shoulder and a hip, for a lean to be believed
+        self.least_trunk_score = 0.3  # of a shoulder and a hip, for a lean to be trusted
         self.keypoints = len(COCO_KEYPOINTS)
 
     def forward(self, images: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,7 +167,7 @@ class TopDownPose(nn.Module):
         return keypoints, keypoint_scores
 
     def look(self, images: Tensor, boxes: Tensor, index: Tensor, turns: int) -> tuple[Tensor, Tensor]:
-        """Keypoints (N, 17, 2) in pixels of the image and scores (N, 17) of boxes (N, 4), in crops turned so often."""
+        """Keypoints (N, 17, 2) in image pixels and scores (N, 17) of boxes (N, 4), from crops after quarter turns."""
         if turns % 2 == 1:
             crops, height, width = self.wide_crop(images, boxes, index), self.crop.width, self.crop.height
         else:
@@ -195,5 +195,5 @@ class TopDownPose(nn.Module):
         return points, scores
 
     def extra_repr(self) -> str:
-        """What print shows beside the parts."""
+        """What print shows besides the submodules."""
         return f"crops_per_batch={self.crops_per_batch}, stand_up={self.stand_up}"
