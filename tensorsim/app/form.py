@@ -1,4 +1,4 @@
-"""The controls of the app, made from the options of ``simulate``: groups, units, help, and values back to options."""
+"""The app's controls, generated from the options of ``simulate``, and the conversion of their values to options."""
 
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, Literal, get_args, get_type_hints
@@ -10,7 +10,7 @@ from tensorsim.commands.simulate import Simulate
 from tensorsim.enhance.choice import DENOISERS
 from tensorsim.errors import TensorsimError, check_choice
 
-#: Options beside those of the panel, by group.
+#: Options in addition to those of the panel, by group.
 _MORE = {
     "SCENE": [
         "body",
@@ -41,16 +41,16 @@ _MORE = {
 }
 _OFF = {"kind": "switch", "choices": (), "default": False}
 _ON = {"kind": "switch", "choices": (), "default": True}
-#: What controls have that the command does not say of their options.
+#: Attributes of controls that differ from what the command states about their options.
 _OTHERWISE: dict[str, dict[str, Any]] = {
-    # There is no configuration that a switch could leave as it is.
+    # The app loads no configuration that an unset switch could leave unchanged.
     "sway": _OFF,
     "vital_signs": _OFF,
     "leakage": _OFF,
     "wall_echo": _OFF,
     "calibrate": _ON,
     "flip_test": _ON,
-    # The command takes files of weights as well; who opens the app may not read files of its machine.
+    # The command also takes weight files; users of the app must not read files on the machine that runs it.
     "denoiser": {
         "label": "Denoiser",
         "help": "Denoiser for the displayed maps; ksvd takes minutes. Default: none.",
@@ -58,7 +58,7 @@ _OTHERWISE: dict[str, dict[str, Any]] = {
         "choices": ("", *DENOISERS),
     },
 }
-#: Kinds of controls that take numbers, and what they expect.
+#: Kinds of controls that take numbers, and the input that they expect.
 _EXPECTED = {
     "number": "a number",
     "integer": "a whole number",
@@ -73,15 +73,15 @@ class Control:
     """A control of the form.
 
     Attributes:
-        option: of :class:`~tensorsim.commands.simulate.Simulate`.
-        group: of :data:`GROUPS`.
-        label: with its unit.
+        option: option of :class:`~tensorsim.commands.simulate.Simulate`.
+        group: one of :data:`GROUPS`.
+        label: label with the unit.
         help: what the option does and its default.
         kind: ``"number"``, ``"integer"``, ``"numbers"``, ``"integers"`` (several, separated by spaces), ``"choice"``,
             ``"switch"`` or ``"text"``.
-        choices: of a choice; the empty one leaves the default.
-        default: what the control shows at first.
-        count: how many numbers it takes; None for any number of them.
+        choices: values of a choice; the empty one means the default.
+        default: initial value of the control.
+        count: how many numbers it takes; None for any count.
     """
 
     option: str
@@ -94,10 +94,10 @@ class Control:
     count: int | None = None
 
     def value_of(self, given: Any) -> Any:
-        """The value of the option that was given; None where the control was left empty.
+        """The value of the option for the given input; None where the control was left empty.
 
         Raises:
-            TensorsimError: numbers that are none, or no choice.
+            TensorsimError: input that is not numeric where numbers are expected, or not one of the choices.
         """
         if self.kind == "switch":
             return bool(given)
@@ -140,7 +140,7 @@ def controls() -> list[Control]:
 
 
 def options_of(values: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of the command for the values of the controls by option; those left at their default are not named.
+    """Arguments of the command for control values by option; those left at their default are omitted.
 
     Raises:
         TensorsimError: see :meth:`Control.value_of`.
@@ -154,10 +154,10 @@ def options_of(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def for_demo(options: dict[str, Any]) -> dict[str, Any]:
-    """The same options for a generated person.
+    """The same options, checked for use with a generated person.
 
     Raises:
-        TensorsimError: an option that a file alone has.
+        TensorsimError: an option that applies to files only.
     """
     unknown = [name for name in options if name not in Demo.__dataclass_fields__]
     if unknown:
@@ -168,7 +168,7 @@ def for_demo(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _kind(hint: Any) -> tuple[str, tuple[str, ...]]:
-    """The kind of control of an option of this type, and its choices."""
+    """The kind of control for an option of this type, and its choices."""
     members = [member for member in get_args(hint) if member is not type(None)] or [hint]
     if getattr(hint, "__origin__", None) is Literal:
         return "choice", tuple(get_args(hint))
@@ -183,13 +183,13 @@ def _kind(hint: Any) -> tuple[str, tuple[str, ...]]:
 
 
 def _count(hint: Any) -> int | None:
-    """How many numbers an option of this type takes, where it takes a fixed number of several."""
+    """How many numbers an option of this type takes, if it takes a fixed count of several; otherwise None."""
     members = [get_args(member) for member in get_args(hint) if getattr(member, "__origin__", None) is tuple]
     return len(members[0]) if members and ... not in members[0] else None
 
 
 def _whole(given: Any) -> int:
-    """A whole number, however it is written."""
+    """A whole number in any notation, such as 3 or 3.0."""
     number = float(given)
     if number != int(number):
         raise ValueError

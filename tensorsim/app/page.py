@@ -1,4 +1,4 @@
-"""The page of the app: controls, what is going on, and the results of one or two runs."""
+"""The page of the app: controls, progress, and the results of one or two runs."""
 
 import html
 import time
@@ -17,7 +17,7 @@ from tensorsim.config import ACTIVITIES
 from tensorsim.errors import TensorsimError
 from tensorsim.radar.presets import PRESETS
 
-#: Kinds of files that can be dropped.
+#: File types that can be dropped.
 FILE_TYPES = [".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".m4v", ".bvh", ".npz", ".json"]
 _SCENES = ("free-space", "through-wall")
 _EXAMPLES = {
@@ -39,9 +39,9 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
 
     Args:
         runs: where simulations run.
-        longest_s: of films, motion capture and key points in seconds.
+        longest_s: longest film, motion capture or key points in seconds.
     """
-    # Long, for it declares the page from top to bottom, in the order in which it is read.
+    # Long because it declares the page from top to bottom, in reading order.
     made = controls()
     with gr.Blocks(title="tensorsim", analytics_enabled=False, delete_cache=(600, 3600)) as page:
         gr.Markdown("# tensorsim\nWhat a radar would have seen of the people in a film.")
@@ -119,7 +119,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
 
 
 def _activities() -> list[str]:
-    """Names of the activities as ``demo`` takes them."""
+    """Names of the activities as accepted by ``demo``."""
     return [name.split(" ", 1)[1].lower() for name in ACTIVITIES]
 
 
@@ -138,7 +138,7 @@ def _examples(activity: gr.Dropdown, scene: gr.Radio, duration: gr.Number) -> No
 
 
 def _component(control: Control) -> Any:
-    """The control as a component of Gradio."""
+    """The control as a Gradio component."""
     common: dict[str, Any] = {
         "label": control.label,
         "info": control.help,
@@ -148,7 +148,7 @@ def _component(control: Control) -> Any:
         return gr.Checkbox(value=bool(control.default), **common)
     if control.kind == "choice":
         return gr.Dropdown(list(control.choices), value=control.default or control.choices[0], **common)
-    # Not a gr.Number: that cannot be left empty, which is the default of the scene.
+    # Not a gr.Number: that cannot be left empty, and empty means the default of the scene.
     shown = (
         ""
         if control.default is None
@@ -162,7 +162,7 @@ def _component(control: Control) -> Any:
 def _command(
     film: str | None, activity: str, duration: str, values: dict[str, Any], longest_s: float
 ) -> Callable[[Path], Any]:
-    """What makes the command of a run for its folder; it raises where the values make none."""
+    """A function that builds the command of a run for its folder; it raises if the values are invalid."""
 
     def command(folder: Path) -> Any:
         given = options_of(values) | {
@@ -183,7 +183,7 @@ def _command(
 
 
 def _length(given: str, longest_s: float) -> float:
-    """Seconds of a generated film."""
+    """Length of a generated film in seconds."""
     try:
         seconds = float(given)
     except ValueError:
@@ -196,10 +196,10 @@ def _length(given: str, longest_s: float) -> float:
 
 
 def check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
-    """Refuse what would take too long, unless a part of it is chosen."""
+    """Refuse sources that would take too long, unless a short enough part of them is chosen."""
     seconds, fps = _part(film, given)
     if seconds is not None and given.get("fps") is not None:
-        # Frames take their time: a higher rate than their own makes them no fewer.
+        # Computing time depends on the number of frames: a rate above the file's own does not reduce it.
         with suppress(TensorsimError):  # the file states no rate
             own_fps = _part(film, {"clip": given.get("clip")})[1]
             seconds *= max(1.0, fps / own_fps)
@@ -211,7 +211,7 @@ def check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
 
 
 def _part(film: Path, given: dict[str, Any]) -> tuple[float | None, float]:
-    """Seconds of the part of a file that is chosen, None if unknown, and its frames per second."""
+    """Length of the chosen part of a file in seconds, None if unknown, and its frames per second."""
     from tensorsim.data.blazepose import load_keypoints
     from tensorsim.data.motion_files import load_motion
     from tensorsim.data.video import VideoReader
@@ -237,7 +237,7 @@ def _part(film: Path, given: dict[str, Any]) -> tuple[float | None, float]:
 
 
 def _followed(run: Run) -> Iterator[dict[str, Any]]:
-    """What to show of a run, a few times a second until it ends."""
+    """The state of a run to display, a few times a second until it ends."""
     while True:
         ended = run.finished.wait(0.4)
         yield {
@@ -251,7 +251,7 @@ def _followed(run: Run) -> Iterator[dict[str, Any]]:
 
 
 def _status(run: Run) -> str:
-    """One line on a run."""
+    """The status of a run in one line."""
     if run.error is not None:
         return f'<p class="failed" role="alert">{html.escape(run.error)}</p>'
     if run.finished.is_set():
@@ -266,7 +266,7 @@ def _status(run: Run) -> str:
 
 
 def _results(runs: Runs, tokens: tuple[str, ...]) -> str:
-    """The reports of one run or two, side by side, with everything to download."""
+    """The reports of one or two runs, side by side, with links to download all their files."""
     parts = []
     for token in tokens:
         run = runs.known.get(token)

@@ -1,4 +1,4 @@
-"""Runs of the app: one at a time, watched, cancelled on demand, kept in temporary folders for a while."""
+"""Runs of the app: one at a time, monitored, cancellable, kept in temporary folders for a while."""
 
 import re
 import secrets
@@ -19,10 +19,10 @@ from tensorsim.errors import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.progress import watched
 
-#: Runs that are kept; the oldest is removed for a new one.
+#: Number of runs kept; the oldest finished one is removed for a new one.
 KEPT = 12
 ARCHIVE = "all.zip"
-#: Seconds that a run may take to end once it is cancelled; a stage that reports no progress does not notice.
+#: Seconds to wait for a cancelled run to end; a stage that reports no progress does not notice the cancellation.
 LONGEST_END_S = 10.0
 
 
@@ -31,14 +31,14 @@ class CancelledError(TensorsimError):
 
 
 class Run:
-    """A simulation in a thread of its own.
+    """A simulation in its own thread.
 
     Attributes:
         token: its secret name.
-        folder: of its results, complete once it has succeeded.
-        stage, done, total: what is being done and how far it is.
+        folder: folder of its results, complete once it has succeeded.
+        stage, done, total: current stage and its progress.
         pictures: the newest picture (H, W, 3) uint8 RGB by name, ``"film"`` and ``"world"``.
-        error: one sentence, if it failed.
+        error: one sentence if it failed, else None.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -60,7 +60,7 @@ class Run:
         self.pictures[name] = draw()
 
     def files(self) -> list[Path]:
-        """The files of the results."""
+        """The result files."""
         return (
             sorted(path for path in self.folder.iterdir() if path.is_file()) if self.folder.is_dir() else []
         )
@@ -79,7 +79,7 @@ class Runs:
         self.one_at_a_time, self.lock = Lock(), Lock()
 
     def start(self, command_for: Callable[[Path], Any]) -> Run:
-        """Run ``command_for(folder).run()`` in a thread; a command that cannot be made is an error of the run."""
+        """Run ``command_for(folder).run()`` in a thread; if ``command_for`` fails, that is an error of the run."""
         run = Run(self.root / secrets.token_urlsafe(16))
         with self.lock:
             self.known[run.token] = run
@@ -107,7 +107,7 @@ class Runs:
 
     @contextmanager
     def _turn_of(self, run: Run) -> Iterator[None]:
-        """Wait for the run before this one, unless this one is cancelled."""
+        """Wait until no other run is active, unless this one is cancelled."""
         while not self.one_at_a_time.acquire(timeout=0.2):
             run.advanced("waiting", 0, None)
         try:
@@ -116,23 +116,23 @@ class Runs:
             self.one_at_a_time.release()
 
     def _without_paths(self, message: str) -> str:
-        """A message that names files, but not the temporary folders that they are in."""
+        """The message with file names but without the temporary folders that contain them."""
         return re.sub(re.escape(str(self.root.parent)) + r"/([^\s/]+/)*", "", message)
 
     def cancel(self, token: str | None) -> None:
-        """Cancel a run that may have ended already."""
+        """Cancel a run; does nothing if it has already ended."""
         with suppress(KeyError):
             self.known[token or ""].cancelled.set()
 
     def close(self) -> None:
-        """Cancel all runs and wait for them: a thread that still computes when Python ends aborts the process."""
+        """Cancel all runs and wait for them: a thread still computing when Python exits aborts the process."""
         for run in self.known.values():
             run.cancelled.set()
         for run in self.known.values():
             run.finished.wait(LONGEST_END_S)
 
     def file(self, token: str, name: str) -> Path | None:
-        """The file of a run with this name, None if there is none: nothing else can be read."""
+        """The file of a run with this name, None if there is none; no other files can be read."""
         run = self.known.get(token)
         if run is None or not run.finished.is_set():
             return None
@@ -140,14 +140,14 @@ class Runs:
 
 
 def _add_configuration(folder: Path) -> None:
-    """Write the configuration of the run as YAML, for ``--config``."""
+    """Write the configuration of the run as YAML for ``--config``."""
     from tensorsim.config import SimulationConfig
 
     SimulationConfig.from_yaml(folder / "summary.json").to_yaml(folder / "configuration.yaml")
 
 
 def _add_archive(folder: Path) -> None:
-    """Put all files into one."""
+    """Put all files into one archive."""
     files = sorted(path for path in folder.iterdir() if path.is_file())
     with (
         complete_file(folder / ARCHIVE) as scratch,

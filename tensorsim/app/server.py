@@ -1,4 +1,4 @@
-"""The server of the app: the page, and the files of its runs."""
+"""The server of the app: the page and the files of its runs."""
 
 import os
 import tempfile
@@ -10,16 +10,16 @@ from typing import Any
 from tensorsim.app.runs import Runs
 from tensorsim.errors import TensorsimError
 
-#: Hosts that only this machine reaches.
+#: Hosts that only this machine can reach.
 LOCAL = ("127.0.0.1", "localhost")
 
 
 @contextmanager
 def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]:
-    """The ASGI application; its uploads and results are removed with it.
+    """The ASGI application; uploads and results are deleted when it closes.
 
     Args:
-        host: address that it is opened at. Where that is this machine, requests under other names are refused.
+        host: address to serve. If it is local, requests for other host names are refused.
         largest_mb: size of the largest upload in megabytes.
         longest_s: longest film in seconds.
 
@@ -27,7 +27,7 @@ def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]
         TensorsimError: gradio is not installed.
     """
     with tempfile.TemporaryDirectory(prefix="tensorsim-app-") as scratch:
-        # Gradio reads these when it is imported: uploads are below the folder that is removed, and nobody is called.
+        # Gradio reads these on import: uploads go into the folder that is deleted, and no analytics are sent.
         os.environ["GRADIO_TEMP_DIR"] = str(Path(scratch) / "uploads")
         os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
         try:
@@ -46,7 +46,7 @@ def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]
         runs = Runs(root)
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         if host in LOCAL:
-            # A page of the network whose name is led to this machine could read what the app answers.
+            # A web page whose host name resolves to this machine (DNS rebinding) could read the app's answers.
             server.add_middleware(TrustedHostMiddleware, allowed_hosts=LOCAL)
 
         @server.get("/runs/{token}/{name}")
@@ -57,7 +57,7 @@ def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]
             return FileResponse(path)
 
         page = build(runs, longest_s)
-        # Else Gradio, when it is mounted, takes any path of this machine for a file that was uploaded.
+        # Otherwise Gradio, when mounted, accepts any path on this machine as an uploaded file.
         page.has_launched = True
         theme = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["monospace"])
         mounted = gr.mount_gradio_app(

@@ -1,4 +1,4 @@
-"""Live: frames of a camera in one by one, people and radar maps out, with a bounded delay and bounded memory."""
+"""Live simulation: camera frames in one by one, people and radar maps out, with bounded delay and memory."""
 
 from tensorsim.live.labels import LiveLabel
 from tensorsim.live.simulator import LiveFrame, LivePerson, LiveSimulator

@@ -1,4 +1,4 @@
-"""Frames as they come: from a camera, a stream, or a film that is played like one."""
+"""Frames in real time: from a camera, a stream, or a film played at its own rate."""
 
 import time
 from collections import deque
@@ -14,15 +14,15 @@ from torch import Tensor
 from tensorsim.data.video import VideoReader, silent_log
 from tensorsim.errors import TensorsimError, check_positive
 
-#: Frames that wait for the consumer; older ones are dropped.
+#: Length of the queue of frames for the consumer; older ones are dropped.
 WAITING = 2
-#: Frames by which a camera may be ahead of its rate, as frames that were late come at once.
+#: Frames by which a camera may run ahead of its rate, because late frames arrive in bursts.
 AHEAD = 2
 _STREAMS = ("rtsp://", "rtsps://", "rtmp://", "http://", "https://", "udp://", "tcp://")
 
 
 class Grabbed(NamedTuple):
-    """A frame (3, H, W) uint8 RGB, and how many frames before it are missing: dropped, or not in the source."""
+    """A frame (3, H, W) uint8 RGB, and how many frames are missing before it: dropped, or absent from the source."""
 
     frame: Tensor
     missing: int
@@ -30,8 +30,8 @@ class Grabbed(NamedTuple):
 
 @dataclass
 class _State:
-    """Of the thread that grabs frames: whether it came to its end, whether it should, and what went wrong; and how many
-    frames the consumer will never see."""
+    """State of the thread that grabs frames: how many frames were dropped, whether it has ended, whether it should
+    end, and the error that ended it."""
 
     dropped: int = 0
     ended: bool = False
@@ -40,19 +40,19 @@ class _State:
 
 
 class Camera:
-    """Frames of a camera at a constant rate; those that come while the consumer is busy are dropped and counted.
+    """Frames of a camera at a constant rate; those that arrive while the consumer is busy are dropped and counted.
 
-    Those that a source does not have where its frames come at uneven times are missing as well, but not dropped.
+    Frames that a source with uneven frame times lacks count as missing too, but not as dropped.
 
     Args:
         source: the number of a camera, the address of a stream, or a file.
-        fps: frames per second, instead of those that the source announces (30 where it announces none).
-        every_frame: of a file, wait for the consumer instead of dropping frames; the film takes as long as it takes.
-        loops: of a file, how often it is played.
+        fps: frames per second instead of the rate that the source reports (30 if it reports none).
+        every_frame: for files: wait for the consumer instead of dropping frames; playback is not in real time.
+        loops: for files: how many times the film is played.
 
     Attributes:
         fps: frames per second.
-        dropped: frames that came before the last one that was given, and were not given.
+        dropped: frames dropped before the last one delivered.
 
     Raises:
         TensorsimError: a source that cannot be opened, or ``every_frame`` of one that does not wait.
@@ -97,7 +97,7 @@ class Camera:
 
     @staticmethod
     def _counted(numbered: Iterator[tuple[int, Tensor]]) -> Iterator[Grabbed]:
-        """Frames with the numbers of those between them that are missing."""
+        """Frames with the number of frames missing before each."""
         last = -1
         for index, frame in numbered:
             missing, last = index - last - 1, index
@@ -121,7 +121,7 @@ class Camera:
             yield index, frame
 
     def _grab(self, waiting: deque[tuple[int, Tensor | None]], arrived: Condition, state: "_State") -> None:
-        """Put frames with their numbers into the queue as they come; the work of a thread."""
+        """Put frames with their numbers into the queue as they arrive; runs in a thread."""
         start = time.monotonic()
         try:
             for index, frame in self._film() if self.is_file else self._live(state):
@@ -151,9 +151,9 @@ class Camera:
             first = index + 1
 
     def _live(self, state: "_State") -> Iterator[tuple[int, Tensor | None]]:
-        """Frames numbered by the time at which they came, from the first one on; None once there are no more.
+        """Frames numbered by their arrival times after the first one; None once there are no more.
 
-        Those that come faster than the constant rate are dropped: time would run slower than the people.
+        Frames that arrive faster than the constant rate are dropped: otherwise people would seem to move too slowly.
         """
         import cv2
 

@@ -1,4 +1,4 @@
-"""The nearest poses of one frame after the other: the whole pool is compared at once, from a table made beforehand."""
+"""Nearest poses, frame by frame: each frame is compared with the whole pool at once, by a precomputed table."""
 
 import torch
 from torch import Tensor, nn
@@ -8,10 +8,10 @@ from tensorsim.vision.lifting.pose_search import PoseSearch, normalise_weights, 
 
 
 class DenseSearch(nn.Module):
-    """What :class:`~tensorsim.vision.lifting.pose_search.PoseSearch` finds, in float32 and for few frames at a time.
+    """The result of :class:`~tensorsim.vision.lifting.pose_search.PoseSearch`, in float32, for few frames at a time.
 
-    That class saves comparisons where many frames share the work; for a single frame its preparations cost more than
-    one pass over all poses, ten milliseconds for 300 000.
+    That class saves comparisons when many frames share the work; for a single frame its preparation costs more than
+    one pass over all poses, which takes ten milliseconds for 300 000.
 
     Args:
         search: the pool, its headings and the number of neighbours.

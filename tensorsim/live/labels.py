@@ -1,4 +1,4 @@
-"""Activities as they happen: the recognizer is asked about the last seconds of the maps."""
+"""Activities in real time: the recognizer classifies the last seconds of the maps."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from tensorsim.types import RadarMaps
 
 
 class LiveLabel(NamedTuple):
-    """The activity of the last seconds: from when to when, name and probability."""
+    """The activity of the last seconds: start, end, name and probability."""
 
     start_s: float
     end_s: float
@@ -21,7 +21,7 @@ class LiveLabel(NamedTuple):
 
 
 class LastColumns:
-    """The last columns (rows, n) of a map that grows."""
+    """The last columns (rows, n) of a growing map."""
 
     def __init__(self, columns: int) -> None:
         self.columns = max(1, columns)
@@ -35,7 +35,7 @@ class LastColumns:
             del self.parts[0]
 
     def result(self) -> Tensor:
-        """At most ``columns`` of them."""
+        """The last columns, at most ``columns`` of them."""
         return torch.cat(self.parts, dim=-1)[:, -self.columns :]
 
 
@@ -43,9 +43,9 @@ class LiveLabels:
     """Labels the last four seconds once a second.
 
     Args:
-        recognizer: of the radar of the simulator.
-        simulator: makes the maps.
-        least_probability: below it the label is "not sure".
+        recognizer: recognizer for the simulator's radar.
+        simulator: the simulator that makes the maps.
+        least_probability: labels with a lower probability become "not sure".
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class LiveLabels:
         self.due_s = WINDOW_S
 
     def push(self, doppler_time: Tensor, range_time_mti: Tensor, end_s: float) -> LiveLabel | None:
-        """Append columns that end at ``end_s``; the label, where one is due."""
+        """Append columns that end at ``end_s``; returns a label when one is due."""
         self.doppler_time.push(doppler_time)
         self.range_time_mti.push(range_time_mti)
         if end_s < self.due_s:

@@ -1,4 +1,4 @@
-"""A page on this machine that shows pictures as they come."""
+"""A local web page that shows pictures as they arrive."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,7 +34,7 @@ class LivePage:
             self.changed.notify_all()
 
     def pictures(self) -> Iterator[bytes]:
-        """The newest picture whenever there is one; a slow reader misses some."""
+        """The newest picture whenever there is a new one; a slow reader misses some."""
         seen = 0
         while True:
             with self.changed:
@@ -51,13 +51,13 @@ def serving(port: int) -> Iterator[LivePage]:
     """A page that only this machine can open, at a port (0: any free one).
 
     Raises:
-        TensorsimError: the port is taken.
+        TensorsimError: the port cannot be used.
     """
     page = LivePage()
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            # A page of the network whose name is led to this machine could look through the camera.
+            # A web page whose host name resolves to this machine (DNS rebinding) could watch the camera.
             if self.headers.get("Host", "").split(":")[0] not in ("127.0.0.1", "localhost"):
                 self.send_error(403)
             elif self.path == "/":
@@ -85,7 +85,7 @@ def serving(port: int) -> Iterator[LivePage]:
                 pass  # the reader has gone
 
         def log_message(self, *_: Any) -> None:
-            """Say nothing of requests."""
+            """Do not log requests."""
 
     try:
         server = ThreadingHTTPServer(("127.0.0.1", port), Handler)

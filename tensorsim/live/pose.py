@@ -1,4 +1,4 @@
-"""Causal poses: key points of one frame to joints in the world, filtered with what came before only."""
+"""Causal poses: from the key points of a frame to joints in the world, filtered with past frames only."""
 
 from typing import NamedTuple
 
@@ -9,21 +9,21 @@ from tensorsim.body.skeleton import coco_to_body, lowest_ankle, mid_hips
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside, lowered
 from tensorsim.vision.smoothing.kalman import KalmanState, constant_velocity_predict, kalman_update
 
-#: Variance of a position of which nothing is known, in variances of a measurement.
+#: Variance of an unknown position, in units of the variance of a measurement.
 _WIDE = 1e4
 
 
 class PoseState(NamedTuple):
-    """What is known of P people from earlier frames.
+    """What is known about P people from earlier frames.
 
     Attributes:
         size: logarithm of the height in pixels of the standing body (P, 1), filtered.
         joints: (P, 14, 3) m, filtered.
-        lows: (P, n) heights of the lower ankle in the last frames, the newest last; NaN where there was none.
-        shown: (P, 14, 3) m, the joints given out last.
-        hidden: (P, 14) frames since each joint was seen.
+        lows: (P, n) heights of the lower ankle in the last frames, the newest last; NaN where unknown.
+        shown: (P, 14, 3) m, the most recent output joints.
+        hidden: (P, 14) frames since each joint was last seen.
         frames: (P,) usable frames so far.
-        good: (P,) of them those in which the pose network saw a person.
+        good: (P,) usable frames so far in which the pose network was confident of a person.
         missed: (P,) frames since the last usable one.
     """
 
@@ -40,13 +40,13 @@ class PoseState(NamedTuple):
 class CausalPose(nn.Module):
     """Lifts, places and filters people frame by frame.
 
-    Every frame is lifted alone; the size of the body, and with it the range, and each joint go through the forward
-    Kalman filter of constant velocity; the floor is a low quantile of the lower ankle in the last frames. A joint that
-    hides briefly is predicted, over a longer gap that of the matched pose replaces it.
+    Each frame is lifted on its own. The size of the body (and so the range) and each joint pass through a forward
+    constant-velocity Kalman filter. The floor is a low quantile of the height of the lower ankle in the last frames.
+    A joint that is hidden briefly is predicted; over a longer gap it is taken from the matched pose.
 
     Args:
-        lifter: joints (P, T, 14, 2), weights -> Lifted, each frame alone (``temporal=0``).
-        metric_pose: places them; of a calibrated camera, so that it estimates no floor.
+        lifter: joints (P, T, 14, 2), weights -> Lifted, each frame on its own (``temporal=0``).
+        metric_pose: places them in the world; for a calibrated camera, so that it estimates no floor.
         fps: frames per second.
         keypoint_threshold, fewest_joints, least_score, brief_gap_s, top_speed_m_s: see
             :class:`~tensorsim.VideoToPose`.
@@ -70,15 +70,15 @@ class CausalPose(nn.Module):
         self.brief_gap = int(brief_gap_s * fps)
         self.floor_frames = max(1, int(metric_pose.floor_window_s * fps))
         self.floor_quantile = 0.15
-        self.least_width = 0.2  # of a box that the edge of the picture cuts, in its heights
-        # Gain -3 dB at 1 Hz: sizes of 4 % error, somebody who starts to walk within half a second.
+        self.least_width = 0.2  # of a box cut by the edge of the picture, relative to its height
+        # Gain -3 dB at 1 Hz: for sizes with 4 % error and people who start to walk within half a second.
         self.size_density, self.size_noise, self.size_speed = 0.1, 0.04**2, 0.3
-        self.unknown = 0.1 * _WIDE * self.size_noise  # variance from which a size is not known
-        # Gain -3 dB at 4 Hz: m^2/s^3, and 3 cm of error of the key points, see noise.keypoint_noise.
+        self.unknown = 0.1 * _WIDE * self.size_noise  # variance from which a size counts as unknown
+        # Gain -3 dB at 4 Hz: m^2/s^3, and 3 cm of key point error, see noise.keypoint_noise.
         self.joint_density, self.joint_noise, self.initial_speed = 27.0, 0.03**2, 3.0
 
     def begin(self, people: int) -> PoseState:
-        """The state of people who were never seen."""
+        """The state of people who have not been seen yet."""
         zeros = torch.zeros(people, 14, 3, dtype=torch.float64)
         never = torch.zeros(people, dtype=torch.int64)
         return PoseState(
@@ -108,13 +108,13 @@ class CausalPose(nn.Module):
             state: of P people.
             keypoints: (P, 17, 2) pixels.
             scores: (P, 17).
-            boxes: (P, 4) pixels, ``xyxy``; the size of a body that the left or right edge of the picture cuts counts
-                little.
+            boxes: (P, 4) pixels, ``xyxy``; the size of a body cut by the left or right edge of the picture has a low
+                weight.
             there: (P,) bool, the people with key points; the others are predicted.
-            height, width: of the picture.
+            height, width: size of the picture.
         """
         if not bool(there.any()):
-            # Lifting and placing take longer than a frame lasts, and nothing of it would count.
+            # Lifting and placing take longer than a frame lasts, and the results would not be used.
             size = self._predicted(state.size, self.size_density)
             lows = torch.cat([state.lows[:, 1:], torch.full_like(state.lows[:, :1], torch.nan)], dim=-1)
             seen = torch.zeros_like(state.hidden, dtype=torch.bool)
@@ -123,7 +123,7 @@ class CausalPose(nn.Module):
         reliable = (body_scores >= self.keypoint_threshold) & there[:, None]
         body_scores = body_scores * reliable
         cut_off = cut_off_beside(boxes, width)
-        # A few joints or a strip of somebody who leaves by the edge of the picture determine no pose.
+        # A few joints, or a strip of somebody leaving the picture, do not determine a pose.
         fewest = torch.where(cut_off, self.metric_pose.whole_body_joints, self.fewest_joints)
         inside = boxes[:, 2].clamp(max=width) - boxes[:, 0].clamp(min=0)
         strip = cut_off & (inside < self.least_width * (boxes[:, 3] - boxes[:, 1]))
@@ -174,7 +174,7 @@ class CausalPose(nn.Module):
         hidden = torch.where(seen, 0, state.hidden + 1)
         measured = usable[:, None] & (seen | (hidden > self.brief_gap))
         newly = usable & (state.missed > self.brief_gap)
-        # What is beyond the edge of the picture goes along with the hips: nothing else is known of it.
+        # Joints beyond the edge of the picture move with the hips: nothing else is known about them.
         along = state.shown + (mid_hips(placed) - mid_hips(state.shown))[:, None]
         beyond = cut_off[:, None] & usable[:, None] & ~seen & ~newly[:, None]
         placed, measured = torch.where(beyond[..., None], along, placed), measured | beyond
@@ -188,7 +188,7 @@ class CausalPose(nn.Module):
             (newly[:, None] & measured)[..., None],
         )
         missed = torch.where(usable, 0, state.missed + 1)
-        # Over a longer gap a prediction would drift away: there the body stays where it is.
+        # Over a longer gap the prediction would drift away, so the body stays where it is.
         step = (joints.position - state.shown) * (missed <= self.brief_gap)[:, None, None]
         length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
         limit = (self.top_speed_m_s / self.fps / length.clamp(min=1e-9)).clamp(max=1.0)
@@ -201,7 +201,7 @@ class CausalPose(nn.Module):
         )
 
     def present(self, state: PoseState) -> Tensor:
-        """Who is in the scene, (P,) bool: seen just now, and a person in at least a quarter of the frames."""
+        """Who is in the scene, (P,) bool: seen recently, and a person in at least a quarter of the usable frames."""
         return (state.frames > 0) & (state.missed <= self.brief_gap) & (4 * state.good >= state.frames)
 
     def _filtered(
@@ -214,20 +214,20 @@ class CausalPose(nn.Module):
         valid: Tensor,
         first: Tensor,
     ) -> KalmanState:
-        """Prediction by a frame and update; where ``first``, the filter begins with this measurement."""
+        """Prediction by one frame and update; where ``first``, the filter starts with this measurement."""
         predicted = self._predicted(state, density)
         begun = _unknown(measured.double(), noise, speed)
         prior = KalmanState(*(torch.where(first, a, b) for a, b in zip(begun, predicted, strict=True)))
         return kalman_update(prior, measured.double(), noise, valid.double())
 
     def _predicted(self, state: KalmanState, density: float) -> KalmanState:
-        """The state a frame later."""
+        """The state one frame later."""
         q = torch.full([1], density, dtype=torch.float64)
         return constant_velocity_predict(state, q, 1 / self.fps)
 
 
 def _unknown(place: Tensor, noise: float | Tensor, speed: float) -> KalmanState:
-    """A state (..., D) at a place of which nothing is known, with velocities within ``speed``."""
+    """A state (..., D) near ``place`` but of wide variance, with velocities of standard deviation ``speed``."""
     wide = torch.zeros_like(place[..., :1]) + _WIDE * noise
     return KalmanState(
         place, torch.zeros_like(place), wide, torch.zeros_like(wide), torch.full_like(wide, speed**2)

@@ -1,4 +1,4 @@
-"""Joints frame by frame to maps: a spline that looks two frames ahead, then the radar pulse by pulse."""
+"""Joints to maps, frame by frame: a spline that looks two frames ahead, then the radar pulse by pulse."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.simulator import Pending
 
-#: Seconds in which somebody appears and disappears.
+#: Seconds over which a person fades in or out.
 FADE_S = 0.1
 
 
@@ -35,8 +35,8 @@ class NewColumns(NamedTuple):
 
 @dataclass
 class _Person:
-    """The last four frames of somebody: joints (4, 14, 3) and presence (4,), the order of appearance, and whether
-    somebody who was absent has not come back yet."""
+    """The last four frames of a person: joints (4, 14, 3) and presence (4,), the order of appearance, and whether
+    the person is away, that is, was absent and has not come back yet."""
 
     joints: Tensor
     presence: Tensor
@@ -63,7 +63,7 @@ def cubic_b_spline(knots: Tensor, u: Tensor) -> Tensor:
 
 
 def _joined(scenes: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Scatterers (1, m, S, 3) and cross sections (1, m, S) one after the other; people who come later add to S."""
+    """Scatterers (1, m, S, 3) and cross sections (1, m, S) joined in time; people who appear later add to S."""
     last = scenes[-1][0]
     places, sections = [], []
     for points, rcs in scenes:
@@ -77,16 +77,16 @@ class LiveRadar:
     """The radar chain of a :class:`~tensorsim.PoseToDoppler`, given joints frame by frame.
 
     Frame k completes the motion up to frame k - 1, as the spline looks two frames ahead of the start of its piece.
-    The noise is that of a target of 1 m^2 at 3 m with the configured signal-to-noise ratio: the power of the people
-    is not known before they come.
+    The noise level is set by a target of 1 m^2 at 3 m with the configured signal-to-noise ratio: the power of the
+    people is not known in advance.
 
     Args:
         stage: scatterers and simulator.
         fps: frames per second.
 
     Raises:
-        TensorsimError: a moving target indicator that needs the whole clip, a smoother along the pulses, small
-            motions or a denoiser, which look ahead or need maps.
+        TensorsimError: a moving target indicator, smoothing along the pulses, sway or vital signs, a denoiser or
+            effects of the receiver that need the whole clip; several antennas.
     """
 
     def __init__(self, stage: PoseToDoppler, fps: float) -> None:
@@ -108,7 +108,7 @@ class LiveRadar:
         self.people: dict[int, _Person] = {}
         self.frame, self.pulse = -1, 0
         self.pending: Pending | None = None
-        # Scatterers of pulses that wait for others.
+        # Scatterers of pulses that wait for further pulses.
         self.begun: list[tuple[Tensor, Tensor]] = []
         self.rest = [torch.empty(0), torch.empty(0)]
 
@@ -116,7 +116,7 @@ class LiveRadar:
         """Add a frame.
 
         Args:
-            joints: by number of a person, joints (14, 3) m float64 and whether the person is in the scene.
+            joints: for each person by number, joints (14, 3) m float64 and whether the person is in the scene.
         """
         self.frame += 1
         self._remember(joints)
@@ -126,7 +126,7 @@ class LiveRadar:
             self.begun.append(self._scene(pulses * self.fps / self.prf_hz - (self.frame - 2)))
             self.pulse = stop
         first = self.pulse - sum(points.shape[1] for points, _ in self.begun)
-        # The moving target indicator needs several pulses to begin with.
+        # The moving target indicator needs several pulses to start.
         least = self.simulator.mti.lost_pulses if self.pending is None else 0
         if self.pulse - first <= least:
             return self._columns(None, first)
@@ -141,7 +141,7 @@ class LiveRadar:
                 self.people[number] = _Person(place.expand(4, 14, 3), torch.zeros(4).double(), number)
         for number, person in list(self.people.items()):
             place, there = joints.get(number, (person.joints[-1], False))
-            # People that were absent appear where they are now once nothing is heard of them where they were.
+            # People who were absent reappear at their new place only once they have faded out at the old one.
             silent = float(person.presence.amax()) == 0
             if there and silent:
                 person.joints = place.expand(4, 14, 3)
@@ -157,7 +157,7 @@ class LiveRadar:
                 del self.people[number]
 
     def _scene(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Scatterers (1, m, S, 3) and their cross sections at times u (m,) of the piece."""
+        """Scatterers (1, m, S, 3) and their cross sections at times u (m,) within the piece of the spline."""
         shown = [person for person in self.people.values() if float(person.presence.amax()) > 0]
         joints = (
             torch.stack([cubic_b_spline(p.joints, u) for p in shown])
@@ -187,7 +187,7 @@ class LiveRadar:
         return NewColumns(piece.doppler_time[0], still, moving, end_s)
 
     def _display(self, index: int, magnitude: Tensor) -> Tensor:
-        """Columns (R, m) at the display rate; those that do not fill a block wait."""
+        """Columns (R, m) at the display rate; those that do not fill a block are kept for the next call."""
         if self.rest[index].numel():
             magnitude = torch.cat([self.rest[index], magnitude], dim=-1)
         block = self.simulator.range_time_block

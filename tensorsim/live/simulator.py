@@ -22,7 +22,7 @@ from tensorsim.vision.lifting.metric_pose import MetricPose
 
 
 class LivePerson(NamedTuple):
-    """Somebody in a frame.
+    """A person in a frame.
 
     Attributes:
         number: in order of appearance, from 1.
@@ -125,7 +125,7 @@ class LiveSimulator:
         if config.processing.display_rate_hz is None and config.scene.radar.prf_hz > 256:
             config = config.replace(processing__display_rate_hz=256.0)
         self.config, self.fps = config, float(fps)
-        # First, because it refuses settings before networks are loaded.
+        # First, because it checks the settings before networks are loaded.
         self.radar = LiveRadar(PoseToDoppler.from_config(config), fps)
         self.vision = VideoToPose.from_config(config, detector, pose)
         self.lifter = _each_frame_alone(self.vision.lifter)
@@ -166,7 +166,7 @@ class LiveSimulator:
             )
         self.index += 1
         detections = None
-        # Not by the number of the frame: of those that a busy machine drops, too many may be the ones to look at.
+        # Not by frame number: a busy machine may drop too many of the very frames due for detection.
         if self.detected is None or self.index - self.detected >= self.vision.interval_at(self.fps):
             self.detected = self.index
             detections = Detections(*(field[0] for field in self.vision.detect(frame[None])))
@@ -197,7 +197,7 @@ class LiveSimulator:
         centre_s = (column * doppler.hop + doppler.length / 2) / self.radar.prf_hz + late_s
         self.columns_done += count
         time_s = self.index / self.fps
-        # Before the first column the radar waits for its first window.
+        # Before the first column, the radar is still filling its first window.
         end_s = ((self.columns_done - 1) * doppler.hop + doppler.length) / self.radar.prf_hz
         delay_s = time_s - end_s if self.columns_done else time_s
         label = None
@@ -258,7 +258,7 @@ class LiveSimulator:
         return self.poses[min(self.order[number], len(self.poses) - 1)]
 
     def _causal_pose(self, height_m: float) -> CausalPose:
-        """The pose stage of somebody of this height."""
+        """The pose stage for a person of this height."""
         vision, people = self.vision, self.config.pose
         metric = MetricPose(people.camera, (height_m,), None, people.keypoint_threshold, calibrated=True)
         return CausalPose(
@@ -274,7 +274,7 @@ class LiveSimulator:
 
 
 def _each_frame_alone(lifter: nn.Module | None) -> nn.Module:
-    """The same lifter without a look at other frames, quick for single ones.
+    """The same lifter without looking at other frames, fast for single frames.
 
     Raises:
         TensorsimError: a lifter of another class.

@@ -1,4 +1,4 @@
-"""Tracking frame by frame: the association of :class:`~tensorsim.vision.GNNTracker` without its look ahead."""
+"""Tracking frame by frame: the association of :class:`~tensorsim.vision.GNNTracker` without look-ahead."""
 
 from typing import NamedTuple
 
@@ -17,8 +17,8 @@ class OnlineTracks(NamedTuple):
     Attributes:
         living: their boxes and hits.
         confirmed: (n,) bool.
-        strong_hits: (n,) detections of at least the start score so far.
-        born: tracks that were ever started; ``living.rows`` are their numbers.
+        strong_hits: (n,) number of detections so far with at least the start score.
+        born: number of tracks ever started; ``living.rows`` are their numbers.
     """
 
     living: Living
@@ -28,11 +28,11 @@ class OnlineTracks(NamedTuple):
 
 
 class OnlineTracker(GNNTracker):
-    """A :class:`~tensorsim.vision.GNNTracker` that is given one frame at a time.
+    """A :class:`~tensorsim.vision.GNNTracker` that takes one frame at a time.
 
-    Detections belong to the same tracks as in the whole clip. Boxes are filtered, not smoothed; somebody is a person
-    from the moment on at which a track is confirmed and has its ``min_hits``, and of more than ``max_tracks`` the
-    oldest count. The state is handed in and out.
+    Detections are assigned to the same tracks as for the whole clip. Boxes are filtered, not smoothed. A track is a
+    person as soon as it is confirmed and has ``min_hits``; of more than ``max_tracks``, the oldest are kept. The
+    caller holds the state.
     """
 
     def begin(self) -> OnlineTracks:
@@ -75,7 +75,7 @@ class OnlineTracker(GNNTracker):
         return state.living.rows[chosen].tolist(), center_to_xyxy(place)
 
     def _usable(self, detections: Detections) -> tuple[Tensor, Tensor]:
-        """Boxes (k, 4) of the detections that count, best first, and their scores (k,)."""
+        """Boxes (k, 4) of the usable detections, best first, and their scores (k,)."""
         boxes, scores = detections.boxes.detach().cpu().double(), detections.scores.detach().cpu().double()
         usable = (
             detections.valid.cpu()
@@ -89,5 +89,5 @@ class OnlineTracker(GNNTracker):
 
 
 def _taken(strong: Tensor, column: Tensor) -> Tensor:
-    """Of each track, whether its detection (n,), -1 without, is a strong one."""
+    """For each track, whether its detection (n,), -1 for none, is a strong one."""
     return torch.cat([strong, strong.new_zeros(1)])[column]

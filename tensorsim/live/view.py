@@ -1,4 +1,4 @@
-"""The picture of a live simulation: the camera's frame with people, the scrolling map, labels over time."""
+"""The picture of a live simulation: the camera frame with people, the scrolling map, labels over time."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from tensorsim.live.labels import LastColumns, LiveLabel
 from tensorsim.live.simulator import LiveFrame, LiveSimulator
 
 WIDTH, MAP_HEIGHT, STRIP_HEIGHT = 640, 240, 26
-#: Seconds of the map that are shown.
+#: Seconds of the map shown.
 SHOWN_S = 10.0
 #: A person at 9 m, relative to one at 3 m (amplitude).
 FAR_AWAY = 1 / 9
@@ -16,15 +16,15 @@ _COLOURS = ((70, 110, 180), (170, 100, 60), (80, 140, 80), (150, 80, 150), (120,
 
 
 class LiveView:
-    """Draws what a :class:`~tensorsim.LiveSimulator` gives, frame by frame.
+    """Draws the output of a :class:`~tensorsim.LiveSimulator` frame by frame.
 
-    The map is drawn in dB below its peak, or below the echo of a person far away: the noise of an empty scene is as
-    weak as it is.
+    The map is drawn in dB below its peak, but at least that of a person far away, so that the noise of an empty scene
+    stays weak.
 
     Args:
         simulator: the source of the frames.
         style: colours and dynamic range.
-        top_speed_m_s: the map shows Doppler of speeds up to this.
+        top_speed_m_s: the map shows Doppler frequencies of speeds up to this.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class LiveView:
         self.labels: list[LiveLabel] = []
 
     def add(self, new: LiveFrame) -> None:
-        """Take the columns and the label of a frame, also of one that was missed."""
+        """Take the columns and the label of a frame, including a missed one."""
         self.map.push(new.doppler_time[torch.from_numpy(self.rows)])
         if new.label is not None:
             self.labels.append(new.label)
@@ -92,7 +92,7 @@ class LiveView:
         return picture
 
     def _strip(self, new: LiveFrame) -> np.ndarray:
-        """Labels, each where its last second is."""
+        """A strip of labels, each drawn over its last second."""
         import cv2
 
         strip = np.full((STRIP_HEIGHT, WIDTH, 3), 40, np.uint8)
