@@ -1,1 +1,1 @@
-"""How far the pipeline is from the truth: films of people whose motion is known, and the maps of both."""
+"""How far the pipeline is from the truth: films of people with known motion, and the maps of both."""

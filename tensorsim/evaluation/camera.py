@@ -1,4 +1,4 @@
-"""How well a camera is told from people: generated walks before cameras that are known."""
+"""How well a camera is estimated from people: generated walks in front of known cameras."""
 
 import math
 from typing import NamedTuple
@@ -18,16 +18,16 @@ from tensorsim.vision.calibration.upright import STANDING, WALKING, ends_of_body
 
 FPS = 30.0
 HEIGHT, WIDTH = 480, 640
-#: Somebody whose key points all lie in the picture in less than this share of the frames is not tried.
+#: Walks with all key points in the picture in less than this share of the frames are skipped.
 LEAST_SEEN = 0.5
 
 
 class Walk(NamedTuple):
-    """Somebody who walks before a camera.
+    """A person walking in front of a camera.
 
     Attributes:
         joints: (T, 14, 3) metres, the camera above the origin.
-        height_m: of the body.
+        height_m: height of the body.
         keypoints: (T, 17, 2) pixels.
         scores: (T, 17), 1 in the picture, else 0.
     """
@@ -47,10 +47,10 @@ class CameraErrors(NamedTuple):
     """Errors of one estimate.
 
     Attributes:
-        pitch_deg: estimated less true.
-        range: relative, median over the frames with an upright body.
-        fov_deg, height_m: estimated less true.
-        fov_sd_deg: the standard deviation that the estimate gives for its field of view.
+        pitch_deg: estimate minus truth.
+        range: relative error, median over the frames with an upright body.
+        fov_deg, height_m: estimate minus truth.
+        fov_sd_deg: standard deviation of the field of view as stated by the estimate.
     """
 
     pitch_deg: float
@@ -61,7 +61,7 @@ class CameraErrors(NamedTuple):
 
 
 def known_camera(tilt_deg: float, height_m: float, fov_deg: float) -> CameraConfig:
-    """A camera above the origin that looks down by ``tilt_deg``."""
+    """A camera above the origin, tilted down by ``tilt_deg``."""
     return CameraConfig(
         horizontal_fov_rad=math.radians(fov_deg),
         position_m=(0.0, 0.0, height_m),
@@ -70,12 +70,12 @@ def known_camera(tilt_deg: float, height_m: float, fov_deg: float) -> CameraConf
 
 
 def walk_before(camera: CameraConfig, seed: int, turn_deg: float = 80.0, seconds: float = 8.0) -> Walk:
-    """A generated walk that turns once, where most of it is in the picture.
+    """A generated walk with one turn, placed at the range where most of it is in the picture.
 
     Args:
-        camera: above the origin.
-        seed: of the person, the heading and the side to which they turn.
-        turn_deg: angle of the turn after half the time; 0 is a straight walk.
+        camera: a camera above the origin.
+        seed: seed of the person, the heading and the side of the turn.
+        turn_deg: angle of the turn at half time; 0 is a straight walk.
         seconds: length.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -111,7 +111,7 @@ def _seen_by(camera: CameraConfig, joints: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def estimate(walk: Walk, noise_px: float, known_height: bool, seed: int = 0) -> CameraEstimate:
-    """The camera told from the key points of a walk with normal errors of ``noise_px``, before :func:`used`."""
+    """The camera estimated from key points of a walk with Gaussian errors of ``noise_px``, before :func:`used`."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(walk.keypoints.shape, generator=generator, dtype=torch.float64)
     keypoints = walk.keypoints + noise_px * noise
@@ -121,12 +121,12 @@ def estimate(walk: Walk, noise_px: float, known_height: bool, seed: int = 0) -> 
 
 
 def used(told: CameraEstimate) -> CameraEstimate:
-    """What the pipeline takes of an estimate: less of a tilt that is uncertain."""
+    """The estimate as used by the pipeline: drawn towards a usual camera where its tilt is uncertain."""
     return with_reserve(told, HEIGHT, WIDTH)
 
 
 def errors_of(found: CameraEstimate, camera: CameraConfig, walk: Walk) -> CameraErrors:
-    """Errors of an estimate; ranges are those of the true key points seen through the estimated camera.
+    """Errors of an estimate; ranges follow from the true key points and the estimated camera.
 
     Raises:
         TensorsimError: no frame of the walk shows an upright body.

@@ -1,4 +1,4 @@
-"""Clips whose motion is known at every instant, from the generator or from motion capture."""
+"""Clips with motion known at every instant, from the generator or from motion capture."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,9 +27,9 @@ class ActivityClip:
     """A generated person who performs one of the twelve activities.
 
     Attributes:
-        row: name of the class, the row of the table that the clip counts for.
-        name: of the clip within the row.
-        seed: of the generator, and of the random numbers of a film of it.
+        row: name of the class, which is the clip's row in the table.
+        name: name of the clip within the row.
+        seed: seed of the generator and of the random numbers of a film of it.
     """
 
     row: str
@@ -49,7 +49,7 @@ class ActivityClip:
         return activity_index(self.row) != 0
 
     def joints(self, rate_hz: float) -> Tensor:
-        """The true joints (T, 14, 3) float64 in m at ``k / rate_hz``, evaluated and not resampled."""
+        """The true joints (T, 14, 3) float64 in m at ``k / rate_hz``, evaluated, not resampled."""
         motion = ActivityGenerator().generate(
             self.row, seed=self.seed, duration_s=self.duration_s, rate_hz=rate_hz
         )
@@ -58,13 +58,13 @@ class ActivityClip:
 
 @dataclass(frozen=True)
 class CapturedClip:
-    """Captured motion; between its frames the natural cubic spline through them counts as the truth.
+    """Captured motion; between frames, the natural cubic spline through them counts as the truth.
 
     Attributes:
         row, name: see :class:`ActivityClip`.
         motion: one person on the floor, cut to the clip.
-        source: what the motion was read from: digest of the file, and the frame rate that was given.
-        seed: of the random numbers of a film of it.
+        source: origin of the motion: digest of the file, and the frame rate given.
+        seed: seed of the random numbers of a film of it.
     """
 
     row: str
@@ -97,7 +97,7 @@ Clip = ActivityClip | CapturedClip
 
 
 def activity_clips(activities: tuple[str, ...], count: int, seed: int) -> dict[str, list[Clip]]:
-    """``count`` clips of each activity (default all), numbered from ``seed`` on, by row; all with different people."""
+    """``count`` clips of each activity (default all), numbered from ``seed``, by row; all of different people."""
     indices = [activity_index(name) for name in activities] or list(range(len(ACTIVITIES)))
     return {
         ACTIVITIES[i]: [
@@ -110,15 +110,15 @@ def activity_clips(activities: tuple[str, ...], count: int, seed: int) -> dict[s
 def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Clip]:
     """The first ``count`` motions of a file, at most 4 s of each, 4 m away.
 
-    The first frame of a capture is left out: it is often a calibration pose.
+    The first frame of a capture is skipped: it is often a calibration pose.
 
     Args:
-        path: ``.bvh`` or ``.npz``; of an ``.npz`` with several motions the first person of each.
+        path: ``.bvh`` or ``.npz``; from an ``.npz`` with several motions, the first person of each.
         count: largest number of clips.
-        fps: frames per second, in place of that of the file; required if the file has none.
+        fps: frames per second, overrides that of the file; required if the file has none.
 
     Raises:
-        TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; no motion that is long enough.
+        TensorsimError: see :func:`tensorsim.data.motion_files.load_motion`; no motion is long enough.
     """
     clips: list[Clip] = []
     keys = motion_keys(path)
@@ -137,7 +137,8 @@ def captured_clips(path: Path, count: int, fps: float | None = None) -> list[Cli
 
 
 def _kept_away(motion: Motion, nearest_m: float = 1.5, farthest_m: float = 7.0) -> Motion:
-    """Motion moved along y by the least amount that keeps it within the generator's ranges, the nearest one first."""
+    """Motion moved along y by the least amount that keeps it within the generator's ranges; the nearest one has
+    priority."""
     y = mid_hips(motion.joints)[..., 1]
     shift = (farthest_m - y.max()).clamp(max=0.0)
     shift = torch.maximum(shift, nearest_m - y.min())

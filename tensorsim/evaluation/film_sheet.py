@@ -1,4 +1,4 @@
-"""A contact sheet of a film: pictures with the people found in them, Doppler-time maps, and where people are."""
+"""A contact sheet of a film: pictures with the people found, Doppler-time maps, and positions of people."""
 
 import math
 from textwrap import fill
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS, _ROWS = 4, 2
-#: Most people in the legend.
+#: Maximum number of people in the legend.
 _NAMED = 5
 
 
@@ -35,11 +35,11 @@ def contact_sheet(
     """Draw the sheet; all times are those of the film.
 
     Args:
-        film: what is known of the film.
-        reader: of the frames that ``found.pose`` is of.
-        found: the people of one clip, and the camera whose floor is drawn; None draws none.
+        film: the labelled film.
+        reader: reads the frames that ``found.pose`` belongs to.
+        found: the people of one clip, and the camera whose floor is drawn; a camera of None draws no floor.
         threshold: score from which a key point is drawn.
-        scenes: per scene the verdict, and its maps with their axes where there are any.
+        scenes: for each scene, the verdict, and its maps with their axes if there are any.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -82,7 +82,7 @@ def _said_of(camera: CameraEstimate | None) -> str:
 def _pictures(
     reader: VideoReader, found: Found, threshold: float, chosen: set[int]
 ) -> list[tuple[int, np.ndarray]]:
-    """The chosen frames by number, people drawn on them."""
+    """The chosen frames with their numbers, people drawn on them."""
     pose, camera = found.pose, found.camera
     to_film = None if found.from_film is None else found.from_film.inverse().numpy()
     boxes, keypoints, scores, valid = (
@@ -117,7 +117,7 @@ def _pictures(
 
 
 def _small(frame: Tensor, width: int = 640) -> np.ndarray:
-    """A frame (3, H, W) as (h, w, 3), not wider than ``width``."""
+    """A frame (3, H, W) as (h, w, 3), at most ``width`` pixels wide."""
     import cv2
 
     picture = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())

@@ -1,8 +1,8 @@
-"""Variants of a film that show the same activity: how much a label depends on small things.
+"""Variants of a film that show the same activity: how much a label depends on small changes.
 
-With few labelled films, one that is nearly even between two labels decides a whole figure. The variants of a film are
-it mirrored, without its first or its last quarter of a second, and with key points that are a little off. They are
-made of what the networks found, so the networks run once.
+With few labelled films, a single one that is nearly tied between two labels can sway an overall score. The variants
+of a film are its mirror image, the film without its first or last quarter of a second, and the film with slightly
+displaced key points. They are made from the networks' results, so the networks run only once.
 """
 
 import math
@@ -17,22 +17,22 @@ from tensorsim.types import Tracks
 
 #: Seconds left out at the beginning or at the end.
 CUT_S = 0.25
-#: Standard deviation of the key points' errors, share of the diagonal of the box.
+#: Standard deviation of the displacement of key points, as a share of the diagonal of the box.
 KEY_POINT_ERROR = 0.007
-#: Probability that is counted where the right label has a lower one, or the simulation refuses the film.
+#: Lower bound of the probability of the right label; also counts where the simulation refuses the film.
 LEAST_PROBABILITY = 1e-3
 
 
 class Observed(NamedTuple):
-    """What the networks found in a film, at even times.
+    """What the networks found in a film, at evenly spaced times.
 
     Attributes:
-        tracks: of one clip (B = 1).
+        tracks: tracks of one clip (B = 1).
         keypoints: (1, P, T, 17, 2) pixels.
         scores: (1, P, T, 17).
         size: (height, width) of the pictures.
         background_px_s: as in :class:`~tensorsim.streaming.Found`.
-        camera_steps: (T, 4) of a camera that moves, see :func:`~tensorsim.streaming.steps_of_camera`; None of a still
+        camera_steps: (T, 4) of a moving camera, see :func:`~tensorsim.streaming.steps_of_camera`; None for a static
             one.
     """
 
@@ -45,10 +45,10 @@ class Observed(NamedTuple):
 
 
 def variants(seen: Observed, fps: float) -> dict[str, Observed]:
-    """The film as it is, first, and its variants, by name.
+    """The unchanged film first, then its variants, by name.
 
     Args:
-        seen: of the film; one no longer than a second is not shortened.
+        seen: results for the film; one no longer than a second is not shortened.
         fps: frames per second.
     """
     found = {"as it is": seen, "mirrored": mirrored(seen)}
@@ -62,7 +62,7 @@ def variants(seen: Observed, fps: float) -> dict[str, Observed]:
 
 
 def mirrored(seen: Observed) -> Observed:
-    """What would be found in the mirror image: left is right, for the picture and for the people."""
+    """What would be found in the mirror image: left and right are swapped, in the picture and on the people."""
     edge = seen.size[1] - 1
     left, top, right, bottom = seen.tracks.boxes.unbind(-1)
     boxes = torch.stack([edge - right, top, edge - left, bottom], -1)
@@ -98,15 +98,15 @@ def _displaced(seen: Observed, seed: int) -> Observed:
 
 
 def over_variants(rows: Iterable[Mapping[str, Any]], scene: str) -> tuple[float, float]:
-    """What the variants of films say of a scene.
+    """Results over the variants of films in a scene.
 
     Args:
-        rows: of films, with their ``variants``: those of ``films.json``.
+        rows: rows of films with their ``variants``, as in ``films.json``.
         scene: name of the scene.
 
     Returns:
-        How many of the films are right, mean over their variants, and the mean logarithm of the probability of the
-        right labels.
+        How many of the films are right, averaged over their variants, and the mean logarithm of the probability of
+        the right labels.
     """
     right, logarithms = 0.0, []
     for row in rows:

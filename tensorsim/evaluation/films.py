@@ -1,4 +1,4 @@
-"""Keypoints of a clip in a camera picture: the true ones, or those that networks find in the rendered film."""
+"""Keypoints of a clip in a camera picture: the true ones, or those found by networks in the rendered film."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from tensorsim.types import Tracks
 #: Frame rate of the films.
 FPS = 30.0
 HEIGHT, WIDTH = 360, 640
-#: Behind the radar, so that a whole body is in view from 1.5 m on.
+#: Behind the radar, so that a whole body is in view from a range of 1.5 m.
 CAMERA = CameraConfig(position_m=(0.0, -2.0, 1.0))
 
 
@@ -29,7 +29,7 @@ class Observed(NamedTuple):
 
     Attributes:
         boxes: (P, T, 4) ``xyxy`` pixels.
-        valid: (P, T) bool, whether the person is followed in that frame.
+        valid: (P, T) bool, whether the person is tracked in that frame.
         keypoints: (P, T, 17, 2) pixels.
         scores: (P, T, 17).
     """
@@ -40,17 +40,17 @@ class Observed(NamedTuple):
     scores: Tensor
 
     def tracks(self) -> Tracks:
-        """As the output of a tracker, a batch of one clip."""
+        """The tracks in the form of a tracker's output, a batch of one clip."""
         return Tracks(self.boxes[None], self.valid[None], self.valid[None])
 
     def lifted_by(self, stage: VideoToPose) -> tuple[Tensor, Tensor]:
-        """Joints (P, T, 14, 3) m that a stage makes of these key points, and whether people are there (P, T)."""
+        """Joints (P, T, 14, 3) m that a stage makes from these key points, and whether people are present (P, T)."""
         pose = stage.lift(self.tracks(), self.keypoints[None], self.scores[None], HEIGHT, WIDTH, FPS)
         return pose.joints[0], pose.valid[0]
 
 
 def project(joints: Tensor) -> tuple[Tensor, Tensor, View]:
-    """COCO keypoints of joints (T, 14, 3): pixels (T, 17, 2), whether in the picture (T, 17), the camera's view."""
+    """COCO keypoints of joints (T, 14, 3): pixels (T, 17, 2), whether inside the picture (T, 17), and the view."""
     view = View.of_camera(CAMERA, HEIGHT, WIDTH, joints)
     pixels, depth = view.project(body_to_coco(joints))
     limit = pixels.new_tensor([WIDTH - 0.5, HEIGHT - 0.5])
@@ -59,9 +59,9 @@ def project(joints: Tensor) -> tuple[Tensor, Tensor, View]:
 
 
 def true_keypoints(clip: Clip) -> Observed:
-    """The true keypoints of a clip, those inside the picture with score 1, the others with 0.
+    """The true keypoints of a clip, with score 1 inside the picture and 0 outside.
 
-    Hidden ones count, as they do in the labels of COCO; boxes are those of the keypoints and a margin.
+    Hidden ones count, as in COCO's labels; boxes enclose the keypoints with a margin.
     """
     joints = clip.joints(FPS)
     if not clip.present:

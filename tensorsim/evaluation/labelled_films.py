@@ -1,6 +1,6 @@
-"""Real films of known activity: who is found in them, and what the maps of each scene are taken for.
+"""Real films of known activity: the people found in them, and the activity recognised in the maps of each scene.
 
-``labels.json`` of a folder lists its films: ``file``, the seconds ``start_s`` to ``end_s`` in which the activity
+A folder's ``labels.json`` lists its films: ``file``, the seconds ``start_s`` to ``end_s`` in which the activity
 happens, and the activities that count as right (``accept``).
 """
 
@@ -48,7 +48,7 @@ class LabelledFilm:
     Attributes:
         folder, file: where the film is.
         start_s, end_s: the seconds in which the activity happens.
-        accept: labels that are right, of ``tensorsim.ACTIVITIES``.
+        accept: labels that count as right, from ``tensorsim.ACTIVITIES``.
     """
 
     folder: Path
@@ -59,20 +59,20 @@ class LabelledFilm:
 
     @property
     def path(self) -> Path:
-        """Of the film."""
+        """Path of the film."""
         return self.folder / self.file
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the maps of one scene are taken for.
+    """The activity recognised in the maps of one scene.
 
     Attributes:
         scene: name of the scene.
         label: the most probable activity; None where the simulation refused the film.
-        probability: of the label.
+        probability: probability of the label.
         right: whether the label is accepted.
-        right_probability: of all accepted labels together; 0 where there is no label.
+        right_probability: total probability of all accepted labels; 0 where there is no label.
         error: why there is no label.
     """
 
@@ -92,11 +92,11 @@ class Scene(NamedTuple):
 
 
 def read_labels(folder: Path) -> list[LabelledFilm]:
-    """The films that ``labels.json`` of a folder lists.
+    """The films listed in the ``labels.json`` of a folder.
 
     Raises:
-        TensorsimError: no such file, not such a list, no films, an unknown activity or none, seconds that cannot be, a
-            film that is not there, or seconds that are listed twice.
+        TensorsimError: the file is missing or not such a list; no films; an unknown activity or none; impossible
+            times; a missing film; or the same seconds listed twice.
     """
     table = folder / "labels.json"
     try:
@@ -141,7 +141,7 @@ def read_labels(folder: Path) -> list[LabelledFilm]:
 
 
 def whole_films(films: Iterable[LabelledFilm]) -> list[LabelledFilm]:
-    """Each film once, from beginning to end; what is right in any of its parts is right."""
+    """Each film once, from beginning to end; a label accepted in any of its parts is accepted."""
     accept: dict[tuple[Path, str], dict[str, None]] = {}
     for film in films:
         accept.setdefault((film.folder, film.file), {}).update(dict.fromkeys(film.accept))
@@ -149,15 +149,16 @@ def whole_films(films: Iterable[LabelledFilm]) -> list[LabelledFilm]:
 
 
 class FilmReader:
-    """Finds the people of films; what the networks gave is kept in a folder and used again.
+    """Finds the people in films; the networks' outputs are cached in a folder and reused.
 
-    Detections are kept by film, cut and detector, key points by these, the tracks and the pose network, networks by
-    their file and what runs them, and all by the version of this package; tracking, lifting and smoothing run anew.
+    Detections are keyed by film, cut and detector; key points by these, the tracks and the pose network; networks by
+    their file and what runs them; and everything by the version of this package. Tracking, lifting and smoothing are
+    computed anew.
 
     Args:
-        stage: with the networks.
+        stage: the stage that holds the networks.
         networks: files of detector and pose network.
-        cache: the folder.
+        cache: the folder of the cache.
         stride: keep every n-th frame of the films.
         calibrate: estimate the camera of each film from the people in it.
     """
@@ -171,7 +172,7 @@ class FilmReader:
         calibrate: bool = True,
     ) -> None:
         self.stage, self.cache, self.stride, self.calibrate = stage, cache, stride, calibrate
-        # The names of their parts say what runs the networks, and whether the pose network sees mirror images.
+        # Their repr shows what runs the networks, and whether the pose network also sees mirror images.
         self.detector, self.pose = (
             digest([sha256_of(path), repr(network)])
             for path, network in zip(networks, (stage.detector, stage.pose), strict=True)
@@ -184,18 +185,18 @@ class FilmReader:
     def people(
         self, film: LabelledFilm, reader: VideoReader, device: torch.device, quiet: bool = False
     ) -> Found:
-        """The people of a film and its camera, if that is estimated; arguments of :meth:`observed`."""
+        """The people of a film, and its camera if it is estimated; arguments as for :meth:`observed`."""
         return self.lifted(self.observed(film, reader, device, quiet), reader.fps)
 
     def observed(
         self, film: LabelledFilm, reader: VideoReader, device: torch.device, quiet: bool = False
     ) -> Observed:
-        """What the networks find in a film, from the cache where it is there.
+        """What the networks find in a film, from the cache where available.
 
         Args:
-            film: of which.
-            reader: of :meth:`open`; it knows the times of the frames afterwards.
-            device: to compute on.
+            film: the film.
+            reader: reader from :meth:`open`; afterwards it knows the times of the frames.
+            device: device to compute on.
             quiet: no progress bars.
         """
         stage = self.stage
@@ -236,7 +237,7 @@ class FilmReader:
         return Observed(tracks, keypoints, scores, size, shift, steps)
 
     def lifted(self, seen: Observed, fps: float) -> Found:
-        """The people in metres, and the camera if that is estimated, of :meth:`observed`."""
+        """The people in metres, and the camera if it is estimated, from the result of :meth:`observed`."""
         found = lifted_film(
             self.stage,
             seen.tracks,
@@ -251,7 +252,7 @@ class FilmReader:
         return found._replace(background_px_s=seen.background_px_s)
 
     def _kept(self, name: str, make: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """Tensors of a file of the cache, made and written first if it is not there."""
+        """Tensors from a file of the cache, computed and written first if it is missing."""
         path = self.cache / f"{name}.npz"
         if path.is_file():
             with np.load(path, allow_pickle=False) as arrays:
@@ -272,7 +273,7 @@ def judged(
     device: torch.device,
     quiet: bool = False,
 ) -> tuple[Verdict, RadarMaps | None]:
-    """The verdict on a film in one scene, and its maps; None where the simulation refuses its motion."""
+    """The verdict on a film in one scene, and its maps; maps are None where the simulation refuses its motion."""
     pose = within_reach(found, how.stage.simulator.radar).pose
     torch.manual_seed(seed)
     try:
@@ -286,7 +287,7 @@ def judged(
 
 
 def followed(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]]:
-    """A row per person: those of :func:`~tensorsim.summary.people_of`, for how long, and the fastest joint."""
+    """A row per person: that of :func:`~tensorsim.summary.people_of`, tracked time, and speed of the fastest joint."""
     rows = people_of(pose, fps, radar)
     for row in rows:
         person = row["id"] - 1
@@ -305,7 +306,7 @@ def film_row(
     fps: float,
     verdicts: Iterable[Verdict],
 ) -> dict[str, Any]:
-    """What ``films.json`` says of a film."""
+    """The entry of a film in ``films.json``."""
     return {
         "file": film.file,
         "start_s": film.start_s,
@@ -320,7 +321,7 @@ def film_row(
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The table of the films, how many are right in each scene, and over their variants if they have been labelled."""
+    """The table of films, and how many are right in each scene, also over their variants if these were labelled."""
     scenes = list(rows[0]["scenes"])
     heads = ["film", "right is", *scenes, "followed"]
     lines = [heads, ["---"] * len(heads)]

@@ -22,14 +22,14 @@ HEADINGS = {
     "nmse": "NMSE",
     "envelope_m_s": "envelope RMSE m/s",
 }
-#: Errors of the joints of a cell, with their names in the tables.
+#: Errors of joints in a cell, with their names in the tables.
 POSE = {
     "followed": "frames followed, share",
     "root": "hips, rms m",
     "joints": "joints about the hips, mean m",
     "range": "of these along y, rms m",
 }
-#: The row with nobody in it: what is exactly right there has an infinite PSNR, and what is not has any.
+#: The row without people: there, PSNR is infinite where the maps are exactly right and arbitrary otherwise.
 EMPTY = ACTIVITIES[0]
 Cells = list[dict[str, Any]]
 
@@ -49,7 +49,7 @@ def figure_of(cells: Cells, scene: str, name: str, figure: str) -> float:
 
 
 def write_csv(path: Path, cells: Cells) -> None:
-    """One line per clip, setting, scene and map; the errors of the joints are those of all its scenes and maps."""
+    """One line per clip, setting, scene and map; joint errors are the same for all scenes and maps of a clip."""
     with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         errors = ("people", *POSE)
@@ -77,7 +77,7 @@ def _table(heads: list[str], lines: list[list[str]]) -> list[str]:
 
 
 def markdown(cells: Cells) -> str:
-    """Tables for whole pipelines, pipelines with one true stage, errors of joints, and people who are not there."""
+    """Tables for whole pipelines, pipelines with one true stage, joint errors, and falsely detected people."""
     rows = list(dict.fromkeys(c["row"] for c in cells))
     names = list(dict.fromkeys(c["setting"] for c in cells))
     scenes = list(dict.fromkeys(scene for c in cells for scene in c["scores"]))
@@ -88,7 +88,7 @@ def markdown(cells: Cells) -> str:
         return [c for c in cells if c["setting"] == setting and (row is None or c["row"] == row)]
 
     def overall(setting: str, scene: str, name: str, figure: str) -> float:
-        """Mean of the means of the rows with somebody in them, so that rows have equal weight."""
+        """Mean of the means of all rows with people, so that these rows have equal weight."""
         return mean(figure_of(chosen(setting, row), scene, name, figure) for row in rows if row != EMPTY)
 
     text = ["# Truth loop", ""]
@@ -149,7 +149,7 @@ def markdown(cells: Cells) -> str:
 
 
 def _left_out(cells: Cells, names: list[str], scenes: list[str]) -> list[str]:
-    """How many clips each setting lacks: means of settings that lack different ones do not compare."""
+    """How many clips each setting lacks: means over different sets of clips are not comparable."""
     counts = {
         (name, scene): [scene not in cell["scores"] for cell in cells if cell["setting"] == name]
         for name in names

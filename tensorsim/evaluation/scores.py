@@ -25,11 +25,11 @@ class Maps:
 
     @classmethod
     def of(cls, maps: RadarMaps) -> "Maps":
-        """Those of one clip."""
+        """The maps of one clip."""
         return cls(*(getattr(maps, name).reshape(getattr(maps, name).shape[-2:]) for name in MAPS))
 
     def like(self, other: "Maps") -> "Maps":
-        """The same with as many columns as ``other``: cut, or padded with zeros."""
+        """The same maps with as many columns as ``other``: cut, or padded with zeros."""
         return Maps(
             *(
                 F.pad(
@@ -52,10 +52,10 @@ def mean_maps(many: list[Maps]) -> Maps:
 
 
 def compare(guess: Maps, truth: Maps, speed_m_s: Tensor) -> dict[str, dict[str, float]]:
-    """Figures of each map: PSNR, SSIM (linear, and in dB cut 40 dB below the peak), NMSE, envelope.
+    """Scores of each map: PSNR, SSIM (linear, and in dB clipped 40 dB below the peak), NMSE, envelope.
 
     Each map is scaled by its own peak; nothing is shifted or fitted. Two maps without any echo are equal (PSNR
-    infinite, NMSE 0). The envelope is NaN if one of the maps has none.
+    infinite, NMSE 0). The envelope error is NaN if one of the maps has no envelope.
 
     Args:
         guess, truth: maps of one size.
@@ -77,7 +77,7 @@ def compare(guess: Maps, truth: Maps, speed_m_s: Tensor) -> dict[str, dict[str, 
 
 
 def similarity(maps: RadarMaps, truth: RadarMaps) -> dict[str, dict[str, float | None]]:
-    """How like maps are to those of the true motion: PSNR of linear and dB maps, SSIM, each map over its peak.
+    """Similarity of maps to those of the true motion: PSNR and SSIM of linear and dB maps, each scaled by its peak.
 
     None where a figure is not finite, as for two empty maps.
     """

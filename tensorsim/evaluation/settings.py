@@ -1,4 +1,4 @@
-"""The ways from a clip to its maps that are compared: whole pipelines, and pipelines with one true stage."""
+"""The compared ways from a clip to its maps: whole pipelines, and pipelines with one true stage."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -26,11 +26,11 @@ from tensorsim.vision.smoothing.kalman import KalmanSmoother
 
 #: Columns per second of range-time maps that have more pulses than that.
 DISPLAY_RATE_HZ = 256.0
-#: The configuration of the pipeline by whether it is the literal paper.
+#: Configurations of the pipeline; the key is whether it follows the paper literally.
 CONFIGS = {False: SimulationConfig(), True: SimulationConfig.paper()}
 #: Variance in m^2 of joints from exact keypoints.
 EXACT_NOISE = 1e-6
-#: Stages in their order; the first two have a say from a film on only, the next three from keypoints on.
+#: Stages in order; the first two matter only for films, the next three for films and keypoints.
 STAGES = ("detector", "pose", "lifting", "position", "smoothing", "interpolation")
 SOURCES = {
     "a": "true 3D joints at video rate",
@@ -45,7 +45,7 @@ class Setting:
 
     Attributes:
         source: "a" starts from true joints at the frame rate, "b" from true keypoints, "c" from the film.
-        paper: the paper's literal formulas in every stage that has them.
+        paper: use the paper's literal formulas in every stage that has them.
         true_stage: the stage of ``STAGES`` that is replaced by the truth, or "".
     """
 
@@ -55,7 +55,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """What tables and files call it."""
+        """Its name in tables and files."""
         return (
             self.source
             + ("-paper" if self.paper else "")
@@ -64,13 +64,13 @@ class Setting:
 
 
 def lifting_files() -> dict[str, str]:
-    """Digests of the shipped files by which key points are lifted: weights, and the poses of nearest matching."""
+    """Digests of the shipped files used to lift key points: weights, and the poses for nearest matching."""
     poses = {entry["name"]: entry["sha256"] for entry in manifest() if entry["file"] == SHIPPED_LIBRARY}
     return shipped_weights("TemporalLifter") | poses
 
 
 def true_lifting(clip: Clip) -> Lifted:
-    """What a perfect lifter says of the one person of a clip, shapes (1, T, ...)."""
+    """The output of a perfect lifter for the one person of a clip, shapes (1, T, ...)."""
     joints = clip.joints(FPS)
     view = project(joints)[2]
     pixels, reach = view.project(joints)
@@ -97,7 +97,7 @@ class _TrueLifter(nn.Module):
 
 
 class _TruePosition(nn.Module):
-    """Moves what a stage has placed to where the hips truly are."""
+    """Moves the output of a stage so that the hips are at their true position."""
 
     def __init__(self, stage: nn.Module, joints: Tensor) -> None:
         super().__init__()
@@ -111,7 +111,7 @@ class _TruePosition(nn.Module):
 
 
 class _TrueSmoothing(nn.Module):
-    """Smooths the error only: the motion passes unchanged."""
+    """Smooths only the error; the true motion passes unchanged."""
 
     def __init__(self, stage: nn.Module, joints: Tensor) -> None:
         super().__init__()
@@ -126,8 +126,8 @@ class Pipelines:
     """The pipelines of every setting, from joints, keypoints or films to the maps of every scene.
 
     Args:
-        scenes: by name.
-        lifter: the lifter of settings that are not the paper's; None is the default one.
+        scenes: scenes by name.
+        lifter: lifter of settings other than the paper's; None is the default one.
     """
 
     def __init__(self, scenes: dict[str, SceneConfig], lifter: PoseConfig | None = None) -> None:
@@ -148,26 +148,26 @@ class Pipelines:
         return simulator.doppler.doppler_hz * (simulator.radar.doppler_wavelength_m / 2)
 
     def joints(self, setting: Setting, clip: Clip, film: Filmed | None) -> tuple[Tensor, Tensor]:
-        """Joints (P, T, 14, 3) at the frame rate and whether people are there (P, T).
+        """Joints (P, T, 14, 3) at the frame rate and whether people are present (P, T).
 
         Args:
-            setting: what to do.
+            setting: the way to the joints.
             clip: the truth.
-            film: needed from source "c" on.
+            film: needed for source "c".
         """
         truth = clip.joints(FPS)
         if setting.source == "a":
             joints = truth[None][: int(clip.present)]
             valid = torch.ones(joints.shape[:2], dtype=torch.bool)
-            # Exact joints need no smoothing and get none, as those of motion files.
+            # Exact joints need no smoothing and get none, like those of motion files.
             return _smoother(setting, truth)(joints, None, FPS) if setting.paper else joints, valid
         return self.lifted(setting, clip, self._observed(setting, clip, film))
 
     def lifted(self, setting: Setting, clip: Clip, observed: Observed) -> tuple[Tensor, Tensor]:
-        """Joints and who is there, as :meth:`joints`, of people that were observed in the picture."""
+        """Joints and presence, as :meth:`joints`, of people observed in the picture."""
         if observed.valid.shape[0] == 0:
             return torch.zeros(0, observed.valid.shape[1], 14, 3), observed.valid
-        if setting.true_stage in ("lifting", "position", "smoothing"):  # about the one person that is there
+        if setting.true_stage in ("lifting", "position", "smoothing"):  # the truth has one person only
             longest = int(observed.valid.sum(dim=-1).argmax())
             observed = Observed(*(field[longest : longest + 1] for field in observed))
         stage = self._video_to_pose(setting, clip, clip.joints(FPS))
@@ -175,10 +175,10 @@ class Pipelines:
             return observed.lifted_by(stage)
 
     def maps(self, setting: Setting, scene: str, clip: Clip, joints: Tensor, valid: Tensor) -> Maps:
-        """The maps of joints at the frame rate; of an empty scene where there are none.
+        """The maps of joints at the frame rate; those of an empty scene where there are none.
 
         Raises:
-            TensorsimError: motion that the radar of the scene cannot follow.
+            TensorsimError: motion that is too fast for the radar of the scene.
         """
         stage = self.radars[scene, setting.paper]
         pulses = stage.resampler.pulses(valid.shape[-1], FPS)
@@ -193,7 +193,7 @@ class Pipelines:
         """The maps of the true joints, evaluated at every pulse.
 
         Raises:
-            TensorsimError: motion that the radar of the scene cannot follow.
+            TensorsimError: motion that is too fast for the radar of the scene.
         """
         stage = self.radars[scene, False]
         positions = clip.joints(stage.simulator.radar.prf_hz)[None]
@@ -208,7 +208,7 @@ class Pipelines:
             )
         fade = visibility_fade(valid, FPS, stage.simulator.radar.prf_hz, 0, pulses)
         with torch.inference_mode(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", TensorsimWarning)  # limbs that alias do so in the truth as well
+            warnings.simplefilter("ignore", TensorsimWarning)  # limbs that alias also do so in the truth
             return Maps.of(stage.simulator(*stage.scatterers(positions, fade)))
 
     def _observed(self, setting: Setting, clip: Clip, film: Filmed | None) -> Observed:
@@ -228,7 +228,7 @@ class Pipelines:
         return Observed(film.found.boxes[longest : longest + 1], valid, true.keypoints, true.scores)
 
     def _video_to_pose(self, setting: Setting, clip: Clip, truth: Tensor) -> VideoToPose:
-        # The camera is known, as is the height of the body, which users of the pipeline give it too.
+        # The camera is known, and so is the height of the body, which users also give to the pipeline.
         distance = (float(mid_hips(truth)[0, 1]) - CAMERA.position_m[1],) if setting.paper else None
         place: nn.Module = MetricPose(
             CAMERA,
@@ -249,7 +249,7 @@ class Pipelines:
         fit: nn.Module | None = None
         if _is_exact(setting):
             fit = BoneFit(CAMERA.position_m, (clip.height_m,), calibrated=True)
-            if setting.true_stage == "lifting":  # depths that need no mending
+            if setting.true_stage == "lifting":  # true depths need no correction
                 fit = None
             elif setting.true_stage == "position":
                 fit = _TruePosition(fit, truth)
@@ -265,7 +265,7 @@ class Pipelines:
 
 
 class _Shifted(nn.Module):
-    """The paper's position starts from the camera: along y by where that stands."""
+    """The paper's position is relative to the camera: adds the y of the camera."""
 
     def __init__(self, stage: nn.Module, y_m: float) -> None:
         super().__init__()
@@ -277,7 +277,7 @@ class _Shifted(nn.Module):
 
 
 def _is_exact(setting: Setting) -> bool:
-    """Whether keypoints are exact: the pipeline is then told so, as for labelled ones."""
+    """Whether keypoints are exact; the pipeline is then told so, as for labelled ones."""
     return not setting.paper and (setting.source == "b" or setting.true_stage == "pose")
 
 
@@ -289,7 +289,7 @@ def _smoother(setting: Setting, truth: Tensor) -> nn.Module:
 
 
 def _pose_to_doppler(scene: SceneConfig, paper: bool) -> PoseToDoppler:
-    """Free of noise: it would be the same in all maps."""
+    """The radar stage of a scene, without noise, which would be the same in all maps."""
     rate_hz = DISPLAY_RATE_HZ if scene.radar.prf_hz > DISPLAY_RATE_HZ else None
     config = SimulationConfig(replace(scene, snr_db=None), ProcessingConfig(display_rate_hz=rate_hz))
     return PoseToDoppler.from_config(SimulationConfig.paper(config) if paper else config)

@@ -1,4 +1,4 @@
-"""The truth loop: maps of every setting against those of the true motion, clip by clip, resumable."""
+"""The truth loop: maps of every setting compared with those of the true motion, clip by clip, resumable."""
 
 import json
 import time
@@ -27,10 +27,10 @@ from tensorsim.files import write_text
 from tensorsim.process import end_with_parent
 from tensorsim.radar.presets import PRESETS
 
-#: Trivial guesses as a baseline: an empty map; the mean of the row's other clips; another clip of the row.
+#: Trivial guesses as baselines: an empty map; the mean of the row's other clips; another clip of the row.
 GUESSES = ("empty", "mean", "shuffled")
 
-#: Figures of one cell by scene, map and figure.
+#: Scores of one cell by scene, map and score name.
 Scores = dict[str, dict[str, dict[str, float]]]
 
 
@@ -39,18 +39,18 @@ class TruthLoop:
     """What to evaluate.
 
     Attributes:
-        out: folder; ``cells/`` in it has the figures of every clip and setting, ``films/`` the networks' results.
-        clips: per row of the table.
-        activities: by name; an empty tuple is all twelve.
+        out: output folder; ``cells/`` has the scores of every clip and setting, ``films/`` the networks' results.
+        clips: clips per row of the table.
+        activities: names of activities; an empty tuple is all twelve.
         motions: motion capture files, each a row.
-        motion_fps: their frame rate, in place of that in the files.
+        motion_fps: their frame rate, overrides that in the files.
         scenes: names of radar presets.
-        sources: of ``SOURCES``.
-        stages: also replace every stage by the truth, in the last of the sources that has it.
-        detector, pose: networks, for source "c".
-        lifter: lifter of settings that are not the paper's, in place of the default one.
-        seed: of the first clip of each activity.
-        jobs: processes.
+        sources: keys of ``SOURCES``.
+        stages: also replace each stage by the truth in turn, in the last of the sources.
+        detector, pose: networks for source "c".
+        lifter: lifter of settings other than the paper's, instead of the default one.
+        seed: seed of the first clip of each activity.
+        jobs: number of processes.
     """
 
     out: Path
@@ -68,7 +68,7 @@ class TruthLoop:
     lifter: Lifting | None = None
 
     def pipelines(self) -> Pipelines:
-        """What makes the maps of the scenes."""
+        """The pipelines that make the maps of the scenes."""
         lifter = None if self.lifter is None else PoseConfig(lifter=self.lifter)
         return Pipelines({name: PRESETS[name] for name in self.scenes}, lifter)
 
@@ -98,7 +98,7 @@ class TruthLoop:
         """Compute every missing cell; returns all cells, see :func:`read_cells`.
 
         Raises:
-            TensorsimError: settings whose networks are not given, or unknown names.
+            TensorsimError: networks that a setting needs are missing, or unknown names.
         """
         self._check()
         work = [
@@ -148,9 +148,9 @@ class TruthLoop:
         return [self.cell(row, c, n) for row, clips in self.rows().items() for c in clips for n in names]
 
     def cell(self, row: str, clip: Clip, setting: str) -> Path:
-        """File of a cell; its name has a hash of the options and the version that its figures depend on."""
+        """File of a cell; its name includes a hash of the options and version that its scores depend on."""
         options: dict[str, Any] = {"scenes": self.scenes, "clips": 0, "fps": FPS}
-        if setting in GUESSES:  # made of the other clips
+        if setting in GUESSES:  # made from the other clips
             options |= {"clips": self.clips, "seed": self.seed}
         else:
             options |= {"lifter": self.lifter, "weights": lifting_files()}
@@ -167,7 +167,7 @@ class TruthLoop:
         return self.out / "films" / _plain(clip.row) / f"{_plain(clip.name)}-{key}.npz"
 
     def _networks(self) -> list[tuple[str, int]]:
-        """Identifies the networks, also after more training: their files and modification times."""
+        """Identifies the networks, even after further training, by their files and modification times."""
         files = [path.resolve() for path in (self.detector, self.pose) if path is not None]
         return [(str(file), file.stat().st_mtime_ns if file.is_file() else 0) for file in files]
 
@@ -266,7 +266,7 @@ class _Truths:
         self.made: dict[tuple[str, int], Maps | None] = {}
 
     def get(self, scene: str, k: int) -> Maps | None:
-        """True maps of clip k, or None, with a warning, where the radar of the scene cannot follow it."""
+        """True maps of clip k; None, with a warning, where it is too fast for the radar of the scene."""
         if (scene, k) not in self.made:
             if not self.keep:
                 self.made = {key: maps for key, maps in self.made.items() if key[1] == k}
@@ -278,13 +278,13 @@ class _Truths:
         return self.made[scene, k]
 
     def compare(self, guess: Maps, scene: str, k: int) -> dict[str, dict[str, float]]:
-        """Figures of maps of clip k."""
+        """Scores of maps of clip k."""
         truth = self.get(scene, k)
         assert truth is not None
         return compare(guess.like(truth), truth, self.pipelines.speed_m_s(scene))
 
     def guess(self, name: str, scene: str, k: int) -> dict[str, dict[str, float]]:
-        """Figures of a trivial guess of clip k; none where there is no other clip to guess from."""
+        """Scores of a trivial guess of clip k; empty where there is no other clip to guess from."""
         truth = self.get(scene, k)
         if truth is None:
             return {}
@@ -298,11 +298,11 @@ class _Truths:
 
 
 def pose_errors(joints: Tensor, valid: Tensor, clip: Clip) -> dict[str, float]:
-    """Errors of joints (P, T, 14, 3) in metres, for the person followed longest, in the frames in which they are.
+    """Errors of joints (P, T, 14, 3) in metres, for the person tracked longest, in the frames in which they are tracked.
 
-    ``followed`` is the share of these frames, ``root`` the rms distance of the middle of the hips, ``joints`` the mean
-    distance of the joints after aligning the hips, ``range`` the rms error along y of the joints after that; ``people``
-    the number of people. Where nobody is followed there are no errors.
+    ``followed`` is the share of these frames, ``root`` the rms distance of the mid-hips, ``joints`` the mean distance
+    of the joints after aligning the hips, ``range`` the rms error along y of the joints after aligning; ``people`` the
+    number of people. There are no errors if nobody is tracked.
     """
     errors = {"people": float(joints.shape[0])}
     if not clip.present:
@@ -325,7 +325,7 @@ def pose_errors(joints: Tensor, valid: Tensor, clip: Clip) -> dict[str, float]:
 def example_maps(loop: TruthLoop, pipelines: Pipelines, scene: str) -> dict[str, list[tuple[str, Tensor]]]:
     """DTMs of the first clip of each row, the truth first and then one per source, for a picture.
 
-    Rows with motion that the radar of the scene cannot follow are left out.
+    Rows with motion that is too fast for the radar of the scene are left out.
     """
     networks: list[nn.Module] = []
     pictures: dict[str, list[tuple[str, Tensor]]] = {}
@@ -338,7 +338,7 @@ def example_maps(loop: TruthLoop, pipelines: Pipelines, scene: str) -> dict[str,
                 setting = Setting(source)
                 maps = pipelines.maps(setting, scene, clip, *pipelines.joints(setting, clip, film))
                 shown.append((source, maps.doppler_time))
-        except TensorsimError:  # the loop has warned of it
+        except TensorsimError:  # the loop has already warned
             continue
         pictures[row] = shown
     return pictures

@@ -1,4 +1,4 @@
-"""The film of a report: small pictures inside the page, or a film beside it where they are too many."""
+"""The film of a report: small pictures embedded in the page, or a separate film if there are too many."""
 
 import base64
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 
 from tensorsim.data.video_writer import VideoWriter
 
-#: A film of at most so many frames goes into the page, as JPEG pictures of at most so many bytes together.
+#: A film of at most this many frames is embedded in the page as JPEG pictures of at most this many bytes in total.
 MOST_FRAMES, MOST_BYTES = 900, 8_000_000
 WIDTH = 480
 QUALITIES = (75, 55, 35, 20, 10)
@@ -19,8 +19,8 @@ class FilmStrip:
     """Collects the pictures of a film, reduced to :data:`WIDTH` pixels.
 
     Args:
-        folder: of the report; a long film is written there as :data:`BESIDE`.
-        frames: how many there will be.
+        folder: folder of the report; a long film is written there as :data:`BESIDE`.
+        frames: number of frames to come.
         fps: frames per second.
 
     Raises:
@@ -49,7 +49,7 @@ class FilmStrip:
         height, width = frame.shape[:2]
         scale = min(1.0, WIDTH / width)
         self.size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        # Halves by areas, the rest between neighbours: a sixth of the time of areas of no whole number of pixels.
+        # Halved by area averages, then bilinear: a sixth of the time of area averages at a fractional ratio.
         small = frame
         while small.shape[1] >= 2 * self.size[0] and small.shape[0] >= 2 * self.size[1]:
             small = cv2.resize(
@@ -62,14 +62,14 @@ class FilmStrip:
             self.pictures.append(base64.b64encode(_jpeg(small, self._budget)).decode())
 
     def content(self) -> dict[str, Any]:
-        """What the page is told of the film."""
+        """The data on the film for the page."""
         width, height = self.size
         beside = None if self._beside is None else BESIDE
         return {"width": width, "height": height, "pictures": self.pictures, "beside": beside}
 
 
 def _jpeg(frame: np.ndarray, budget: int) -> bytes:
-    """A picture as JPEG, of the best quality whose file is within the budget."""
+    """A picture as JPEG with the best quality that fits the budget; if none does, the lowest quality."""
     import cv2
 
     bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)

@@ -1,4 +1,4 @@
-"""The page of a report: everything that it shows as JSON, and the program that shows it."""
+"""The page of a report: its content as JSON, and the script that shows it."""
 
 import base64
 import json
@@ -19,7 +19,7 @@ from tensorsim.types import Pose, RadarMaps
 if TYPE_CHECKING:
     from tensorsim.results import Axes, Pictures
 
-#: Maps are stored with this many dB below the peak, or as many as are to be shown; the page can show fewer.
+#: Maps are stored down to this many dB below the peak, or to the dynamic range if larger; the page can show less.
 STORED_DB = 80.0
 _MOST_COLUMNS, _MOST_ROWS = 1200, 400
 _COLOURMAPS = ("turbo", "viridis", "jet", "parula", "gray")
@@ -41,16 +41,16 @@ def write_report(
     """Write ``report.html``, which needs no other file and no network (a long film is beside it).
 
     Args:
-        folder: where to.
-        summary: that of ``summary.json``.
-        pose: of one clip (B = 1), on the CPU.
+        folder: output folder.
+        summary: content of ``summary.json``.
+        pose: pose of one clip (B = 1), on the CPU.
         fps: frames per second of the pose.
-        maps: on the CPU, without batch dimensions.
-        axes: of the maps.
-        film: with all frames added.
+        maps: maps on the CPU, without batch dimensions.
+        axes: axes of the maps.
+        film: film with all frames added.
         pictures: how the maps are drawn.
         truth: maps of the true motion, shown below those of the film.
-        further: maps as :func:`map_contents` gives them, shown below all others.
+        further: maps as returned by :func:`map_contents`, shown below all others.
     """
     frames = pose.valid.shape[2]
     content = {
@@ -91,7 +91,7 @@ def packed(values: np.ndarray) -> str:
 
 
 def people_content(pose: Pose) -> dict[str, Any]:
-    """Joints (P, T, 14, 3) in whole centimetres as int16, and who is there as bytes."""
+    """Joints (P, T, 14, 3) in whole centimetres as int16, and presence as bytes."""
     valid = pose.valid[0].numpy()
     shown = np.flatnonzero(valid.any(1))
     joints = np.clip(pose.joints[0].numpy()[shown] * 100, -32768, 32767)
@@ -106,7 +106,7 @@ def people_content(pose: Pose) -> dict[str, Any]:
 
 
 def scene_content(summary: dict[str, Any]) -> dict[str, Any]:
-    """Where the radar and the wall are."""
+    """Positions of the radar and the wall."""
     radar, wall = summary["radar"], summary.get("wall")
     antennas = [np.atleast_2d(radar[name])[0].tolist() for name in ("tx_m", "rx_m")]
     place = {} if wall is None else {"wall": {key: wall[key] for key in ("center_m", "size_m")}}
@@ -114,7 +114,7 @@ def scene_content(summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def timeline_content(windows: list[dict[str, Any]], duration_s: float) -> list[dict[str, Any]]:
-    """Windows that overlap as stretches that do not: at every moment the window with the nearest middle."""
+    """Overlapping windows as intervals that do not overlap: at any time, the window with the nearest centre."""
     middles = [(window["start_s"] + window["end_s"]) / 2 for window in windows]
     borders = [0.0, *((a + b) / 2 for a, b in pairwise(middles)), duration_s]
     return [
@@ -124,7 +124,7 @@ def timeline_content(windows: list[dict[str, Any]], duration_s: float) -> list[d
 
 
 def colour_table(name: Any) -> str:
-    """256 colours of a colour map, RGB bytes."""
+    """The 256 colours of a colour map as RGB bytes."""
     return packed((plot.colormap(name)(np.linspace(0, 1, 256))[:, :3] * 255).round().astype(np.uint8))
 
 
@@ -177,7 +177,7 @@ def map_contents(maps: RadarMaps, axes: "Axes", pictures: "Pictures", of: str = 
 def _content(
     name: str, maps: RadarMaps, axis: np.ndarray, rows: np.ndarray, pictures: "Pictures"
 ) -> dict[str, Any]:
-    """A map as a grey PNG, top row first: 255 is the peak, 0 is what is stored below it."""
+    """A map as a grey PNG, top row first: 255 is the peak, 0 the lowest stored level."""
     import cv2
 
     magnitude = getattr(maps, name).numpy()[rows]
@@ -199,7 +199,7 @@ def _content(
 
 
 def _fewer(magnitude: np.ndarray, most: int) -> np.ndarray:
-    """At most about ``most`` columns, by root mean squares of neighbours."""
+    """At most ``most`` columns, by root mean squares of neighbours."""
     columns = magnitude.shape[1]
     if columns <= most:
         return magnitude

@@ -1,1 +1,1 @@
-"""How far networks that saw simulated radar only go on measured radar."""
+"""How well networks trained only on simulated radar do on measured radar."""

@@ -1,4 +1,4 @@
-"""What each effect of a simulation is worth: trainings without it, on simulation alone, tested on measured clips."""
+"""What each effect of a simulation is worth: training without it on simulation alone, tests on measured clips."""
 
 from functools import partial
 from typing import Any
@@ -7,18 +7,19 @@ from tensorsim.evaluation.measured.report import accuracy, subset_accuracy
 from tensorsim.evaluation.measured.run import Experiment
 from tensorsim.experiments.work import Work
 
-#: Accuracies of all classes and of the part, for each training.
+#: For each training, the accuracy over all classes and over the subset of classes.
 Accuracies = list[list[float]]
 
 
 def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
-    """Accuracies of the simulation, whole ("") and without each effect in turn.
+    """Accuracies with the full simulation ("") and without each effect in turn.
 
-    Every training is kept in ``out/results``; a later run with the same settings and test clips does not repeat it.
+    Results of every training are kept in ``out/results``; a later run with the same settings and test clips does not
+    repeat it.
 
     Args:
         experiment: one set, its folders and settings.
-        repeats: trainings of each simulation, with the seeds from that of the experiment on.
+        repeats: trainings for each simulation, with consecutive seeds from that of the experiment.
     """
     measured, labels = experiment.measured, experiment.test_labels
     subset = [measured.classes.index(name) for name in measured.subset]
@@ -40,7 +41,7 @@ def ablation(experiment: Experiment, repeats: int) -> dict[str, Accuracies]:
 
 
 def ablation_table(experiment: Experiment, rows: dict[str, Accuracies]) -> str:
-    """Markdown: mean accuracy, the lowest and the highest in brackets, and what the mean loses without an effect."""
+    """Markdown: mean accuracy, lowest and highest in brackets, and the loss of the mean without each effect."""
     measured = experiment.measured
     head = (
         f"{measured.name}: simulation without",

@@ -1,8 +1,8 @@
 """Glasgow, 5.8 GHz FMCW: CFAR masks of Doppler-time maps of six activities.
 
-The measured masks were made by others (2-D cell-averaging CFAR on the decibels of the spectrogram, 256 x 256, a whole
-clip). The simulation repeats their chain: sweeps, high-pass over pulses, short-time Fourier transform of every range
-bin, sum of bins, decibels, CFAR.
+The measured masks come from the data set's authors (2-D cell-averaging CFAR on the spectrogram in decibels,
+256 x 256, a whole clip). The simulation repeats their chain: sweeps, high-pass over pulses, short-time Fourier
+transform of every range bin, sum of bins, decibels, CFAR.
 """
 
 from dataclasses import dataclass, replace
@@ -50,29 +50,29 @@ CLASSES = ("walking", "sitting_down", "standing_up", "pick_up", "drinking", "fal
 RADAR = replace(MEASURED_SENSORS["glasgow-ancortek"].radar, prf_hz=500.0)
 #: Rows of the measured masks (3.9 Hz each) within +-250 Hz.
 ROWS = slice(64, 192)
-#: Over the median of a map, where an ablation does without CFAR.
+#: Threshold above the median of a map, for the ablation without CFAR.
 FIXED_THRESHOLD_DB = 10.0
 
 
 @dataclass(frozen=True)
 class Effects:
-    """What the simulation has beside bodies that move, each to be left out for an ablation.
+    """Effects of the simulation beyond moving bodies; an ablation leaves out one at a time.
 
     Attributes:
-        to_and_fro: walkers turn round; else they go straight on.
-        falls_from_standing: else people fall out of a walk.
-        random_start: everything begins at a time drawn for each clip; else always at the same.
-        quick_limbs: joints move as they do; else as a Kalman smoother of the paper's noises leaves them.
-        ellipsoids: segments whose cross section follows the aspect; else joints as points, all alike.
+        to_and_fro: walkers turn round; else they walk straight on.
+        falls_from_standing: people fall from standing; else while walking.
+        random_start: the motion starts at a time drawn for each clip; else always at the same time.
+        quick_limbs: joints keep their full motion; else they pass a Kalman smoother with the paper's noise values.
+        ellipsoids: segments whose cross section depends on the aspect; else joints as identical points.
         unrest: sway of the body and small movements of the limbs.
         residue: noise next to zero Doppler, in every frame.
         lines: tones of the hardware at fixed Doppler.
-        dim_limbs: other ratios of limbs to trunk than those of ellipsoids, drawn for each clip.
-        levels: signal and floor drawn for each clip; else always the same.
+        dim_limbs: limb-to-trunk ratios other than those of ellipsoids, drawn for each clip.
+        levels: signal and noise floor drawn for each clip; else always the same.
         image: a weak mirror image in Doppler.
-        shuffling: people end farther back after sitting down, farther ahead after rising.
-        cfar: a threshold by the surroundings of a cell; else one for the whole map, 10 dB above its median.
-        prf: sweeps fast enough for everybody; else half as many, so that limbs above 3.2 m/s wrap.
+        shuffling: people end up farther back after sitting down, farther forward after rising.
+        cfar: a threshold from the surroundings of each cell; else one for the whole map, 10 dB above its median.
+        prf: a sweep rate high enough for all motion; else half of it, so that limbs above 3.2 m/s wrap.
     """
 
     to_and_fro: bool = True
@@ -132,13 +132,13 @@ class Glasgow:
             }[label]
             if label == 5 and not self.effects.falls_from_standing:
                 script, first_s = walk_to_fall, 1.0  # the fall begins at 1.55 s
-                range_m = range_m + 1.5  # they come nearer before
+                range_m = range_m + 1.5  # they come closer first
             began, tempo = draw(*start), draw(*rate)
             if not self.effects.random_start:
                 began = torch.full_like(began, sum(start) / 2)
             joints = act_out(script, (time - began) * tempo + first_s, people)
             if label in (1, 2) and self.effects.shuffling:
-                # Those who sit down end farther back than their feet, those who rise farther ahead.
+                # People who sit down end up farther back than their feet, those who rise farther forward.
                 way = draw(0.0, 0.25) * segment(time, began, began + 2 / tempo)
                 joints[..., 1] += (way if label == 1 else -way)[..., None]
             joints = place(joints, draw(-0.3, 0.3), range_m)
@@ -162,7 +162,7 @@ class Glasgow:
         echo = echo / echo.abs().square().sum(-1).mean(-1)[:, None, None].sqrt()
         signal_db = draw(28.0, 48.0) if self.effects.levels else draw(38.0, 38.0)
         if self.effects.image:
-            # Both senses of motion in each frame: the image of imperfect quadrature and of scattered paths.
+            # Both signs of Doppler in each frame: the image due to imperfect quadrature and scattered paths.
             image_db = draw(-45.0, -18.0)
             echo = echo + 10 ** (image_db / 20).float().unsqueeze(-1) * echo.conj()
         x = echo * 10 ** (signal_db / 20).float().unsqueeze(-1)
@@ -172,7 +172,7 @@ class Glasgow:
         return self._detected(self.maps(moving), level_db)
 
     def _receiver(self, draw: Draw, pulses: int) -> Tensor:
-        """White noise of power 1, residue of what stands still, and lines at fixed Doppler (N, M, R)."""
+        """White noise of power 1, residue of static echoes, and lines at fixed Doppler (N, M, R)."""
         shape = (pulses, self.bins)
         noise = torch.complex(draw.normal(*shape).float(), draw.normal(*shape).float()) / 2**0.5
         rate = RADAR.prf_hz
@@ -213,32 +213,32 @@ class Glasgow:
 
 
 def read(packed: npt.NDArray[np.uint8]) -> Tensor:
-    """Measured masks (N, 256, 32), of which a bit is a cell, to masks (N, 128, 256) bool."""
+    """Measured masks (N, 256, 32), one bit per cell, to masks (N, 128, 256) bool."""
     return torch.from_numpy(np.unpackbits(packed, axis=-1).astype(bool))[:, ROWS]
 
 
 def pictures(masks: Tensor) -> Tensor:
-    """Masks (N, 128, 256) to pictures (N, 1, 80, 64) of +-156 Hz, without the filter's start in the first columns."""
+    """Masks (N, 128, 256) to pictures (N, 1, 80, 64) of +-156 Hz; the first columns (filter start-up) are zeroed."""
     shown = masks[:, 24:104].float()
     shown[..., :4] = 0.0
     return F.avg_pool2d(shown.unsqueeze(1), (1, 4))
 
 
 def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Pictures moved in time, thickened, thinned, and with cells missing."""
+    """Pictures shifted in time and Doppler, thickened or thinned, and with cells missing."""
     shown = shift(shown, 14, -1, generator)
     shown = shift(shown, 2, -2, generator)
     return drop_cells(thicken(shown, generator), 0.03, generator)
 
 
 def augment_measured(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Measured pictures, which are few and less varied than simulated ones: at other tempos and speeds as well."""
+    """Measured pictures, also at other tempos and speeds, because they are few and vary less than simulated ones."""
     shown = warp(shown, generator, time=0.2, doppler=0.12, later=0.4)
     return drop_cells(thicken(shown, generator), 0.1, generator)
 
 
 def thicken(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Pictures of which some are wider along Doppler and some narrower."""
+    """Pictures, some thickened along Doppler and some thinned."""
     chance = torch.rand(shown.shape[0], 1, 1, 1, generator=generator)
     thick = F.max_pool2d(shown, (3, 1), 1, (1, 0))
     thin = -F.max_pool2d(-shown, (3, 1), 1, (1, 0))

@@ -1,4 +1,4 @@
-"""People who move as those before the measured radars did, at any instants."""
+"""People who move like those in front of the measured radars, at any instants."""
 
 import math
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from tensorsim.vision.smoothing.kalman import (
     KalmanSmoother,
 )
 
-#: Joints are worked out at this rate and interpolated by a C2 spline.
+#: Joints are computed at this rate and interpolated by a C2 spline.
 KNOT_HZ = 120.0
 
 Script = Callable[[Tensor, People], Act]
@@ -46,7 +46,7 @@ class Draw:
 
 
 def smooth_noise(draw: Draw, frames: int, rate_hz: float, band_hz: Tensor, columns: int) -> Tensor:
-    """Gaussian noise (N, frames, columns) of deviation 1 with the spectrum ``1 / (1 + (f / band)^4)``, band (N, 1)."""
+    """Gaussian noise (N, frames, columns), standard deviation 1, spectrum ``1 / (1 + (f / band)^4)``, band (N, 1)."""
     white = draw.normal(frames, columns)
     frequency = torch.fft.rfftfreq(frames, 1 / rate_hz, dtype=torch.float64)
     shape = 1 / (1 + (frequency / band_hz) ** 4)
@@ -56,18 +56,18 @@ def smooth_noise(draw: Draw, frames: int, rate_hz: float, band_hz: Tensor, colum
 
 @dataclass(frozen=True)
 class Unrest:
-    """Small movements that people make besides what they do.
+    """Small movements that people make on top of their activity.
 
     Attributes:
-        sway_m: deviation of the whole body, (low, high).
-        limbs_m: deviation of wrists, less of elbows and head, (low, high).
+        sway_m: standard deviation of the whole body, (low, high).
+        limbs_m: standard deviation of the wrists, smaller for elbows and head, (low, high).
     """
 
     sway_m: tuple[float, float] = (0.002, 0.008)
     limbs_m: tuple[float, float] = (0.0, 0.03)
 
 
-#: How much of the limbs' unrest each of the 14 joints takes part in.
+#: Share of the limbs' unrest in each of the 14 joints.
 _LIMB_SHARE = (0.5, 0.2, 0.2, 0.6, 1.0, 0.2, 0.6, 1.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.0)
 
 
@@ -77,7 +77,7 @@ def add_unrest(joints: Tensor, draw: Draw, unrest: Unrest) -> Tensor:
     sway = smooth_noise(draw, frames, KNOT_HZ, draw(0.2, 0.6), 3) * draw(*unrest.sway_m)[..., None]
     limbs = smooth_noise(draw, frames, KNOT_HZ, draw(0.3, 1.0), 14 * 3).unflatten(-1, (14, 3))
     share = torch.tensor(_LIMB_SHARE, dtype=torch.float64)[:, None]
-    height = (joints[..., 2:] / 1.4).clamp(0.0, 1.0)  # feet stand
+    height = (joints[..., 2:] / 1.4).clamp(0.0, 1.0)  # feet do not sway
     lively = draw(*unrest.limbs_m)[..., None, None] * draw(0.0, 1.0)[..., None, None]
     return joints + height * sway[:, :, None] + lively * share * limbs
 
@@ -85,7 +85,7 @@ def add_unrest(joints: Tensor, draw: Draw, unrest: Unrest) -> Tensor:
 def stage_people(
     count: int, draw: Draw, config: PeopleConfig, speed_m_s: tuple[float, float] | None
 ) -> People:
-    """Draw people; speeds beyond those of ``PeopleConfig`` by ``speed_m_s``."""
+    """Draw people; ``speed_m_s``, if given, are bounds of speeds beyond those of ``PeopleConfig``."""
     people = draw_people(count, config, draw.generator)
     if speed_m_s is not None:
         people = people._replace(speed_m_s=draw(*speed_m_s)[:, 0])
@@ -93,15 +93,15 @@ def stage_people(
 
 
 def act_out(script: Script, time: Tensor, people: People) -> Tensor:
-    """Joints (N, K, 14, 3) of people who follow a script from the origin, heading as drawn, half of them mirrored."""
+    """Joints (N, K, 14, 3) of people who follow a script from the origin, heading as drawn, left-handed mirrored."""
     joints = perform(script, time, people)
     joints = torch.where(people.left_handed[:, None, None, None], mirror(joints), joints)
     return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
 
 
 def smooth_as_paper(joints: Tensor) -> Tensor:
-    """Joints (N, K, 14, 3) as the smoother of the paper leaves them at 30 fps: limbs lose what is above 2 Hz."""
-    # Four times as many measurements in a second, each of four times the variance, weigh the same.
+    """Joints (N, K, 14, 3) as smoothed by the paper's smoother at 30 fps: limbs lose motion above 2 Hz."""
+    # Four times as many measurements per second, each with four times the variance, have the same weight.
     noise = PANEL_MEASUREMENT_NOISE * KNOT_HZ / REFERENCE_FPS
     return KalmanSmoother(PANEL_PROCESS_NOISE, noise)(joints, None, KNOT_HZ)
 
@@ -116,15 +116,15 @@ def place(joints: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
 def to_and_fro(
     script: Script, time: Tensor, people: People, draw: Draw, leg_m: Tensor, turn_s: Tensor, first_m: Tensor
 ) -> Tensor:
-    """People (N, K, 14, 3) who go straight for ``leg_m``, turn round in ``turn_s`` and come back, and so on.
+    """People (N, K, 14, 3) who walk straight for ``leg_m``, turn round in ``turn_s``, come back, and so on.
 
     Args:
         script: a gait along +y at the person's speed.
         time: (N, K) s.
-        people: N people; their heading is that at the start.
+        people: N people with their headings at the start.
         draw: random numbers.
         leg_m, turn_s: (N, 1).
-        first_m: (N, 1) of the first leg gone at time 0.
+        first_m: (N, 1) part of the first leg already covered at time 0.
     """
     speed = people.speed_m_s[:, None]
     straight = leg_m / speed
@@ -142,12 +142,12 @@ def to_and_fro(
 
 
 def along(script: Script, heading_rad: Tensor, pace: Tensor, people: People) -> Tensor:
-    """People (N, K, 14, 3) who go wherever they head: their own heading plus ``heading_rad`` (N, K).
+    """People (N, K, 14, 3) who walk in the direction of their own heading plus ``heading_rad`` (N, K).
 
     Args:
         script: a gait along +y at the person's speed.
         heading_rad: (N, K) counter-clockwise seen from above, at ``KNOT_HZ``.
-        pace: (N, K) share of the person's speed; the clock of the gait runs at this pace.
+        pace: (N, K) fraction of the person's speed; the gait slows down with it.
         people: N people.
     """
     speed = people.speed_m_s[:, None]
@@ -166,13 +166,13 @@ def along(script: Script, heading_rad: Tensor, pace: Tensor, people: People) -> 
 
 
 def dim_limbs(rcs: Tensor, draw: Draw, low_db: float, high_db: float, per_segment: int) -> Tensor:
-    """Cross sections (N, K, S) with another gain for each segment of each body; that of the torso stays.
+    """Cross sections (N, K, S) with a gain drawn for each segment of each body; the torso is unchanged.
 
     Args:
-        rcs: of :class:`~tensorsim.motion.LimbScatterers`.
+        rcs: cross sections of :class:`~tensorsim.motion.LimbScatterers`.
         draw: random numbers.
         low_db, high_db: bounds of the mean gain of a body; segments differ from it by 3 dB rms.
-        per_segment: scatterers of a segment.
+        per_segment: scatterers per segment.
     """
     gain_db = draw(low_db, high_db) + 3 * draw.normal(len(SEGMENTS))
     gain_db[:, 1] = 0.0  # the torso
@@ -187,17 +187,17 @@ def walk_to_and_fro(
     turn_s: tuple[float, float],
     turns: bool,
 ) -> tuple[Tensor, Tensor]:
-    """People who walk towards or away from the radar, and turn round or go straight on.
+    """People who walk towards or away from the radar, and turn round or walk straight on.
 
     Args:
         time: (N, K) s.
         people: N people.
         draw: random numbers.
-        leg_m, turn_s: bounds of the straight parts and of the time of a turn.
+        leg_m, turn_s: bounds of the length of straight parts and of the duration of a turn.
         turns: whether they turn round.
 
     Returns:
-        Joints (N, K, 14, 3), and what to add to the wanted mean y (N, 1) of the walk for the y of its start.
+        Joints (N, K, 14, 3), and the offset (N, 1) from the mean y of the walk to the y of its start.
     """
     people = people._replace(heading_rad=people.heading_rad + torch.pi * (draw(0, 1)[:, 0] < 0.5))
     leg = draw(*leg_m)
@@ -217,12 +217,12 @@ def at_instants(joints: Tensor, time_s: Tensor) -> Tensor:
 
 
 def in_beam(positions: Tensor, rcs: Tensor, height_m: float, width_deg: Tensor) -> Tensor:
-    """Cross sections (N, K, S) as a Gaussian beam of two antennas leaves them, narrow in elevation.
+    """Cross sections (N, K, S) weighted by a Gaussian two-way beam that is narrow in elevation.
 
     Args:
         positions: (N, K, S, 3) m.
         rcs: (N, K, S) m^2.
-        height_m: of the antennas, at x = y = 0.
+        height_m: height of the antennas, at x = y = 0.
         width_deg: (N, 1) full width of the two-way beam at half power.
     """
     across = positions[..., 2] - height_m
@@ -231,9 +231,9 @@ def in_beam(positions: Tensor, rcs: Tensor, height_m: float, width_deg: Tensor) 
 
 
 def at_half_the_pulse_rate(echo: Tensor) -> Tensor:
-    """Echo (..., M) as a radar of half the pulse rate has it: what is faster than half of the axis wraps.
+    """Echo (..., M) as seen by a radar of half the pulse rate: Doppler beyond half of the axis wraps.
 
-    Every second pulse, interpolated to all M (even) by a Fourier transform, so that the Doppler axis stays.
+    Every second pulse, interpolated to all M (even) by a Fourier transform, so that the Doppler axis is the same.
     """
     pulses = echo.shape[-1]
     quarter = pulses // 4
@@ -244,7 +244,7 @@ def at_half_the_pulse_rate(echo: Tensor) -> Tensor:
 
 
 def linear(values: Tensor, time_s: Tensor) -> Tensor:
-    """Values (N, K, S) at ``KNOT_HZ`` to (N, M, S) at instants (M,), by straight lines."""
+    """Values (N, K, S) at ``KNOT_HZ`` to (N, M, S) at instants (M,), by linear interpolation."""
     at = (time_s * KNOT_HZ).clamp(max=values.shape[1] - 1.001)
     before = torch.floor(at).long()
     share = (at - before)[:, None].to(values.dtype)

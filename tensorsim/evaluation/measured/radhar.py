@@ -1,4 +1,4 @@
-"""RadHAR, TI IWR1443 at 30 frames per second: what of five exercises is left in sparse point clouds."""
+"""RadHAR, TI IWR1443 at 30 frames per second: what remains of five exercises in sparse point clouds."""
 
 from dataclasses import dataclass
 
@@ -42,17 +42,17 @@ _WRISTS = [JOINTS.index("right_wrist"), JOINTS.index("left_wrist")]
 
 @dataclass(frozen=True)
 class Effects:
-    """What the simulation has beside bodies that move, each to be left out for an ablation.
+    """Effects of the simulation beyond moving bodies; an ablation leaves out one at a time.
 
     Attributes:
-        to_and_fro: walkers turn round; else they go straight on.
+        to_and_fro: walkers turn round; else they walk straight on.
         unrest: sway of the body and small movements of the limbs.
-        dim_limbs: other ratios of limbs to trunk than those of ellipsoids, drawn for each clip.
-        peaks_only: detections with a stronger neighbour in range or Doppler are left out.
+        dim_limbs: limb-to-trunk ratios other than those of ellipsoids, drawn for each clip.
+        peaks_only: detections with a stronger neighbour in range or Doppler are dropped.
         levels: signal drawn for each clip; else always the same.
         beam: a beam that is narrow in elevation.
         hands: a scatterer at each wrist.
-        prf: chirps as fast as the radar's; else half as many, so that what is above 2.5 m/s wraps.
+        prf: the radar's chirp rate; else half of it, so that speeds above 2.5 m/s wrap.
     """
 
     to_and_fro: bool = True
@@ -73,7 +73,7 @@ class RadHar:
         profile = RangeProfile(RADAR, window="hamming", gate_m=(0.8, 4.6))
         self.echo = RangeBinSynthesizer(EchoSynthesizer(RADAR), profile, near_bins=2)
         self.scatterers = LimbScatterers(RADAR.tx_positions_m[0], RADAR.rx_positions_m[0], per_segment=2)
-        # Next to a body that fills many range bins the smaller reference cells are those of noise.
+        # Next to a body that fills many range bins, the smaller reference cells are the ones with noise only.
         self.cfar = CfarDetector(
             (5, 0), (5, 0), 1e-6, "ordered-statistic", rank=0.4, edges=("reflect", "reflect")
         )
@@ -112,7 +112,7 @@ class RadHar:
         if self.effects.dim_limbs:
             rcs = dim_limbs(rcs, draw, -8.0, 3.0, self.scatterers.per_segment)
         if self.effects.hands:
-            # A forearm seen end-on, as in a punch, is an edge of no size without its hand.
+            # A forearm seen end-on, as in a punch, has almost no cross section without its hand.
             hands = (10 ** draw(-2.6, -1.2)).expand(-1, 2)[:, None].expand(-1, joints.shape[1], -1)
             positions = torch.cat([positions, joints[:, :, _WRISTS]], dim=2)
             rcs = torch.cat([rcs, hands.to(rcs.dtype)], dim=2)
@@ -127,7 +127,7 @@ class RadHar:
         echo = echo * 10 ** (level_db / 20).float().unsqueeze(-1) + noise
         frames = echo.unflatten(1, (FRAMES, RADHAR_CHIRPS)).transpose(2, 3)
         window = torch.hann_window(RADHAR_CHIRPS, periodic=False)
-        # Negative raw Doppler is approaching, and first.
+        # Negative raw Doppler is approaching and comes first.
         cube = torch.fft.fftshift(torch.fft.fft(frames * window), dim=-1)
         power = cube.abs().square()
         scale = 10 ** (draw(0.0, 6.0) / 10).float()[..., None, None]
@@ -147,12 +147,12 @@ def read(intensity: npt.NDArray[np.uint8]) -> Tensor:
 
 
 def pictures(maps: Tensor) -> Tensor:
-    """Presence maps (N, 16, 60) to pictures (N, 1, 16, 60) without the row of what stands still."""
+    """Presence maps (N, 16, 60) to pictures (N, 1, 16, 60) with the row of zero Doppler cleared."""
     shown = maps.float()
     shown[:, RADHAR_CHIRPS // 2] = 0.0
     return shown.unsqueeze(1)
 
 
 def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Pictures moved in time, with cells missing."""
+    """Pictures shifted in time, with cells missing."""
     return drop_cells(shift(shown, 20, -1, generator), 0.3, generator)

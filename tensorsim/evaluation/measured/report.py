@@ -28,7 +28,7 @@ def subset_accuracy(logits: Tensor, labels: Tensor, subset: list[int]) -> float:
 
 
 def figures(measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> dict[str, Any]:
-    """What ``measured.json`` says of a set; settings that were not run are null."""
+    """The entry of a set in ``measured.json``; settings that were not run are null."""
     subset = [measured.classes.index(name) for name in measured.subset]
     part = subset_accuracy(logits["simulation_only"], labels, subset)
     scores = {name: accuracy(logits[name], labels) if name in logits else None for name in SETTINGS}
@@ -59,7 +59,7 @@ def table(results: dict[str, dict[str, Any]], errors: dict[str, float]) -> str:
 def write(out: Path, name: str, measured: MeasuredSet, logits: dict[str, Tensor], labels: Tensor) -> float:
     """Confusion matrices and calibration of a set as CSV; returns the calibration error of simulation alone.
 
-    Matrices of settings that were not run are removed: they are of an earlier run.
+    Matrices of settings that were not run are removed: they belong to an earlier run.
     """
     for setting in SETTINGS:
         if setting not in logits:

@@ -1,4 +1,4 @@
-"""The experiments: simulation alone, with a few measured clips, with all of them, and their rivals."""
+"""The experiments: simulation alone, with a few measured clips, with all of them, and baselines."""
 
 import copy
 from pathlib import Path
@@ -13,13 +13,13 @@ from tensorsim.files import sha256_of_arrays
 from tensorsim.recognition.diat_radharnet import DIATRadHARNet
 from tensorsim.weights import save_weights
 
-#: What is trained on what, in the order of the tables.
+#: Training settings in the order of the tables.
 SETTINGS = ("simulation_only", "ten_shot", "ten_shot_alone", "all", "lda")
 #: Measured clips of each class in ``ten_shot``.
 SHOTS = 10
 #: Height and width of the pictures that the network sees.
 SIZE = 32
-#: Share of each class to learn from where no other folder is given to test on.
+#: Share of each class used for training if no separate test folder is given.
 LEARNED = 0.7
 
 
@@ -75,11 +75,11 @@ class Experiment:
     Args:
         measured: the set.
         train: folder of measured sets.
-        test: another one; None keeps the last 30 % of each class of ``train``, in the order of the files, for the test.
-        out: where the weights trained on simulation alone go.
+        test: another folder; None keeps the last 30 % of each class of ``train``, in file order, for the test.
+        out: folder for the weights trained on simulation alone.
         clips: simulated clips of each class.
-        steps: batches of 64 of the training on simulation; half as many on a few measured clips, twice as many on all.
-        seed: of simulation and training.
+        steps: batches of 64 for training on simulation; half as many for a few measured clips, twice as many for all.
+        seed: seed of simulation and training.
         quiet: no progress bar.
     """
 
@@ -115,10 +115,10 @@ class Experiment:
         return {"simulation_only": self._tested(net)}
 
     def check_full(self) -> None:
-        """Refuse what :meth:`full` cannot learn from, or be tested on.
+        """Refuse sets that :meth:`full` cannot be trained or tested on.
 
         Raises:
-            TensorsimError: clips to learn from of one class alone, or the same clips to learn from and to test on.
+            TensorsimError: training clips of a single class, or the same clips for training and test.
         """
         if len(self.train_labels.unique()) < 2:
             raise TensorsimError(
@@ -155,12 +155,12 @@ class Experiment:
         return logits
 
     def simulation_alone(self, seed: int, without: str | None = None) -> Tensor:
-        """Logits (N, classes) of the test clips by a network trained on simulation alone, perhaps without an effect."""
+        """Logits (N, classes) of the test clips after training on simulation alone, optionally without one effect."""
         simulated, labels = self.measured.simulate(self.clips, seed, self.quiet, without)
         return self._tested(self._simulation_trained(simulated, labels, seed))
 
     def _new(self, pictures: Tensor, seed: int) -> DIATRadHARNet:
-        """A network with random weights that takes off the mean of these pictures."""
+        """A network with random weights that subtracts the mean of these pictures."""
         torch.manual_seed(seed)
         net = DIATRadHARNet(len(self.measured.classes))
         net.mean.fill_(float(pictures.float().mean()))
@@ -182,7 +182,7 @@ class Experiment:
     def _measured_logits(
         self, net: DIATRadHARNet, chosen: Tensor, steps: int, learning_rate: float
     ) -> Tensor:
-        """Logits (N, classes) of the test clips by a copy of ``net`` that goes on with chosen clips of train alone."""
+        """Logits (N, classes) of the test clips by a copy of ``net`` trained further on the chosen training clips."""
         learner = copy.deepcopy(net)
         fit_pictures(
             learner, self.train[chosen], self.train_labels[chosen], steps=steps,
@@ -197,5 +197,5 @@ class Experiment:
 
 
 def _seen(augment: Augment) -> Augment:
-    """The same change of pictures, which are then resized to what the network sees."""
+    """The same augmentation, followed by resizing to the network's input size."""
     return lambda pictures, generator: square(augment(pictures, generator), SIZE)

@@ -1,4 +1,4 @@
-"""Infineon Sense2GoL, 24 GHz continuous wave: bursts of I/Q of people who come towards the radar in four styles."""
+"""Infineon Sense2GoL, 24 GHz continuous wave: I/Q bursts of people approaching the radar in four styles."""
 
 from dataclasses import dataclass
 
@@ -51,16 +51,16 @@ STYLES = (
 
 @dataclass(frozen=True)
 class Effects:
-    """What the simulation has beside bodies that move, each to be left out for an ablation.
+    """Effects of the simulation beyond moving bodies; an ablation leaves out one at a time.
 
     Attributes:
-        speeding_up: people start from rest and stop before the radar; else their speed is constant.
+        speeding_up: people start from rest and stop in front of the radar; else their speed is constant.
         unrest: sway of the body and small movements of the limbs.
-        dim_limbs: other ratios of limbs to trunk than those of ellipsoids, drawn for each clip.
-        image: the mirror image of unequal I and Q.
-        saturation: steps and limits of the 12-bit converter.
+        dim_limbs: limb-to-trunk ratios other than those of ellipsoids, drawn for each clip.
+        image: the mirror image due to I/Q imbalance.
+        saturation: quantization and clipping of the 12-bit converter.
         beam: a beam that is narrow in elevation.
-        prf: samples fast enough for everybody; else half as many, so that limbs above 4.7 m/s wrap.
+        prf: a sampling rate high enough for all motion; else half of it, so that limbs above 4.7 m/s wrap.
     """
 
     speeding_up: bool = True
@@ -73,7 +73,7 @@ class Effects:
 
 
 def doppler_maps(iq: Tensor) -> Tensor:
-    """Decibels (N, 128, frames) of the bursts of I/Q (N, 2, 128 frames), Doppler ascending; towards is negative."""
+    """Doppler maps in dB (N, 128, frames) of I/Q bursts (N, 2, 128 frames), ascending; approaching is negative."""
     signal = torch.complex(iq[:, 0], iq[:, 1]).unflatten(-1, (-1, SENSE2GOL_BURST_SAMPLES))
     signal = signal - signal.mean(-1, keepdim=True)
     window = torch.hamming_window(SENSE2GOL_BURST_SAMPLES, periodic=False)
@@ -95,7 +95,7 @@ class Sense2Gol:
         ).flatten()
 
     def motion(self, label: int, count: int, generator: torch.Generator) -> Tensor:
-        """Joints (count, K, 14, 3) at ``KNOT_HZ``: people stand, come nearer and stop before the radar."""
+        """Joints (count, K, 14, 3) at ``KNOT_HZ``: people stand, approach and stop in front of the radar."""
         draw = Draw(count, generator)
         script, speed = STYLES[label]
         config = PeopleConfig(heading_rad=0.15, facing_radar_share=1.0)
@@ -114,7 +114,7 @@ class Sense2Gol:
         return joints
 
     def _pace(self, time: Tensor, draw: Draw, start_m: Tensor, speed: Tensor) -> Tensor:
-        """Share (N, K) of the full speed: from rest at the start, to rest about half a metre before the radar."""
+        """Fraction (N, K) of full speed: from rest at the start to rest about half a metre in front of the radar."""
         begin, rise, brake, stop_m = draw(-0.3, 0.5), draw(0.3, 1.0), draw(1.2, 4.0), draw(0.3, 0.8)
         gained = ((time - begin) / rise).clamp(0.0, 1.0)
         gained = gained**2 * (3 - 2 * gained)
@@ -164,7 +164,7 @@ def pictures(maps: Tensor) -> Tensor:
 
 
 def augment(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Pictures a frame earlier or later, of other levels, with noise."""
+    """Pictures shifted by up to one frame, with changed levels and added noise."""
     count = shown.shape[0]
     shown = shift(shown, 1, -1, generator)
     factor, offset = torch.rand(2, count, 1, 1, 1, generator=generator)

@@ -1,4 +1,4 @@
-"""The measured sets: what each needs of the simulation, of its folder and of the network."""
+"""The measured sets: what each needs from the simulation, its folder and the network."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from tensorsim.evaluation.measured import glasgow, radhar, sense2gol
 from tensorsim.evaluation.measured.training import Augment
 from tensorsim.files import reading
 
-#: Clips that are simulated at once.
+#: Clips simulated at once.
 _CHUNK = 10
 
 
@@ -26,20 +26,20 @@ class MeasuredSet:
     """A measured set and its simulation.
 
     Attributes:
-        name: its folder, and its name in the results.
-        file: what is read in that folder: classes, label (N,) and an array of the clips.
+        name: name of its folder, also used in the results.
+        file: file in that folder, with the classes, label (N,) and an array of the clips.
         array: name of that array.
-        shape: of each clip in it.
+        shape: shape of each clip in it.
         classes: names in the order of the labels.
-        subset: classes of the figure for a part of them.
-        simulator: of some effects, makes something with ``simulate(label, count, generator)`` -> maps (count, H, W).
-        effects: dataclass of what the simulation has beside bodies that move, each a bool.
+        subset: classes for which accuracy is also reported separately.
+        simulator: effects -> an object with ``simulate(label, count, generator)`` -> maps (count, H, W).
+        effects: dataclass of the effects of the simulation beyond moving bodies, each a bool.
         read: that array -> maps (N, H, W).
         pictures: maps -> pictures (N, 1, rows, columns).
-        augment: changes of pictures in training.
+        augment: augmentation of pictures in training.
         weights: name of the shipped weights.
-        augment_measured: changes of measured pictures in training.
-        ignored: classes of the file whose clips are left out.
+        augment_measured: augmentation of measured pictures in training.
+        ignored: classes of the file whose clips are ignored.
     """
 
     name: str
@@ -61,8 +61,8 @@ class MeasuredSet:
         """Pictures (N, 1, H, W) and labels (N,) of this set in a folder of measured sets.
 
         Raises:
-            TensorsimError: the file is not there, is damaged, holds no clips, clips of another shape or class, or
-                another number of labels than clips.
+            TensorsimError: the file is missing or damaged, or holds no clips, clips of another shape or class, or
+                unequal numbers of labels and clips.
         """
         path = folder / self.name / self.file
         if not path.is_file():
@@ -84,7 +84,7 @@ class MeasuredSet:
         return self.pictures(self.read(clips[seen.numpy()])), labels[seen]
 
     def _labels(self, path: Path, names: list[str], label: npt.NDArray[Any]) -> Tensor:
-        """Labels (N,) of these names in the order of ``classes``; -1 for those that are ignored."""
+        """Labels (N,) renumbered from these names to the order of ``classes``; -1 for ignored ones."""
         for name in names:
             if name not in self.classes + self.ignored:
                 known = ", ".join(self.classes + self.ignored)
@@ -103,13 +103,13 @@ class MeasuredSet:
 
     @property
     def effect_names(self) -> tuple[str, ...]:
-        """What can be left out of the simulation."""
+        """Names of the effects that can be left out of the simulation."""
         return tuple(field.name for field in dataclasses.fields(self.effects))
 
     def simulate(
         self, clips: int, seed: int, quiet: bool, without: str | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Simulated pictures (N, 1, H, W) and labels (N,), ``clips`` of each class, perhaps without an effect."""
+        """Simulated pictures (N, 1, H, W) and labels (N,), ``clips`` per class, optionally without one effect."""
         simulator = self.simulator(self.effects(**({} if without is None else {without: False})))
         shown, labels = [], []
         bar = tqdm(total=clips * len(self.classes), desc=f"{self.name}: simulated", disable=quiet)
@@ -126,7 +126,7 @@ class MeasuredSet:
 
 
 class Simulator(Protocol):
-    """What ``MeasuredSet.simulator`` makes."""
+    """Type of the objects made by ``MeasuredSet.simulator``."""
 
     def simulate(self, label: int, count: int, generator: torch.Generator) -> Tensor:
         """Maps (count, H, W) of a class."""

@@ -1,4 +1,4 @@
-"""Training of a small network on pictures that fit the memory."""
+"""Training of a small network on pictures that fit in memory."""
 
 from collections.abc import Callable
 
@@ -12,22 +12,22 @@ Augment = Callable[[Tensor, torch.Generator], Tensor]
 
 
 def square(pictures: Tensor, size: int) -> Tensor:
-    """Pictures (N, 1, H, W) as (N, 1, size, size): what is larger is averaged, what is smaller is interpolated."""
+    """Pictures (N, 1, H, W) as (N, 1, size, size): larger sides are averaged, smaller ones interpolated."""
     return F.interpolate(pictures.float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
 
 
 def shift(shown: Tensor, most: int, dim: int, generator: torch.Generator) -> Tensor:
-    """Pictures (B, C, H, W), each turned along ``dim`` by up to ``most`` cells either way."""
+    """Pictures (B, C, H, W), each rolled along ``dim`` by up to ``most`` cells either way."""
     by = torch.randint(-most, most + 1, (shown.shape[0],), generator=generator)
     return torch.stack([torch.roll(picture, int(k), dim) for picture, k in zip(shown, by, strict=True)])
 
 
 def warp(shown: Tensor, generator: torch.Generator, *, time: float, doppler: float, later: float) -> Tensor:
-    """Pictures (B, C, H, W), each stretched and moved at random, bilinearly; edges are continued.
+    """Pictures (B, C, H, W), each stretched and shifted at random, with bilinear interpolation; edges are repeated.
 
     Args:
         shown: the pictures.
-        generator: of the draw.
+        generator: source of the random numbers.
         time, doppler: largest change of the scale of columns and rows about the middle.
         later: largest shift along the columns, as a share of half their number.
     """
@@ -41,7 +41,7 @@ def warp(shown: Tensor, generator: torch.Generator, *, time: float, doppler: flo
 
 
 def drop_cells(shown: Tensor, most: float, generator: torch.Generator) -> Tensor:
-    """Pictures (B, C, H, W), each without a random share, up to ``most``, of its cells."""
+    """Pictures (B, C, H, W), each with a random share of up to ``most`` of its cells removed."""
     share = most * torch.rand(shown.shape[0], 1, 1, 1, generator=generator)
     return shown * (torch.rand(shown.shape, generator=generator) >= share)
 
@@ -66,10 +66,10 @@ def fit_pictures(
         pictures, labels: (N, C, H, W) and (N,) int64.
         steps: batches.
         augment: applied to every batch.
-        learning_rate: the largest one.
-        weights: (N,) how often each picture is drawn relative to the others; None is alike.
+        learning_rate: peak learning rate.
+        weights: (N,) how often each picture is drawn relative to the others; None draws all equally often.
         batch: pictures per step, drawn with replacement.
-        seed: of order, augmentation and dropout.
+        seed: seed of order, augmentation and dropout.
         quiet: no progress bar.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -81,7 +81,7 @@ def fit_pictures(
     for _ in trange(steps, desc="training", unit="step", disable=quiet):
         chosen = torch.multinomial(chance, batch, replacement=True, generator=generator)
         shown = augment(pictures[chosen], generator).contiguous(memory_format=torch.channels_last)
-        # In float32: gradients of depthwise convolutions in bfloat16 come out as NaN at times (torch 2.14).
+        # In float32: bfloat16 gradients of depthwise convolutions are sometimes NaN (torch 2.14).
         loss = F.cross_entropy(net(shown), labels[chosen], label_smoothing=0.1)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
