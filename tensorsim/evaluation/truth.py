@@ -298,7 +298,7 @@ class _Truths:
 
 
 def pose_errors(joints: Tensor, valid: Tensor, clip: Clip) -> dict[str, float]:
-    """Errors of joints (P, T, 14, 3) in metres, for the person tracked longest, in the frames in which they are tracked.
+    """Errors of joints (P, T, 14, 3) in metres for the person tracked longest, in the frames where they are tracked.
 
     ``followed`` is the share of these frames, ``root`` the rms distance of the mid-hips, ``joints`` the mean distance
     of the joints after aligning the hips, ``range`` the rms error along y of the joints after aligning; ``people`` the

@@ -1,1 +1,1 @@
-"""The tables and figures of the paper, each made again by one command: see :mod:`tensorsim.experiments.catalogue`."""
+"""The tables and figures of the paper, each reproduced by one command: see :mod:`tensorsim.experiments.catalogue`."""

@@ -1,4 +1,4 @@
-"""Ablations of the radar module: what the wall and its paths, and each denoiser, do to the maps of known motion."""
+"""Ablations of the radar module: effects of the wall and its paths, and of each denoiser, on maps of known motion."""
 
 import warnings
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ ECHOES: dict[str, dict[str, Any]] = {
     "without multipath": {"multipath": False},
     "without both": {"wall_attenuation": False, "multipath": False},
 }
-#: Trivial guesses that every PSNR stands beside.
+#: Trivial guesses as baselines for every PSNR.
 GUESSES = ("empty map", "another clip")
 SHORT = {"range_time": "RTM", "range_time_mti": "processed RTM", "doppler_time": "DTM"}
 NORMALISATION = (
@@ -47,8 +47,8 @@ class EchoConfig:
     """Settings of ``echo-ablation``.
 
     Attributes:
-        clips: per activity, at least 2.
-        seed: of the first clip.
+        clips: clips per activity, at least 2.
+        seed: seed of the first clip.
     """
 
     clips: int = 10
@@ -61,7 +61,7 @@ class EchoConfig:
 
 
 class _Echoes:
-    """Maps of clips by the complete model of the through-wall scene and by each ablation of it, free of noise."""
+    """Noise-free maps of clips by the complete through-wall model and by each ablation of it."""
 
     def __init__(self) -> None:
         base = replace(PRESETS["through-wall"], snr_db=None)
@@ -81,12 +81,12 @@ class _Echoes:
             return Maps.of(stage(positions, valid, FPS))
 
 
-#: Figures of clips by activity and echo model; of each by map and figure.
+#: Scores of clips by activity and echo model; those of each clip by map and score name.
 _Cells = dict[tuple[str, str], list[dict[str, dict[str, float]]]]
 
 
 def _energy_db(maps: Maps, reference: Maps) -> float:
-    """Energy of a Doppler-time map against another, dB; -inf for an empty one."""
+    """Energy of a Doppler-time map relative to another, dB; -inf for an empty one."""
     share = maps.doppler_time.square().sum() / reference.doppler_time.square().sum()
     return float(10 * share.log10())
 
@@ -96,7 +96,7 @@ def _stage(scene: SceneConfig) -> PoseToDoppler:
 
 
 def echo_report(config: EchoConfig, work: Work) -> Report:
-    """Maps of the ablated echo models against those of the complete one."""
+    """Maps of the ablated echo models compared with those of the complete one."""
     echoes = _Echoes()
     clips = {
         row: found for row, found in activity_clips((), config.clips, config.seed).items() if found[0].present
@@ -161,7 +161,7 @@ def echo_report(config: EchoConfig, work: Work) -> Report:
 
 
 def _strength(cells: _Cells, rows: Iterable[str], name: str) -> float:
-    """Mean energy of the Doppler-time maps against those of the complete model, dB; NaN for a guess."""
+    """Mean energy of the Doppler-time maps relative to those of the complete model, dB; NaN for a guess."""
     if name not in ECHOES:
         return float("nan")
     return mean_and_spread([cell["energy"]["db"] for row in rows for cell in cells[row, name]])[0]
@@ -172,12 +172,12 @@ class DenoiserConfig:
     """Settings of ``denoiser-ablation``.
 
     Attributes:
-        denoisers: of ``none``, ``perona-malik``, ``ksvd``, ``dncnn``, or weights of DnCNN.
+        denoisers: any of ``none``, ``perona-malik``, ``ksvd``, ``dncnn``, or weight files of DnCNN.
         scenes: names of radar presets.
-        clips: per scene and ratio, one activity after another from S2 on.
+        clips: clips per scene and ratio, cycling through the activities from S2.
         snr_db: signal-to-noise ratios.
-        columns: of each map at most, from its middle; K-SVD takes minutes for the 32 767 of a range-time map.
-        seed: of people, motion and noise.
+        columns: most columns of each map, from its middle; K-SVD takes minutes for the 32 767 of a range-time map.
+        seed: seed of people, motion and noise.
     """
 
     denoisers: tuple[str, ...] = DENOISERS
@@ -198,9 +198,9 @@ class DenoiserConfig:
 
 
 def denoiser_report(config: DenoiserConfig, work: Work) -> Report:
-    """Each denoiser's maps against those of the same echo at 50 dB."""
+    """Each denoiser's maps compared with those of the same echo at 50 dB."""
     denoisers: Denoisers = {name: map_denoiser(name) for name in config.denoisers}
-    # A file is told by its content.
+    # Files are identified by their content.
     identities = {name: sha256_of(Path(name)) if Path(name).is_file() else "" for name in config.denoisers}
     found: dict[tuple[str, str, float, str], list[list[float]]] = {}
     jobs = [

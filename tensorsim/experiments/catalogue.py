@@ -1,4 +1,4 @@
-"""The experiments by name, and how one is run and written."""
+"""The experiments by name, and how they are run and their reports written."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ class Experiment:
 
     Attributes:
         title: heading of its report.
-        config: its settings; the defaults are the size of the paper, as far as it says.
+        config: its settings; the defaults have the size of the paper's experiment, as far as it is stated.
         run: (settings, work) -> report.
         quick: settings that finish within three minutes.
-        parallel: whether it takes several processes.
+        parallel: whether it uses several processes.
     """
 
     title: str
@@ -111,16 +111,16 @@ def find_experiment(name: str) -> Experiment:
     """The experiment of this name.
 
     Raises:
-        TensorsimError: no such one; the message lists the known ones.
+        TensorsimError: no such experiment; the message lists the known ones.
     """
     return find_named(EXPERIMENTS, name, "experiment")
 
 
 def configuration(name: str, quick: bool, file: Path | None, options: dict[str, Any]) -> Any:
-    """Settings of an experiment: the defaults or the quick ones, those of a YAML file, then single options.
+    """Settings of an experiment: default or quick ones, overridden by a YAML file, then by single options.
 
     Raises:
-        TensorsimError: unknown names, options that this experiment does not have, values that it refuses.
+        TensorsimError: unknown names, options that this experiment does not have, invalid values.
     """
     experiment = find_experiment(name)
     if quick and file is not None:
@@ -147,8 +147,8 @@ def configuration(name: str, quick: bool, file: Path | None, options: dict[str, 
 def run_experiment(name: str, out: Path, config: Any, work: Work) -> Report:
     """Run an experiment and write its report: ``NAME.md``, ``NAME*.csv``, ``NAME-*.png`` and ``.svg``, ``NAME.yaml``.
 
-    Files appear once all of them are complete, and tables and figures of an earlier run that this one does not have are
-    removed. What was computed stays in the cache of ``work``.
+    Files appear once all are complete; tables and figures of an earlier run that this run does not produce are
+    removed. Computed results stay in the cache of ``work``.
     """
     from tensorsim.plot.figure import save_figure
 

@@ -19,8 +19,8 @@ def bars(groups: Mapping[str, Mapping[str, tuple[float, float]]], label: str, ti
     Args:
         groups: by name of the bar, then of the group: value and standard deviation (NaN for none). Bars are in
             the order given, the first one on top.
-        label: of the axis, with its unit.
-        title: of the figure.
+        label: label of the axis, with its unit.
+        title: title of the figure.
 
     Raises:
         TensorsimError: no values.
@@ -53,7 +53,7 @@ def bars(groups: Mapping[str, Mapping[str, tuple[float, float]]], label: str, ti
 def lines(
     curves: Mapping[str, Sequence[float]], x: Sequence[float], x_label: str, label: str, title: str
 ) -> Figure:
-    """One line per name over ``x``; styles repeat with another dash after ten colours."""
+    """One line per name over ``x``; after ten colours, they repeat with another dash pattern."""
     from tensorsim.plot.figure import new_figure
 
     figure = new_figure(8.5, 5.0)
@@ -90,7 +90,7 @@ def confusions(matrices: Mapping[str, np.ndarray], names: Sequence[str], title: 
 
 
 def map_grid(maps: Mapping[str, Mapping[str, np.ndarray]], title: str, range_db: float = 40.0) -> Figure:
-    """Maps in dB below the peak of each, a row of pictures per name; low values of the axis below."""
+    """Maps in dB below the peak of each, a row of pictures per name; axis values increase upwards."""
     from tensorsim.plot import decibels
     from tensorsim.plot.figure import new_figure
 

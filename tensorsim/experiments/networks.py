@@ -18,9 +18,9 @@ from tensorsim.recognition.networks import CLASSIFIERS, find_classifier
 from tensorsim.training.classifier import check_ratios
 from tensorsim.training.maps import SCENES
 
-#: The comparison of the paper in the order in which it lists the networks; its figures are confusion matrices only.
+#: The networks of the paper's comparison in its order; the paper shows confusion matrices only.
 PAPER_ORDER = ("adfe-net", "mrw-cn", "mc-gclu", "diat-radharnet", "ccln", "spnet")
-#: All but the three wider versions of SPGNet, which take two minutes an epoch on one core.
+#: All but the three wider versions of SPGNet, which take two minutes per epoch on one core.
 USUAL = tuple(name for name in CLASSIFIERS if not name.startswith("spgnet-"))
 RATIOS_DB = (50.0, 40.0, 30.0, 20.0, 10.0)
 
@@ -32,11 +32,11 @@ class NetworksConfig:
     Attributes:
         networks: names of recognisers.
         scenes: names of radar presets.
-        clips: per class to train on; every fifth person is for validation.
-        test_clips: per class of other people.
+        clips: training clips per class; every fifth person is for validation.
+        test_clips: test clips per class, of other people.
         size: height and width of the pictures.
         epochs: passes over the training clips.
-        seeds: trainings with different weights and order of the clips.
+        seeds: number of trainings, with different initial weights and order of the clips.
         snr_db: signal-to-noise ratios of the tests; training is at 50 dB.
     """
 
@@ -70,7 +70,7 @@ class InputsConfig:
     """Settings of the experiment ``inputs``; see :class:`NetworksConfig`.
 
     Attributes:
-        inputs: kinds of pictures, of ``doppler``, ``range``, ``ridges``, ``merged``.
+        inputs: kinds of pictures, from ``doppler``, ``range``, ``ridges``, ``merged``.
     """
 
     networks: tuple[str, ...] = ("spnet", "spgnet", "ccln")
@@ -102,7 +102,7 @@ class InputsConfig:
 
 
 def check_networks(networks: Sequence[str]) -> None:
-    """Refuse unknown names, one that is there twice, and an empty list."""
+    """Refuse unknown names, duplicates, and an empty list."""
     for name in networks:
         find_classifier(name)
     check_count(len(networks), "networks")
@@ -110,14 +110,14 @@ def check_networks(networks: Sequence[str]) -> None:
 
 
 def check_trainings(networks: Sequence[str], scenes: Sequence[str], seeds: int) -> None:
-    """Refuse networks and scenes that are unknown, there twice or none, and no training."""
+    """Refuse unknown or duplicate networks and scenes, empty lists of them, and fewer than one training."""
     check_networks(networks)
     check_scenes(scenes)
     check_count(seeds, "seeds")
 
 
 def protocol(clips: int, test_clips: int, size: int, epochs: int, seeds: int) -> str:
-    """What a table of accuracies says of how it came about."""
+    """The description of the protocol given with a table of accuracies."""
     return (
         f"{counted(clips, 'clip')} per class in {size}x{size} pixels, split 8:2 by person into training and validation "
         f"(the epoch with the lowest validation loss is kept); accuracy is counted on {counted(test_clips, 'clip')} "
@@ -130,16 +130,16 @@ def protocol(clips: int, test_clips: int, size: int, epochs: int, seeds: int) ->
 
 
 def accuracy(result: dict[str, Any], ratio: float) -> float:
-    """Share of right labels at a ratio in dB, in percent."""
+    """Share of correct labels at a ratio in dB, in percent."""
     counts = torch.tensor(result["confusion"][f"{ratio:g}"])
     return float(100 * counts.diagonal().sum() / counts.sum())
 
 
 def multiply_adds(network: nn.Module, channels: int, size: int) -> float:
-    """Millions of multiplications with additions for one picture, Fourier transforms left out."""
+    """Millions of multiply-adds for one picture, without Fourier transforms."""
     from torch.utils.flop_counter import FlopCounterMode
 
-    # In float64: an LSTM in float32 is one operation of oneDNN, which counts as nothing.
+    # In float64: in float32 an LSTM is a single oneDNN operation, which is counted as zero.
     network = copy.deepcopy(network).double().eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         network(torch.zeros(1, channels, size, size, dtype=torch.float64))
@@ -270,11 +270,11 @@ def inputs_report(config: InputsConfig, work: Work) -> Report:
 
 
 def quick_networks() -> NetworksConfig:
-    """Five networks for an epoch, to see that everything works; the accuracies mean nothing."""
+    """Five networks for one epoch, to check that everything works; the accuracies are meaningless."""
     networks = ("spnet", "spgnet", "adfe-net", "ccln", "diat-radharnet")
     return NetworksConfig(networks, ("through-wall",), clips=5, test_clips=2, size=32, epochs=1, seeds=1)
 
 
 def quick_inputs() -> InputsConfig:
-    """As :func:`quick_networks`."""
+    """One network for one epoch, as a check like :func:`quick_networks`."""
     return replace(InputsConfig(), networks=("ccln",), clips=5, test_clips=2, size=32, epochs=1, seeds=1)

@@ -21,9 +21,9 @@ class PaperConfig:
     """Settings of ``paper``.
 
     Attributes:
-        quick: all of them in their quick form.
-        settings: folder with the NAME.yaml of earlier runs; experiments without one have their defaults.
-        data, films: folders of measured sets and of real films for ``real``; without both, that one is left out.
+        quick: run all of them in their quick form.
+        settings: folder with the NAME.yaml of earlier runs; experiments without one use their defaults.
+        data, films: folders of measured sets and of real films for ``real``, which is left out if neither is given.
         maps: folder of simulated maps of everyday motion for ``real``; "" is one in the cache.
     """
 
@@ -47,7 +47,7 @@ class PaperConfig:
 
 
 def paper_report(settings: Mapping[str, Any], work: Work, experiments: Mapping[str, Experiment]) -> Report:
-    """The reports of these experiments under one roof, each with its settings."""
+    """The reports of these experiments in one, each with its settings."""
     notes: list[str] = [
         "The experiments of RadHARSimulator V2 (arXiv 2511.09022), made again on declared data with declared figures."
     ]

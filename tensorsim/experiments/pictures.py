@@ -1,8 +1,8 @@
-"""The pictures that recognisers are trained on: Doppler-time and range-time maps of generated people, kept by person.
+"""Pictures for training recognisers: Doppler-time and range-time maps of generated people, stored by person.
 
-Doppler-time pictures come from :class:`~tensorsim.training.maps.MapStore`, which has them at any signal-to-noise ratio.
-Range-time pictures (after the moving target indicator) and pictures of the ridges are made by the whole simulator, at
-one ratio, from the same people and motion.
+Doppler-time pictures come from :class:`~tensorsim.training.maps.MapStore`, which gives them at any signal-to-noise
+ratio. Range-time pictures (after the moving target indicator) and pictures of the ridges are made by the full
+simulator at one ratio, from the same people and motion.
 """
 
 import warnings
@@ -28,7 +28,7 @@ from tensorsim.training.maps import MapSettings, MapStore, MotionMaker, build_ma
 
 #: Kinds of input, with the number of channels of each.
 INPUTS = {"doppler": 1, "range": 1, "ridges": 1, "merged": 2}
-#: Ratio of the range-time and ridge pictures: the paper's.
+#: Signal-to-noise ratio of the range-time and ridge pictures: the paper's.
 SNR_DB = 50.0
 
 
@@ -36,10 +36,10 @@ class PictureSet:
     """Pictures of the people of one scene.
 
     Args:
-        work: the cache that they are in; those that are missing are made on first use.
+        work: holds the cache of the pictures; missing ones are made by :meth:`prepare`.
         scene: a name in ``tensorsim.radar.presets.PRESETS``.
         size: height and width in pixels.
-        seed: of people, motion and noise.
+        seed: seed of people, motion and noise.
     """
 
     def __init__(self, work: Work, scene: str, size: int, seed: int = 0) -> None:
@@ -53,7 +53,7 @@ class PictureSet:
         return self.work.cache / f"{kind}-{size}{digest(self.settings)}"
 
     def prepare(self, people: int, inputs: str) -> None:
-        """Make what is missing of the first ``people`` people.
+        """Make missing pictures of the first ``people`` people.
 
         Raises:
             TensorsimError: unknown inputs.
@@ -124,12 +124,12 @@ class RangeAndRidges:
 
     @torch.no_grad()
     def pictures(self, joints: Tensor, valid: Tensor, rate_hz: float, seed: int) -> dict[str, Tensor]:
-        """Pictures (N, size, size) in [0, 1] of N clips with joints (N, T, 14, 3), there where ``valid`` (N, T)."""
+        """Pictures (N, size, size) in [0, 1] of N clips of joints (N, T, 14, 3), present where ``valid`` (N, T)."""
         found: dict[str, list[Tensor]] = {"range": [], "ridges": []}
         prf_hz = self.simulator.radar.prf_hz
         torch.manual_seed(seed)
         with warnings.catch_warnings():
-            # Limbs that are too fast for the through-wall preset alias, as they would for a real radar.
+            # Limbs too fast for the through-wall preset alias, as with a real radar.
             warnings.simplefilter("ignore", TensorsimWarning)
             for one, there in zip(joints, valid, strict=True):
                 pulses = self.resampler.pulses(len(one), rate_hz)

@@ -43,18 +43,18 @@ class RealConfig:
         data: folder of measured sets (glasgow_cfar_masks, kmkim_cw24_iq, radhar_points); "" leaves them out.
         films: folder of real films with labels.json; "" leaves them out. At least one of both must be given.
         maps: folder of simulated maps of everyday motion, to train on for films; "" is one in the cache.
-        groups: of these maps; a group is some 100 clips, and takes 10 s where it is missing.
-        group_clips: clips per activity of a group that is made: as the pipeline finds them in films, and of the
-            motion itself.
-        film_count: films to label, the first of the folder; 0 is all.
-        film_steps: batches of 64 of each training on them.
+        groups: number of groups of these maps; a group has some 100 clips and takes 10 s if it must be made.
+        group_clips: clips per activity in a newly made group: as the pipeline finds them in films, and of the true
+            motion.
+        film_count: number of films to label, from the first of the folder; 0 is all.
+        film_steps: batches of 64 of each training for films.
         networks: names of recognisers.
         clips: simulated clips of each class.
         size: height and width of the pictures.
         steps: batches of 64 of each training.
-        seeds: trainings with different weights and order.
+        seeds: number of trainings, with different initial weights and order.
         film_seeds: the same for films.
-        seed: of the simulated clips.
+        seed: seed of the simulated clips.
     """
 
     data: str = ""
@@ -93,10 +93,10 @@ class RealConfig:
             raise TensorsimError(f"size: got {self.size} with films, expected 32 or 64")
 
     def sets(self) -> list[MeasuredSet]:
-        """The sets that the folder has.
+        """The sets that the folder contains.
 
         Raises:
-            TensorsimError: neither it nor films are given, or the folder has none of the sets.
+            TensorsimError: neither it nor a folder of films is given, or the folder has none of the sets.
         """
         if not self.data:
             if self.films:
@@ -113,7 +113,7 @@ class RealConfig:
         return found
 
     def unused(self) -> dict[str, str]:
-        """Settings that count for nothing, and the folder that each is for."""
+        """Settings without effect, and the missing folder that each belongs to."""
         of = {
             "data": ("clips", "steps", "seeds", "seed"),
             "films": ("maps", "groups", "group_clips", "film_count", "film_steps", "film_seeds"),
@@ -123,17 +123,17 @@ class RealConfig:
         }
 
     def everyday(self, work: Work) -> EverydayTraining:
-        """The trainings for films."""
+        """The training for films."""
         filmed, true = self.group_clips
         made = EverydaySettings(filmed=filmed, true=true)
         maps = Path(self.maps) if self.maps else work.cache / f"everyday-maps-{digest(made)}"
         return EverydayTraining(maps, self.groups, self.size, self.film_steps, made, work.quiet)
 
     def check(self, work: Work) -> None:
-        """Refuse folders that do not hold what they should, before trainings of hours.
+        """Refuse folders with unexpected content before hours of training.
 
         Raises:
-            TensorsimError: it says what a folder has and what was expected.
+            TensorsimError: states what a folder has and what was expected.
         """
         for measured in self.sets():
             measured.load(Path(self.data))
@@ -143,7 +143,7 @@ class RealConfig:
 
 
 def real_report(config: RealConfig, work: Work) -> Report:
-    """Accuracy on measured clips, by set, of networks that have seen none, and on real films."""
+    """Accuracy on measured clips, by set, of networks never trained on measured clips, and on real films."""
     config.check(work)
     sets = config.sets()
     reports = [_on_measured(config, sets, work)] if sets else []
@@ -200,7 +200,7 @@ def _on_measured(config: RealConfig, sets: list[MeasuredSet], work: Work) -> Rep
 
 
 def _on_films(config: RealConfig, work: Work) -> Report:
-    """Real films labelled by networks trained on maps of everyday motion, all of the same maps."""
+    """Real films labelled by networks that are all trained on the same maps of everyday motion."""
     films = film_pictures(Path(config.films), config.size, work, config.film_count)
     labelled = [
         (*described(film), film.accept)
@@ -240,10 +240,10 @@ def _on_films(config: RealConfig, work: Work) -> Report:
 
 
 def best_constant(accepted: Sequence[Sequence[str]]) -> tuple[str, float]:
-    """The answer that is right most often if it is always given, and the share in which it is.
+    """The constant answer that is right most often, and the share of clips for which it is right.
 
     Args:
-        accepted: for each clip the answers that are right.
+        accepted: for each clip, the answers that are right.
     """
     answer, count = Counter(name for names in accepted for name in dict.fromkeys(names)).most_common(1)[0]
     return answer, count / len(accepted)
@@ -286,7 +286,7 @@ def _simulated(config: RealConfig, measured: MeasuredSet, work: Work) -> tuple[T
 
 
 def quick_real() -> RealConfig:
-    """Two small networks on a few clips and three films; the folders of sets or films have still to be given."""
+    """Two small networks on a few clips and three films; the folder of sets or films must still be given."""
     return RealConfig(
         groups=5, group_clips=(1, 1), film_count=3, film_steps=20, networks=("ccln", "diat-radharnet"), clips=4,
         size=32, steps=4, seeds=1, film_seeds=1,

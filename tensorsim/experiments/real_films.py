@@ -1,4 +1,4 @@
-"""Recognisers trained on simulated maps of everyday motion and asked about real films of known activity."""
+"""Recognisers trained on simulated maps of everyday motion and tested on real films of known activity."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -28,7 +28,7 @@ from tensorsim.training.everyday_classifier import EverydayRecipe
 from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
 from tensorsim.training.loop import LoopConfig, fit
 
-#: Networks by which films are watched.
+#: Networks that process the films.
 WATCHERS = ("RTMDet", "HRNet", "TemporalLifter")
 
 #: Configurations of the scenes.
@@ -36,11 +36,11 @@ SCENES = {"free-space": SimulationConfig.free_space(), "through-wall": Simulatio
 
 
 class FilmPictures(NamedTuple):
-    """Simulated maps of a film as a network sees them.
+    """Simulated maps of a film as input of a network.
 
     Attributes:
         accept: the activities that are right.
-        windows: for each scene (W, 1, size, size) in [0, 1], the windows of four seconds; none if the simulation
+        windows: for each scene, the windows of four seconds (W, 1, size, size) in [0, 1]; W is 0 if the simulation
             refuses the motion.
     """
 
@@ -53,11 +53,11 @@ class EverydayTraining:
     """A training on maps of everyday motion.
 
     Attributes:
-        maps: folder of the maps; those that are missing are made.
-        groups: of maps, every fifth for validation.
+        maps: folder of the maps; missing ones are made.
+        groups: number of groups of maps, every fifth for validation.
         size: height and width of the pictures: 32 or 64.
         steps: batches of 64.
-        made: contents of maps that are made, where the folder has none yet.
+        made: settings of the maps to make if the folder has none yet.
         quiet: no progress bar.
     """
 
@@ -76,10 +76,11 @@ class EverydayTraining:
 
     @property
     def settings(self) -> EverydaySettings:
-        """Contents of the maps: of those that are there, else of what is made.
+        """Settings of the maps: those of existing ones, else of the ones to make.
 
         Raises:
-            TensorsimError: the folder has maps of another kind, or in pictures that are no multiple of ``size``.
+            TensorsimError: the folder has maps of another kind, or with pictures whose size is not a multiple of
+                ``size``.
         """
         check_folder(self.maps, "--maps")
         there = (self.maps / "settings.json").is_file()
@@ -92,27 +93,27 @@ class EverydayTraining:
 
     @cached_property
     def digest(self) -> str:
-        """Of the content of the maps."""
+        """Digest of the content of the maps."""
         store = self.store
         return sha256_of_arrays(store.power.numpy(), store.activity.numpy(), store.filmed.numpy())
 
 
 def described(film: LabelledFilm) -> tuple[str, int, float, float]:
-    """What tells a film and its part from others: name, size of the file, start and end in seconds."""
+    """What identifies a part of a film: name, size of the file, start and end in seconds."""
     return film.path.name, film.path.stat().st_size, film.start_s, film.end_s
 
 
 def film_pictures(folder: Path, size: int, work: Work, count: int = 0) -> list[FilmPictures]:
-    """Pictures of the films of a folder with ``labels.json``, by the shipped networks; kept in the cache.
+    """Pictures of the films in a folder with ``labels.json``, by the shipped networks; kept in the cache.
 
     Args:
-        folder: of the films.
+        folder: folder of the films.
         size: height and width of the pictures.
         work: cache and progress.
-        count: of films, the first of the folder; 0 is all.
+        count: number of films, from the first of the folder; 0 is all.
 
     Raises:
-        TensorsimError: not such a folder.
+        TensorsimError: the folder has no valid ``labels.json``.
     """
     from safetensors.torch import load_file, save_file
 
@@ -150,9 +151,9 @@ def _made(films: list[LabelledFilm], size: int, work: Work) -> dict[str, Tensor]
             video = reader.open(film)
             found = reader.people(film, video, cpu, quiet=True)
             for name, scene in scenes.items():
-                torch.manual_seed(0)  # of the receiver's noise
+                torch.manual_seed(0)  # for the receiver's noise
                 shown = [torch.zeros(0, 1, size, size)]
-                # Motion too fast for the radar has no map, and no right label.
+                # Motion too fast for the radar gives no map and counts as wrong.
                 with suppress(TensorsimError):
                     pose = within_reach(found, scene.stage.simulator.radar).pose
                     maps = maps_of_pose(scene.stage, pose, video.fps, cpu, quiet=True)
@@ -168,8 +169,8 @@ def film_accuracy(
     """Train a network and label the films.
 
     Returns:
-        Share of held-out clips, as the pipeline finds them in films, and of real films that are labelled rightly, for
-        each scene.
+        For each scene, the share of correct labels on held-out clips as the pipeline finds them in films, and on real
+        films.
     """
     recipe = EverydayRecipe(name, training.store, training.size, seed, learning_rate=1e-3)
     settings = {
@@ -185,10 +186,10 @@ def film_accuracy(
         batch=64,
         seed=seed,
         workers=0,
-        precision="float32",  # gradients of depthwise convolutions in bfloat16 come out as NaN at times
+        precision="float32",  # bfloat16 gradients of depthwise convolutions are sometimes NaN
         checkpoint_every=min(50, training.steps),
         validate_every=training.steps,
-        ema_decay=0.0,  # the last weights are asked, no mean
+        ema_decay=0.0,  # use the last weights, not their average
         quiet=work.quiet,
         events=False,
     )
@@ -200,7 +201,7 @@ def film_accuracy(
 
 @torch.no_grad()
 def right_share(net: nn.Module, films: list[FilmPictures], scene: str) -> float:
-    """Share of the films whose most probable activity, on the mean over windows and both ways round, is right."""
+    """Share of films whose most probable activity, averaged over windows and both Doppler directions, is right."""
     right = 0
     for film in films:
         windows = film.windows[scene]
@@ -212,7 +213,7 @@ def right_share(net: nn.Module, films: list[FilmPictures], scene: str) -> float:
 
 
 def titled(results: Mapping[str, list[dict[str, float]]]) -> list[list[Any]]:
-    """Rows of the table: network, then the mean of each share over the trainings in per cent."""
+    """Rows of the table: network, then the mean of each share over the trainings in percent."""
     rows: list[list[Any]] = []
     for name, trained in results.items():
         keys = [f"{scene} {kind}" for kind in ("clips", "films") for scene in SCENES]

@@ -1,4 +1,4 @@
-"""The results that come with the package: tables of the experiments and the settings that repeat them."""
+"""The results shipped with the package: tables of the experiments and the settings to repeat them."""
 
 import csv
 from pathlib import Path
@@ -10,7 +10,7 @@ RESULTS = Path(__file__).with_name("results")
 
 
 def stored_names() -> list[str]:
-    """Experiments whose results come with the package."""
+    """Experiments whose results are shipped with the package."""
     return sorted(path.stem for path in RESULTS.glob("*.yaml"))
 
 
@@ -18,7 +18,7 @@ def stored_table(name: str) -> list[dict[str, str]]:
     """Rows of a table by column, in the order of the file.
 
     Args:
-        name: of a CSV file without its suffix: an experiment, or ``NAME-PART``.
+        name: name of a CSV file without its suffix: an experiment, or ``NAME-PART``.
 
     Raises:
         TensorsimError: no such table.

@@ -1,8 +1,8 @@
-"""One training of a recogniser and its test, as experiments list them; each in a process of its own.
+"""One training of a recogniser and its test, the unit of the experiments; each runs in its own process.
 
 The protocol is the paper's: cross-entropy, Adam with a learning rate of 1.47e-3 and a tenth of it in the second half,
 L2 of 1e-4 on weights, batches of 64, 20 epochs, pictures at 50 dB, people split 8:2, the epoch with the lowest
-validation loss. Beyond it, accuracy is counted on people who took no part in either.
+validation loss. In addition, accuracy is measured on people who are in neither part.
 """
 
 import io
@@ -39,19 +39,19 @@ L2 = 1e-4
 
 @dataclass(frozen=True)
 class Trial:
-    """What is trained on what.
+    """A network and what it is trained and tested on.
 
     Attributes:
         network: a name of :data:`tensorsim.recognition.networks.CLASSIFIERS`.
-        scene: a name of the two presets of the paper.
-        inputs: of :data:`tensorsim.experiments.pictures.INPUTS`.
-        clips: per class to train and validate on; every fifth person is for validation.
-        test_clips: per class of other people, to test on.
+        scene: name of one of the paper's two presets.
+        inputs: a key of :data:`tensorsim.experiments.pictures.INPUTS`.
+        clips: clips per class for training and validation; every fifth person is for validation.
+        test_clips: test clips per class, of other people.
         size: height and width of the pictures.
         epochs: passes over the training clips.
         batch: clips per step.
-        seed: of weights and order.
-        maps_seed: of people, motion and noise.
+        seed: seed of weights and order.
+        maps_seed: seed of people, motion and noise.
     """
 
     network: str
@@ -66,7 +66,7 @@ class Trial:
     maps_seed: int = 0
 
     def check(self) -> None:
-        """Raises TensorsimError: an unknown network or input, counts that cannot be."""
+        """Raises TensorsimError: an unknown network or input, or counts out of range."""
         find_classifier(self.network)
         check_choice(self.inputs, INPUTS, "inputs")
         if self.clips < 5 or self.test_clips < 1:
@@ -82,12 +82,12 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """What its folder is called."""
+        """Name of its folder."""
         return f"{self.network}-{self.scene}-{self.inputs}-seed{self.seed}-{self.training}"
 
     @property
     def training(self) -> str:
-        """Digest of what the training depends on: all but the clips of the test."""
+        """Digest of what the training depends on: everything but the number of test clips."""
         return digest(replace(self, test_clips=0))
 
     def pictures(self, work: Work) -> PictureSet:
@@ -100,7 +100,7 @@ class Trial:
 
 
 class PaperRecipe(Recipe):
-    """The protocol of the module on pictures (N, C, H, W) with labels (N,), and as many of validation."""
+    """The protocol of this module, on pictures (N, C, H, W) with labels (N,) for training and for validation."""
 
     def __init__(
         self, trial: Trial, net: nn.Module, training: tuple[Tensor, Tensor], validation: tuple[Tensor, Tensor]
@@ -111,7 +111,7 @@ class PaperRecipe(Recipe):
         super().__init__(net, {"trial": trial.training}, stated)
 
     def sample(self, index: int) -> dict[str, Any]:
-        """Picture and label; the clips in a new order in each epoch."""
+        """Picture and label; clips come in a new order in each epoch."""
         chosen = shuffled(index, len(self.training[1]), self.seed)
         return {"picture": self.training[0][chosen], "label": int(self.training[1][chosen])}
 
@@ -136,11 +136,11 @@ class PaperRecipe(Recipe):
 
 
 def run_trial(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, Any]:
-    """Train (or go on), test at every ratio in dB, and keep the result; what is kept is not computed again.
+    """Train (or resume), test at every ratio in dB, and keep the result; kept results are not computed again.
 
     Returns:
-        ``validation`` (accuracy), ``training_s`` (processor time), ``epoch`` of the weights, and ``confusion``: by
-        ratio, the counts.
+        ``validation`` (accuracy), ``training_s`` (processor time), ``epoch`` of the weights, and ``confusion``:
+        counts by ratio.
     """
     folder = work.cache / "trials" / trial.name
     path = folder / "result.json"
@@ -211,7 +211,7 @@ def _one_thread(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str
 
 
 def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -> list[dict[str, Any]]:
-    """Results of all trials in their order, ``work.jobs`` at a time, each in a process of its own.
+    """Results of all trials in order, ``work.jobs`` at a time, each in its own process.
 
     Raises:
         TensorsimError: see :class:`Trial`; a training that fails.
@@ -235,7 +235,7 @@ def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -
                 "a training ended without a result: was it killed, or out of memory?"
             ) from None
         except BaseException:
-            for child in active_children():  # they would train to their end
+            for child in active_children():  # otherwise they would train to the end
                 child.terminate()
             raise
         finally:
@@ -244,7 +244,7 @@ def run_trials(trials: Sequence[Trial], ratios: tuple[float, ...], work: Work) -
 
 
 def _kept(trial: Trial, ratios: tuple[float, ...], work: Work) -> dict[str, Any] | None:
-    """The result of a trial if all of it is there."""
+    """The result of a trial if it is complete, else None."""
     path = work.cache / "trials" / trial.name / "result.json"
     result = read_result(path) if path.is_file() else {}
     counts = result.get("confusion", {}).get(str(trial.test_clips), {})

@@ -49,9 +49,9 @@ class VideoConfig:
     Attributes:
         activities: names; empty is all twelve.
         scenes: names of radar presets.
-        clips: per activity.
-        length_s: of a clip.
-        seed: of the first clip.
+        clips: clips per activity.
+        length_s: length of a clip.
+        seed: seed of the first clip.
     """
 
     activities: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ class VideoConfig:
             )
 
     def rows(self) -> dict[str, list[ActivityClip]]:
-        """The clips by activity; one more of each, with which the last is compared."""
+        """The clips by activity, with one extra clip each for comparison with the last one."""
         found = activity_clips(self.activities, self.clips + 1, self.seed)
         return {
             row: [
@@ -88,11 +88,11 @@ Chain = Callable[[Tensor, float], tuple[Tensor, Tensor]]
 
 
 class Watcher:
-    """The chains that are compared, each from frames to joints; all know the camera and the height of the person.
+    """The compared chains, each from frames to joints; all know the camera and the height of the person.
 
     Attributes:
-        chains: by name.
-        missing: rows that are left out, and why.
+        chains: chains by name.
+        missing: omitted rows, and why.
     """
 
     def __init__(self) -> None:
@@ -122,7 +122,7 @@ class Watcher:
         )
 
     def _by_mosse(self, frames: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
-        """RTMDet starts the filters in the first frame in which it sees somebody."""
+        """Tracks by MOSSE; RTMDet starts the filters in the first frame in which it detects a person."""
         for first in range(0, len(frames), 2):
             start = self.detector(frames[first : first + 1])
             if bool((start.valid & (start.scores >= 0.5)).any()):
@@ -137,7 +137,7 @@ class Watcher:
 
 
 def _lifted(detector: nn.Module, pose: nn.Module, lifter: nn.Module) -> Chain:
-    """The chain with a lifter that knows no camera but its tilt."""
+    """The chain with a lifter that knows nothing of the camera but its tilt."""
 
     def watch(frames: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
         return _joints(VideoToPose(detector, pose, (height_m,), camera=CAMERA, lifter=lifter), frames)
@@ -151,7 +151,7 @@ def _joints(stage: VideoToPose, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def video_report(config: VideoConfig, work: Work) -> Report:
-    """Maps and joints of every chain on rendered films, against those of the true motion."""
+    """Maps and joints of every chain on rendered films, compared with those of the true motion."""
     rows = config.rows()
     watcher = Watcher()
     pipelines = Pipelines({scene: PRESETS[scene] for scene in config.scenes})
@@ -175,7 +175,7 @@ def video_report(config: VideoConfig, work: Work) -> Report:
 
 @torch.inference_mode()
 def _film(clip: ActivityClip, other: ActivityClip, watcher: Watcher, pipelines: Pipelines) -> dict[str, Any]:
-    """By chain and guess: figures of the maps by scene, and errors of the joints."""
+    """For each chain and guess: scores of the maps by scene, and joint errors."""
     joints = clip.joints(FPS).float()
     there = torch.full((1, len(joints)), clip.present)
     frames = PersonRenderer(CAMERA, HEIGHT, WIDTH)(joints, seed=clip.seed, valid=there).frames
@@ -190,7 +190,7 @@ def _film(clip: ActivityClip, other: ActivityClip, watcher: Watcher, pipelines: 
     def seen(scene: str, found: Tensor, valid: Tensor) -> Maps:
         try:
             return pipelines.maps(setting, scene, clip, found, valid)
-        except TensorsimError:  # motion that the radar cannot follow
+        except TensorsimError:  # motion too fast for the radar
             return truth[scene].empty()
 
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""What every experiment has in common: its folder, results that are kept, tables and figures."""
+"""What all experiments have in common: the folder, cached results, tables and figures."""
 
 import csv
 import io
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Work:
-    """Where an experiment works.
+    """The working environment of an experiment.
 
     Attributes:
-        cache: folder of scene sets, trainings and results that are kept, by hash of what they depend on.
-        jobs: processes at a time.
+        cache: folder of cached scene sets, trainings and results, by hash of what they depend on.
+        jobs: number of parallel processes.
         quiet: no progress bars.
     """
 
@@ -44,7 +44,7 @@ class Work:
 
 
 def check_scenes(scenes: Sequence[str]) -> None:
-    """Refuse unknown scenes, one that is there twice, and an empty list."""
+    """Refuse unknown scenes, duplicates, and an empty list."""
     if not scenes:
         raise TensorsimError("scenes: got none, expected at least one")
     for scene in scenes:
@@ -58,12 +58,12 @@ def counted(count: int, noun: str) -> str:
 
 
 def write_result(path: Path, content: dict[str, Any]) -> None:
-    """Write a result as JSON, whole or not at all. NaN and infinity stay what they are."""
+    """Write a result as JSON, completely or not at all. NaN and infinity are preserved."""
     write_text(path, json.dumps(content))
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """What :func:`write_result` wrote.
+    """Read what :func:`write_result` wrote.
 
     Raises:
         TensorsimError: a damaged file.
@@ -79,13 +79,13 @@ def read_result(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers and words under named columns.
+    """Rows of numbers and text under named columns.
 
     Attributes:
         title: heading in the report.
         columns: names, with units.
         rows: one value per column; floats are written with ``digits`` digits in Markdown and in full in CSV.
-        digits: after the point, in Markdown.
+        digits: decimal places in Markdown.
         file: part of the name of the CSV file; "" for the main table of an experiment.
     """
 
@@ -123,9 +123,9 @@ class Report:
     """Outcome of an experiment.
 
     Attributes:
-        notes: paragraphs: what was measured how, what is declared and what the paper leaves open.
+        notes: paragraphs: what was measured and how, assumptions, and what the paper leaves open.
         tables: the first one is the main one.
-        figures: by name.
+        figures: figures by name.
     """
 
     notes: Sequence[str]

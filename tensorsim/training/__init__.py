@@ -1,1 +1,1 @@
-"""Recipes that produced the weights in ``models/``, runnable again: ``tensorsim train``."""
+"""Recipes that produced the weights in ``models/``; ``tensorsim train`` runs them again."""

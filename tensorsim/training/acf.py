@@ -1,8 +1,8 @@
-"""Training of the ACF detector: windows of upright people, boosting, and negatives that the detector itself finds.
+"""Training of the ACF detector: windows of upright people, boosting, and hard negatives found by the detector itself.
 
 The boosting is scikit-learn's gradient boosting with the exponential loss, which is AdaBoost with real leaves, on a
-random sixteenth of the features at each split; every stage starts anew with more trees and with the windows without
-people in which the stage before has seen some.
+random sixteenth of the features at each split. Each stage starts afresh with more trees, and adds the false positives
+of the stage before to the negatives.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,12 +22,12 @@ from tensorsim.training.shards import POINTS, Floats, Sample, Shards, find_shard
 from tensorsim.vision.detection.acf import COLUMNS, PERSON_HEIGHT, ROWS, AcfDetector
 from tensorsim.vision.detection.acf_features import CELL, CHANNELS, aggregate_channels
 
-#: Cells beside a window that its channels are computed with.
+#: Margin of cells around a window for computing its channels.
 _MARGIN = 4
 _SHAPE = (CELL * (ROWS + 2 * _MARGIN), CELL * (COLUMNS + 2 * _MARGIN))
-#: Points of the ends of a body, at least one of each group of an upright person.
+#: Key points at the ends of a body; of an upright person, at least one of each group is labelled.
 _UPPER, _LOWER = ("nose", "left_ear", "right_ear", "head_top"), ("left_ankle", "right_ankle")
-#: Width of an upright person over the height.
+#: Lowest and highest ratio of width to height of an upright person.
 _SLIM = (0.2, 0.65)
 _FEWEST_PIXELS = 48.0
 
@@ -37,12 +37,12 @@ class AcfSettings:
     """How the detector is trained.
 
     Attributes:
-        rounds: trees of each stage.
+        rounds: number of trees in each stage.
         positives: most windows with people.
-        negatives: windows without people that each stage adds.
+        negatives: windows without people added by each stage.
         learning_rate: factor on each tree.
         false_per_picture: false detections per held-out picture at the score 0.5.
-        seed: of draws and boosting.
+        seed: seed of draws and boosting.
 
     Raises:
         TensorsimError: counts below one, factors that are not positive.
@@ -63,7 +63,7 @@ class AcfSettings:
 
 
 def upright_boxes(sample: Sample) -> Floats:
-    """Boxes (n, 4) of people of a picture who are seen upright from head to foot."""
+    """Boxes (n, 4) of people in a picture who are upright and visible from head to foot."""
     kept = []
     for box, points in zip(sample.boxes, sample.keypoints, strict=True):
         width, height = box[2] - box[0], box[3] - box[1]
@@ -102,7 +102,7 @@ def crop(image: npt.NDArray[np.uint8], box: Floats, mirrored: bool) -> npt.NDArr
 
 
 def window_features(crops: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.float32]:
-    """Features (n, 5120) of windows with their margin, in the order of the detector."""
+    """Features (n, 5120) of windows given with their margin, in the order of the detector."""
     inner = slice(_MARGIN, -_MARGIN)
     found = []
     for first in range(0, len(crops), 64):
@@ -118,7 +118,7 @@ def boost(
     settings: AcfSettings,
     quiet: bool = True,
 ) -> AcfDetector:
-    """A detector of ``rounds`` trees that tells windows with people (label 1) from others (0).
+    """A detector of ``rounds`` trees that distinguishes windows with people (label 1) from others (0).
 
     Raises:
         TensorsimError: scikit-learn missing.
@@ -141,14 +141,14 @@ def boost(
 
         def count(*_: Any) -> bool:
             bar.update()
-            return False  # go on
+            return False  # continue
 
         model.fit(features, labels, monitor=count)
     detector = AcfDetector(rounds)
     share = float(labels.mean())
     for k, tree in enumerate(model.estimators_[:, 0]):
         _copy_tree(tree.tree_, detector, k, settings.learning_rate)
-    detector.leaf[0] += 0.5 * float(np.log(share / (1 - share)))  # where the boosting starts
+    detector.leaf[0] += 0.5 * float(np.log(share / (1 - share)))  # initial value of the boosting
     return detector.eval()
 
 
@@ -169,11 +169,11 @@ def _copy_tree(tree: Any, detector: AcfDetector, k: int, learning_rate: float) -
 
 
 class AcfTrainer:
-    """Collects windows and trains stage after stage.
+    """Collects windows and trains stage by stage.
 
     Args:
         data: folder of the shards of ``tensorsim train detector``.
-        settings: how.
+        settings: settings of the training.
         quiet: no progress bars.
 
     Raises:
@@ -232,20 +232,20 @@ class AcfTrainer:
     def _hard_negatives(
         self, detector: AcfDetector, rng: np.random.Generator
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Windows of pictures without people that the detector takes for people, a few of each picture."""
+        """Windows of pictures without people that the detector takes for people, a few from each picture."""
         most, total = max(4, 3 * self.settings.negatives // len(self.empty)), 0
         for k in tqdm(rng.permutation(len(self.empty)), desc="mistakes", unit="picture", disable=self.quiet):
             image = self.empty[k].image()
             found = detect(detector, image)
             for box in found[:most, :4]:
                 total += 1
-                # The box of the detection is slimmer than the height alone says: crop by the height.
+                # The detection's box is narrower than its window, so crop by the height.
                 yield crop(image, box, False)
             if total >= self.settings.negatives:
                 return
 
     def calibrate(self, detector: AcfDetector) -> None:
-        """Set the offset: at the score 0.5 there are ``false_per_picture`` false detections per held-out picture."""
+        """Set the offset so that, at score 0.5, held-out pictures have ``false_per_picture`` false detections each."""
         pictures = [sample for sample in self.held_out if sample.all_labelled]
         wrong: list[float] = []
         for sample in tqdm(pictures, desc="held out", unit="picture", disable=self.quiet):

@@ -1,4 +1,4 @@
-"""Which cells of a detector answer for which objects, and the losses of both.
+"""Assignment of a detector's cells to objects, and the classification and box losses.
 
 B images, N cells (of all levels, in the order of their predictions), G objects per image, padded.
 
@@ -14,17 +14,17 @@ from torch import Tensor
 
 from tensorsim.geometry.boxes import box_area, box_iou
 
-#: Objects get as many cells as the sum of their best overlaps, of at most this many cells.
+#: An object gets as many cells as the sum of its best overlaps, over at most this many cells.
 MOST_CELLS = 13
 IOU_WEIGHT = 3.0
-#: Cells pay 10^(steps from the centre of the object - this).
+#: The cost of a cell includes 10^(distance to the centre of the object in strides - this).
 CENTRE_RADIUS = 3.0
-#: Score from which a teacher's box is one to learn.
+#: Score above which a student learns a teacher's box.
 TAUGHT_SCORE = 0.25
 
 
 class Assignment(NamedTuple):
-    """What each cell answers for.
+    """The object assigned to each cell.
 
     Attributes:
         target: (B, N) int64, the object; -1 for none.
@@ -52,12 +52,12 @@ def cells_of(height: int, width: int, strides: list[int], device: torch.device) 
 def assign(
     logits: Tensor, boxes: Tensor, points: Tensor, strides: Tensor, objects: Tensor, valid: Tensor
 ) -> Assignment:
-    """Dynamic soft labels: each object takes the cells that already do best at it.
+    """Dynamic soft labels: each object takes the cells that already predict it best.
 
     With IoU u of the predicted box, score s and distance d to the centre of the object in strides, the cost is
     ``BCE(s, u) (u - s)^2 - 3 log u + 10^(d - 3)`` among the cells inside any object. An object takes the
-    ``max(1, floor(sum of its 13 largest u))`` cheapest ones; a cell that several take goes to the one that it
-    is cheapest for.
+    ``max(1, floor(sum of its 13 largest u))`` cheapest ones; a cell taken by several goes to the object with the
+    lowest cost.
 
     Args:
         logits: (B, N) of the class.
@@ -82,7 +82,7 @@ def assign(
     cost = (
         soft * (iou - score.sigmoid()).square()
         - IOU_WEIGHT * torch.log(iou + 1e-7)
-        + 10 ** (steps - CENTRE_RADIUS).clamp(max=30.0)  # beyond, single precision overflows
+        + 10 ** (steps - CENTRE_RADIUS).clamp(max=30.0)  # larger exponents overflow single precision
     )
     cost = cost.masked_fill(~candidate, torch.inf)
 
@@ -143,7 +143,7 @@ def detection_losses(
         objects: (B, G, 4).
         valid: (B, G) bool.
         counted: (B, m, m) bool over the square picture: where the absence of an object is known. Cells
-            elsewhere that answer for nothing are left out of the loss.
+            elsewhere without an object are left out of the loss.
     """
     height, width = logits[0].shape[-2] * strides[0], logits[0].shape[-1] * strides[0]
     flat = torch.cat([level.flatten(1) for level in logits], dim=1).float()
@@ -166,10 +166,10 @@ def detection_losses(
 
 
 def distillation_loss(logits: Tensor, boxes: Tensor, taught_logits: Tensor, taught_boxes: Tensor) -> Tensor:
-    """How far the answers of a one-class detector are from a teacher's, cell by cell; 0 where they are the same.
+    """Difference of the outputs of a one-class detector from a teacher's, cell by cell; 0 if they are the same.
 
     The quality focal loss against the teacher's scores, and twice the GIoU loss against its boxes, weighted with the
-    scores where they exceed :data:`TAUGHT_SCORE`; both in relation to the sum of these scores.
+    scores where they exceed :data:`TAUGHT_SCORE`; both divided by the sum of these scores.
 
     Args:
         logits: (B, N) of the class.
@@ -178,7 +178,7 @@ def distillation_loss(logits: Tensor, boxes: Tensor, taught_logits: Tensor, taug
         taught_boxes: (B, N, 4), without gradients.
 
     Reference:
-        Hinton et al., "Distilling the Knowledge in a Neural Network", 2015; here of every cell.
+        Hinton et al., "Distilling the Knowledge in a Neural Network", 2015; here for every cell.
     """
     quality = taught_logits.sigmoid()
     weight = quality * (quality > TAUGHT_SCORE)

@@ -1,4 +1,4 @@
-"""A square picture that others are put into, whole or as cut-outs, with boxes of the people in them.
+"""A square canvas that pictures are put on, whole or as cut-outs, with boxes of the people in them.
 
 Boxes are ``xyxy`` pixels with (0, 0) at the outer corner of the first pixel.
 """
@@ -15,19 +15,19 @@ from tensorsim.training.views import Doubles, warp_boxes, warp_points
 
 Mask = npt.NDArray[np.bool_]
 
-#: Cells of the mask of what is known, along each side.
+#: Number of cells along each side of the mask of what is known.
 KNOWN_CELLS = 40
-#: Around a box this share of its size is known to be free of other people.
+#: Around a box, a margin of this share of its size is known to be free of other people.
 SURROUNDINGS = 0.15
-#: What is cut off by the edge of a picture is nobody's box if less than this is left.
+#: A person cut off by the edge of a picture or covered has no box if less than this share remains visible.
 LEAST_VISIBLE = 0.25
-#: A picture with people is this often about as large as where it is put, not as large as one of its people wants.
+#: How often a picture with people is scaled to about the size of its place, rather than by one of its people.
 AS_IT_IS = 0.5
 
 
 @functools.lru_cache(maxsize=256)
 def shrunk_picture(sample: Sample, longest: int = 448) -> tuple[Picture, float]:
-    """A picture, shrunk to at most ``longest`` pixels a side, and by what factor. Few are larger: they are kept."""
+    """A picture, shrunk to at most ``longest`` pixels a side, and the factor."""
     import cv2
 
     image = sample.image()
@@ -38,13 +38,13 @@ def shrunk_picture(sample: Sample, longest: int = 448) -> tuple[Picture, float]:
 
 
 class Canvas:
-    """A square picture that others are put into, and what is known of it."""
+    """A square picture that others are put into, and what is known about it."""
 
     def __init__(self, size: int) -> None:
         self.image = np.full((size, size, 3), LETTERBOX_GREY, np.uint8)
         self.known = np.ones((KNOWN_CELLS, KNOWN_CELLS), bool)
         self.boxes: list[Floats] = []
-        self.pasted: list[int] = []  # pixels of each cut-out before others covered it
+        self.pasted: list[int] = []  # number of pixels of each cut-out before others covered it
         self.owner = np.zeros((size, size), np.uint8)  # 1 + index of the cut-out that each pixel shows
         self.cell = size / KNOWN_CELLS
 
@@ -83,10 +83,10 @@ class Canvas:
             boxes[:, [0, 2]] = room[0] - boxes[:, [2, 0]]
         if turn is not None:
             matrix = matrix @ turn
-        # OpenCV has pixel centres at integers, boxes have corners there.
+        # In OpenCV, pixel centres are at integers; in boxes, pixel corners are.
         centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
         matrix = np.linalg.inv(centre) @ matrix @ centre
-        if scale <= 0.5:  # an odd width, for an even one would move the picture
+        if scale <= 0.5:  # an odd width, because an even one would shift the picture
             picture = cv2.blur(picture, (2 * int(0.5 / scale) + 1,) * 2)  # type: ignore[assignment]
         self.image[top:bottom, left:right] = cv2.warpPerspective(
             picture, matrix, tuple(room.tolist()), flags=cv2.INTER_LINEAR, borderValue=(LETTERBOX_GREY,) * 3
@@ -112,17 +112,17 @@ class Canvas:
         rng: np.random.Generator,
         beside: tuple[int, int, int, int] | None = None,
     ) -> tuple[int, int, int, int]:
-        """Put a cut-out into a rectangle, at a random scale and place, partly outside at times.
+        """Put a cut-out into a rectangle, at a random scale and place, sometimes partly outside.
 
         Args:
             rgba: the cut-out (h, w, 4), straight alpha.
             rect: left, top, right and bottom of the rectangle.
             rng: random numbers.
-            beside: left, top, width and height of somebody whom it stands close to, as large and as low as that
-                one; None: anywhere.
+            beside: left, top, width and height of a person whom it stands close to, at about the same size and height
+                in the picture; None: anywhere.
 
         Returns:
-            Left, top, width and height of the cut-out, also where it is outside.
+            Left, top, width and height of the cut-out, including parts that are outside.
         """
         import cv2
 
@@ -147,9 +147,9 @@ class Canvas:
         return x, y, *size
 
     def distract(self, sample: Sample, rect: tuple[int, int, int, int], rng: np.random.Generator) -> None:
-        """Put a piece of a picture without people into a rectangle: what has an edge of its own is not a person.
+        """Put a piece of a picture without people into a rectangle: not everything with an edge is a person.
 
-        It may stand in front of people who were pasted before.
+        It may cover people who were pasted before.
         """
         import cv2
 
@@ -164,7 +164,7 @@ class Canvas:
         piece = cv2.resize(
             picture[y : y + part[0], x : x + part[1]], size, interpolation=cv2.INTER_AREA
         ).astype(np.uint8)
-        if rng.random() < 0.2:  # of one colour and some shade
+        if rng.random() < 0.2:  # a single colour with some shading
             piece = (piece * 0.15 + rng.uniform(0, 215, 3)).astype(np.uint8)
         alpha = np.full(size[::-1], 255, np.uint8)
         shape = rng.random()
@@ -172,7 +172,7 @@ class Canvas:
             alpha[:] = 0
             middle, radii = (size[0] // 2, size[1] // 2), (size[0] // 2, size[1] // 2)
             cv2.ellipse(alpha, middle, radii, 0, 0, 360, (255,), -1)
-        elif shape < 0.7:  # a blot
+        elif shape < 0.7:  # a blob
             coarse = rng.uniform(0, 1, (5, 4)).astype(np.float32)
             coarse[[0, -1]] *= 0.4
             coarse[:, [0, -1]] *= 0.4
@@ -187,7 +187,7 @@ class Canvas:
     def _put(
         self, rgba: Picture, corner: tuple[int, int], rect: tuple[int, int, int, int], owner: int
     ) -> None:
-        """Put a cut-out (:func:`premultiplied`) with its corner there, as far as it is within the rectangle."""
+        """Put a cut-out (:func:`premultiplied`) with its corner there, clipped to the rectangle."""
         (x, y), (left, top, right, bottom) = corner, rect
         height, width = rgba.shape[:2]
         x0, y0, x1, y1 = max(x, left), max(y, top), min(x + width, right), min(y + height, bottom)
@@ -198,7 +198,7 @@ class Canvas:
         self.owner[y0:y1, x0:x1][part[..., 3] > 127] = owner
 
     def final_boxes(self) -> Floats:
-        """Boxes (n, 4) of everybody, those of cut-outs around what is left to see of them."""
+        """Boxes (n, 4) of all people, those of cut-outs around their visible parts."""
         boxes = list(self.boxes)
         for index, pixels in enumerate(self.pasted, start=1):
             seen = self.owner == index
@@ -231,14 +231,14 @@ def _placement(
 ) -> tuple[float, Doubles]:
     """Scale of a picture of that size (width, height) and place of its upper left corner in a rectangle.
 
-    Half the time the picture is about as large as the rectangle, else as one of its people wants it, who is then
-    in it.
+    Half the time the picture is about as large as the rectangle; otherwise one of its people determines the scale
+    and is in view.
     """
     fits = room / size
     fit = fits.min()
     if len(boxes) == 0:
         scale = fit * np.exp(rng.uniform(np.log(0.9), np.log(2.2)))
-        if rng.random() < 0.7:  # no grey around it
+        if rng.random() < 0.7:  # without grey borders
             scale = max(scale, fits.max())
         focus = size * rng.uniform(0.3, 0.7, 2)
     else:
@@ -246,7 +246,7 @@ def _placement(
         focus = (box[:2] + box[2:]) / 2
         if rng.random() < AS_IT_IS:
             scale = fit * np.exp(rng.uniform(np.log(0.8), np.log(1.5)))
-        else:  # from far to close
+        else:  # from far away to close up
             wanted = room[1] * np.exp(rng.uniform(np.log(0.15), np.log(1.1)))
             least = fit * (0.9 if rng.random() < 0.75 else 0.4)
             scale = float(np.clip(wanted / max((box[2:] - box[:2]).max(), 1), least, 3.5 * fit))

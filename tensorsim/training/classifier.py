@@ -1,4 +1,4 @@
-"""The recipe of the activity classifiers: cross-entropy on stored pictures, with new noise at every use."""
+"""The recipe of the activity classifiers: cross-entropy on stored pictures, with new noise for every use."""
 
 import math
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from tensorsim.training.maps import MapStore
 from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict
 
-#: Networks by name, each with the size of the pictures that its authors give it.
+#: Networks by name, each with the picture size used by its authors.
 NETWORKS: dict[str, tuple[type[nn.Module], int]] = {"spnet": (SPNet, 224), "spgnet": (SPGNet, 32)}
 RANGE_DB = 40.0
 LEARNING_RATE = 1.47e-3
-#: Between the seeds of masks and of what else is drawn for a picture: equal ones would mask the clearest pictures
-#: most. Below 2**32, as the generator of the CPU takes the low 32 bits of a seed only.
+#: Offset between the seeds of masks and of other draws for a picture: with equal seeds, the clearest pictures would be
+#: masked most. Below 2**32, because the CPU generator uses only the low 32 bits of a seed.
 MASK_STREAM = 0x9E3779B1
 
 
@@ -50,7 +50,7 @@ def check_drawn(
     """Refuse a range of ratios that does not ascend, and masks outside of 0 to 1.
 
     Raises:
-        TensorsimError: it calls them by these names.
+        TensorsimError: refers to them by these names.
     """
     low, high = snr_db
     if not low <= high:
@@ -60,10 +60,10 @@ def check_drawn(
 
 
 def check_ratios(snr_db: Sequence[float], name: str = "snr_db") -> None:
-    """Refuse a list of ratios that is empty, has one twice, or has what is no number of decibels.
+    """Refuse a list of ratios that is empty, or has duplicates or values that are not finite.
 
     Raises:
-        TensorsimError: it calls them by this name.
+        TensorsimError: refers to them by this name.
     """
     if len(snr_db) == 0:
         raise TensorsimError(f"{name}: got no ratios, expected at least one")
@@ -76,7 +76,8 @@ def check_ratios(snr_db: Sequence[float], name: str = "snr_db") -> None:
 def clips_of(
     store: MapStore, scenes: Sequence[str], people: int | None, validation: bool | None
 ) -> list[Clip]:
-    """Clips of the first ``people`` people of a store (None: all); training and validation if ``validation`` is None.
+    """Clips of the first ``people`` people of a store (None: all); all of training and validation if ``validation`` is
+    None.
 
     Raises:
         TensorsimError: the store has fewer people, or no clips of this part.
@@ -121,8 +122,8 @@ def masked(pictures: Tensor, largest: tuple[float, float], seed: int) -> Tensor:
 
     Args:
         pictures: not changed.
-        largest: part of the rows and of the columns that a band covers at most; its width is uniform from 0.
-        seed: of widths and places; the random generator is left as it was.
+        largest: largest part of the rows and of the columns that a band covers; its width is uniform from 0.
+        seed: seed of widths and places; the global random generator is unaffected.
     """
     if largest == (0.0, 0.0):
         return pictures
@@ -137,26 +138,26 @@ def masked(pictures: Tensor, largest: tuple[float, float], seed: int) -> Tensor:
 
 
 class ClassifierRecipe(Recipe):
-    """The paper's protocol: Adam 1.47e-3, coupled L2 1e-4 on weights, a tenth of the rate after half of the epochs.
+    """The paper's protocol: Adam 1.47e-3, coupled L2 1e-4 on weights, a tenth of the rate in the second half.
 
     Args:
         network: a name of :data:`NETWORKS`.
         store: pictures of at least ``people`` people in each scene.
-        scenes: what to train on.
-        people: how many, of whom every fifth is held out.
+        scenes: scenes to train on.
+        people: number of people; every fifth is held out.
         snr_db: (lowest, highest) ratio, drawn for each picture; (50, 50) is the paper's.
-        seed: of weights, order and noise.
+        seed: seed of weights, order and noise.
         init: weights to start from.
         size: height and width of the pictures, a divisor of the store's; None takes that of :data:`NETWORKS`.
-        filmed: a second store, of motion estimated from films, to train on as well.
-        filmed_people: number of people of it.
-        learning_rate: of the first half.
-        masks: largest part of the rows (speeds) and of the columns (time) of a picture that is masked in training, a
-            width and place drawn each time; (0, 0) masks nothing. See :func:`masked`.
+        filmed: a second store to train on as well, of motion estimated from films.
+        filmed_people: number of people in it.
+        learning_rate: learning rate of the first half.
+        masks: largest part of the rows (speeds) and of the columns (time) of a picture that is masked in training;
+            width and place are drawn each time; (0, 0) masks nothing. See :func:`masked`.
 
     Raises:
-        TensorsimError: an unknown network, a range that does not ascend, masks outside of 0 to 1, or a store without
-            the people.
+        TensorsimError: an unknown network, a range that does not ascend, masks outside of 0 to 1, or a store with
+            too few people.
     """
 
     def __init__(
@@ -249,7 +250,7 @@ class ClassifierRecipe(Recipe):
 
 
 def mean_both_ways(net: nn.Module, pictures: Tensor) -> Tensor:
-    """Mean logits (N, classes) of pictures (N, C, H, W) and of the same with approach and retreat exchanged."""
+    """Mean logits (N, classes) of pictures (N, C, H, W) and the same pictures with approach and retreat swapped."""
     logits: Tensor = 0.5 * (net(pictures) + net(pictures.flip(-2)))
     return logits
 
@@ -264,9 +265,9 @@ def logits_of(
     batch: int = 64,
     either_way: bool = False,
 ) -> Tensor:
-    """Logits (N, classes) of N clips, on the CPU. Clip k has the k-th draw of the ratios for every network.
+    """Logits (N, classes) of N clips, on the CPU. Clip k gets the k-th draw of the ratios for every network.
 
-    ``either_way`` takes the mean over both ways round, as :class:`~tensorsim.recognition.ActivityRecognizer` does.
+    ``either_way`` averages over both Doppler directions, as :class:`~tensorsim.recognition.ActivityRecognizer` does.
     """
     parameter = next(net.parameters())
     found = []

@@ -1,4 +1,4 @@
-"""Changes of light, colours and quality of pictures, as cameras and video files differ; cut-outs in front of others."""
+"""Random changes of light, colour and quality, as between cameras and video files; compositing of cut-outs."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ Picture = npt.NDArray[np.uint8]
 
 
 def recoloured(image: Picture, rng: np.random.Generator) -> Picture:
-    """Other exposure, contrast, tint and saturation; now and then dark, blurred, noisy, compressed, or grey."""
+    """Random exposure, contrast, tint and saturation; sometimes dark, blurred, noisy, compressed, or grey."""
     import cv2
 
     ramp = np.linspace(0, 1, 256)
@@ -36,17 +36,17 @@ def compressed(image: Picture, quality: int) -> Picture:
     import cv2
 
     data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    decoded: Any = cv2.imdecode(data, cv2.IMREAD_COLOR)  # both take the channels in one order
+    decoded: Any = cv2.imdecode(data, cv2.IMREAD_COLOR)  # both use the same channel order
     return decoded.astype(np.uint8, copy=False)
 
 
 def premultiplied(rgba: Picture) -> Picture:
-    """A cut-out (h, w, 4) of straight alpha with its colours multiplied by alpha, so that they can be interpolated."""
+    """A cut-out (h, w, 4) of straight alpha with its colours multiplied by alpha, ready for interpolation."""
     alpha = rgba[..., 3:].astype(np.uint16)
     return np.concatenate([(rgba[..., :3] * alpha + 127) // 255, alpha], -1).astype(np.uint8)
 
 
 def over(image: Picture, cutout: Picture) -> Picture:
-    """A picture (h, w, 3) with a cut-out (h, w, 4), as :func:`premultiplied` gives it, in front of it."""
+    """A picture (h, w, 3) with a cut-out (h, w, 4) from :func:`premultiplied` in front of it."""
     rest = 255 - cutout[..., 3:].astype(np.uint16)
     return np.minimum(cutout[..., :3] + (image * rest + 127) // 255, 255).astype(np.uint8)

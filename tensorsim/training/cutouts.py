@@ -1,7 +1,7 @@
-"""People cut out of rendered pictures, with exact outlines, to be pasted on background pictures.
+"""People cut out of rendered pictures, with exact outlines, for pasting onto background pictures.
 
 A shard is a tar of ``KEY.png`` (RGBA, straight alpha, cropped to the person) and ``KEY.json`` with
-``{"keypoints": [[x, y, v] * 17]}`` in pixels of it (centres at integers; v as in COCO).
+``{"keypoints": [[x, y, v] * 17]}`` in its pixels (centres at integers; v as in COCO).
 """
 
 import io
@@ -28,7 +28,7 @@ from tensorsim.motion.pose_sampler import FAMILIES, sample_poses
 from tensorsim.render.renderer import PersonRenderer
 from tensorsim.training.pose_pool import everyday_poses
 
-#: Rendered this many times larger than kept, so that outlines have soft edges.
+#: Rendered this many times larger than stored, so that outlines have soft edges.
 OVERSAMPLING = 2
 PER_SHARD = 250
 
@@ -46,10 +46,10 @@ class Cutout(NamedTuple):
 
 
 class Cutouts(Sequence[Cutout]):
-    """The cut-outs of shards, in the order of the files and of their names inside them, decoded on access.
+    """The cut-outs in shards, in the order of the files and of the names inside them, decoded on access.
 
     Raises:
-        TensorsimError: a file that is not such a shard.
+        TensorsimError: a file is not such a shard.
     """
 
     def __init__(self, paths: Iterable[str | os.PathLike[str]]) -> None:
@@ -83,8 +83,8 @@ def render_cutout(pose: Tensor, seed: int, side: int = 288) -> Cutout:
     """Render one person in this pose with a random view, clothes and light.
 
     Args:
-        pose: (14, 3) body heights, as :func:`tensorsim.motion.pose_sampler.sample_poses` draws them.
-        seed: of appearance, light, heading and camera.
+        pose: (14, 3) body heights, as drawn by :func:`tensorsim.motion.pose_sampler.sample_poses`.
+        seed: seed of appearance, light, heading and camera.
         side: approximate longest side of the result in pixels.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -102,7 +102,7 @@ def render_cutout(pose: Tensor, seed: int, side: int = 288) -> Cutout:
     pitch = math.atan2(float(centre[2]) - camera_height, distance)
     camera = CameraConfig(position_m=position, pitch_rad=pitch)
     pixels = side * OVERSAMPLING
-    # Focal length and principal point for which the joints and a margin for the flesh fill the picture.
+    # Focal length and principal point such that the joints, with a margin for the flesh, fill the picture.
     x, y, z = ((joints - joints.new_tensor(position)) @ camera_to_world(camera)[:, :3].to(joints)).unbind(-1)
     low, high = torch.stack([x / z, y / z], dim=-1).aminmax(dim=0)
     flesh = 0.17 * height / 1.75 / distance
@@ -141,18 +141,18 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     Args:
         count: number of people, at least 13.
         seed: the same seed gives the same people.
-        out: folder, made if it is not there.
+        out: folder, created if missing.
         quiet: no progress bar.
 
     Returns:
         The shards.
 
     Raises:
-        TensorsimError: too few people, or the folder holds those of another number or seed.
+        TensorsimError: too few people, or the folder holds cut-outs of another number or seed.
     """
     from tqdm import tqdm
 
-    near_floor = max(min(count // 2, count - FAMILIES), 0)  # of few people, each family is drawn once
+    near_floor = max(min(count // 2, count - FAMILIES), 0)  # if there are few people, each family is drawn once
     poses = sample_poses(count - near_floor, seed)
     if near_floor:
         poses = torch.cat([poses, everyday_poses(near_floor, seed)])
@@ -172,7 +172,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     shards = [folder / f"cutouts-{k:03d}.tar" for k in range(math.ceil(count / PER_SHARD))]
     rank, processes = rank_and_processes()
     with tqdm(total=count, desc="people", disable=quiet or rank > 0) as progress:
-        # Processes that torchrun starts together each begin with shards of their own.
+        # Processes started together by torchrun each begin with different shards.
         for k in sorted(range(len(shards)), key=lambda k: (k - rank) % processes):
             people = range(k * PER_SHARD, min((k + 1) * PER_SHARD, count))
             if not shards[k].exists():

@@ -1,9 +1,9 @@
-"""The recipe of the map denoiser: patches of simulated maps with noise, of which the network predicts the noise.
+"""The recipe of the map denoiser: the network predicts the noise in patches of noisy simulated maps.
 
-Every clip is simulated twice with one draw of the noise, at a ratio between 0 and 40 dB and at 50 dB, which counts as
-clean. Images and noise are on the ``"floor"`` scale of ``MapDenoiser``, so the network learns what it will be asked.
-There the noise has the same strength at all ratios: over the peak of the map its power spans six orders of magnitude,
-the error of the noisiest maps is all that counts, and a network trained on that spoils the others.
+Every clip is simulated twice with the same draw of the noise: at a ratio between 0 and 40 dB, and at 50 dB, which
+counts as clean. Images and noise are on the ``"floor"`` scale of ``MapDenoiser``, so training matches use. On this
+scale the noise has the same strength at all ratios. Relative to the peak of the map its power would span six orders
+of magnitude, only the error of the noisiest maps would count, and such a network spoils the others.
 """
 
 import math
@@ -36,12 +36,12 @@ NOISY_DB = (0.0, 40.0)
 #: Stored patches are a little larger than trained ones, which are cut from them at random.
 STORED, TRAINED = 64, 50
 _MOTION_HZ = 240.0
-#: Range-time maps at every pulse hardly change along time; long clips are kept at about this rate.
+#: Range-time maps hardly change from pulse to pulse; those of radars with high pulse rates are reduced to this rate.
 _DISPLAY_HZ = 256.0
 
 
 def simulate_pair(scene: str, activity: int, seed: int, snr_db: float) -> tuple[RadarMaps, RadarMaps]:
-    """Maps of one clip at ``snr_db``, and at :data:`CLEAN_DB` with the same noise, only weaker; ``seed`` determines
+    """Maps of one clip at ``snr_db``, and at :data:`CLEAN_DB` with the same but weaker noise; ``seed`` determines
     person and noise.
     """
     radar, wall = PRESETS[scene].radar, PRESETS[scene].wall
@@ -56,14 +56,14 @@ def simulate_pair(scene: str, activity: int, seed: int, snr_db: float) -> tuple[
         simulator = RadarSimulator(radar, echo=echo, snr_db=ratio)
         torch.manual_seed(seed)
         with torch.no_grad(), warnings.catch_warnings():
-            # Kicks and falls are too fast for the through-wall preset and alias, as they would for a real radar.
+            # Kicks and falls are too fast for the through-wall preset and alias, as with a real radar.
             warnings.simplefilter("ignore", TensorsimWarning)
             maps.append(RadarMaps(*(field[0] for field in simulator(points, rcs))))
     return maps[0], maps[1]
 
 
 def views(maps: RadarMaps, prf_hz: float) -> dict[str, Tensor]:
-    """The maps (H, W) that a denoiser is given: Doppler-time, and range-time after MTI at full and at display rate."""
+    """The input maps (H, W) of a denoiser: Doppler-time, and range-time after MTI at full and at display rate."""
     found = {"doppler_time": maps.doppler_time, "range_time_mti": maps.range_time_mti}
     block = round(prf_hz / _DISPLAY_HZ)
     if block > 1:
@@ -85,7 +85,7 @@ def cut_patches(
     beyond = [0, max(0, STORED - width), 0, max(0, STORED - height)]
     padded = [F.pad(x[None, None], beyond, mode="replicate")[0, 0] for x in (image, noise)]
     height, width = padded[0].shape
-    # Of the floor scale: what is left of the map in floors, clean.
+    # The clean map in units of the floor, recovered from the floor scale.
     echo = (padded[0].expm1() - padded[1]).clamp_min(0.0)
     blocks = F.max_pool2d(echo[None, None], 8, ceil_mode=True)[0, 0]
     strong = torch.multinomial(
@@ -110,10 +110,10 @@ def build_pairs(
     scenes: tuple[str, ...] = SCENES,
     quiet: bool = False,
 ) -> None:
-    """Fill a folder with patches of ``clips`` clips per scene, activity after activity; existing files are kept.
+    """Fill a folder with patches of ``clips`` clips per scene, cycling through activities; existing files are kept.
 
     Raises:
-        TensorsimError: the folder holds patches of another seed, or another number of them per map.
+        TensorsimError: the folder holds patches of another seed, or of another number per map.
     """
     from safetensors.torch import save_file
 
@@ -136,7 +136,7 @@ def build_pairs(
 
 
 def untrained(depth: int = 20, seed: int = 0) -> DnCNN:
-    """A DnCNN whose last layer is zero, so that it starts as the identity; ``seed`` is of the other weights."""
+    """A DnCNN whose last layer is zero, so that it starts as the identity; ``seed`` determines the other weights."""
     torch.manual_seed(seed)
     net = DnCNN(depth)
     nn.init.zeros_(net.model[-1].get_parameter("weight"))
@@ -144,16 +144,16 @@ def untrained(depth: int = 20, seed: int = 0) -> DnCNN:
 
 
 class DenoiserRecipe(Recipe):
-    """Residual learning (Zhang et al., 2017): ``1/2 mean (Q(y) - (y - x))^2``, Adam 1e-3 falling to 1e-5 as a cosine.
+    """Residual learning (Zhang et al., 2017): ``1/2 mean (Q(y) - (y - x))^2``, Adam, 1e-3 to 1e-5 along a cosine.
 
     Args:
         net: the network.
         folder: made by :func:`build_pairs`.
-        clips: how many per scene to take; every eleventh is held out, so that all activities come round.
-        seed: of patches and flips.
+        clips: clips per scene to use; every eleventh is held out, so that all activities take turns.
+        seed: seed of patches and flips.
 
     Raises:
-        TensorsimError: none of the first clips in the folder, none to hold out, or no settings that they are made with.
+        TensorsimError: the folder has none of the first clips, none to hold out, or no settings file.
     """
 
     def __init__(self, net: DnCNN, folder: Path, clips: int, seed: int = 0) -> None:
@@ -191,7 +191,7 @@ class DenoiserRecipe(Recipe):
         return found
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Half the mean square error of the residual, in units of the floor."""
+        """Half the mean squared error of the residual, in units of the floor."""
         error = (batch["image"] - net(batch["image"]).float() - batch["noise"]).square().mean()
         before = batch["noise"].square().mean()
         return {"loss": error / 2, "gain_db": -10 * (error.detach() / before).log10()}
@@ -201,7 +201,7 @@ class DenoiserRecipe(Recipe):
         return torch.optim.Adam(self.net.parameters(), lr=1e-3)
 
     def rate(self, step: int, steps: int) -> float:
-        """Cosine from 1 to 0.01, after a short rise."""
+        """Cosine from 1 to 0.01, after a short warm-up."""
         rise = min(1.0, (step + 1) / 20)
         cosine = (1 + torch.cos(torch.tensor(torch.pi * step / steps)).item()) / 2
         return rise * (0.01 + 0.99 * cosine)

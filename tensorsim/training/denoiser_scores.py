@@ -13,19 +13,19 @@ from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.ridges import RidgeExtractor
 from tensorsim.training.denoiser import simulate_pair
 
-#: PSNR of magnitudes over their peak; of decibels cut off 40 dB below it; speed errors of Doppler-time maps.
+#: PSNR of magnitudes scaled by their peak, and of decibels clipped 40 dB below it; speed errors of Doppler-time maps.
 COLUMNS = ("PSNR dB", "PSNR of dB map", "envelope m/s", "ridges m/s")
-#: Range-time maps are cut to this many columns: the slow rivals take minutes for all 32 767 of free space.
+#: Maps are cut to this many columns: the slow methods take minutes for all 32 767 of a free-space range-time map.
 COLUMNS_AT_MOST = 1024
 Key = tuple[str, str, float, str]
-#: By name; None does nothing.
+#: Denoisers by name; None does nothing.
 Denoisers = dict[str, Callable[[Tensor], Tensor] | None]
 
 
 def ridge_error(noisy: Tensor, clean: Tensor, speed_m_s: Tensor) -> float:
-    """Mean distance in m/s of the strongest local maximum of each frame to that of the clean map.
+    """Mean distance in m/s between the strongest local maxima of each frame in both maps.
 
-    Only over frames in which the clean one is within 20 dB of the map's peak.
+    Only over frames in which that of the clean map is within 20 dB of the map's peak.
     """
     extract = RidgeExtractor(count=1)
     found, wanted = extract.peaks(noisy), extract.peaks(clean)
@@ -35,7 +35,7 @@ def ridge_error(noisy: Tensor, clean: Tensor, speed_m_s: Tensor) -> float:
 
 
 def scores(found: Tensor, clean: Tensor, speed_m_s: Tensor | None) -> list[float]:
-    """The figures of :data:`COLUMNS` of one map; speeds only of Doppler-time maps, else NaN."""
+    """The scores in :data:`COLUMNS` of one map; speed errors only for Doppler-time maps, else NaN."""
     figures = [float(psnr(found, clean, scale)) for scale in ("linear", "db")]
     if speed_m_s is None:
         return [*figures, float("nan"), float("nan")]
@@ -53,16 +53,16 @@ def scores_of_clip(
     columns: int = COLUMNS_AT_MOST,
     guesses: bool = False,
 ) -> dict[str, dict[str, list[float]]]:
-    """Figures by map and denoiser of one clip with a person in it, against the same echo at 50 dB.
+    """Scores by map and denoiser for one clip with a person in it, against the same echo at 50 dB.
 
     Args:
-        denoisers: by name.
+        denoisers: denoisers by name.
         scene: name of a radar preset.
         ratio: signal-to-noise ratio in dB.
-        clip: number; the activities from S2 on in turn.
-        seed: of people, motion and noise.
-        columns: of each map at most, from its middle.
-        guesses: also of an empty map and of the clean map of another person of the same activity.
+        clip: number of the clip; clips cycle through the activities from S2.
+        seed: seed of people, motion and noise.
+        columns: most columns of each map, from its middle.
+        guesses: also score an empty map, and the clean map of another person with the same activity.
     """
     people = len(ACTIVITIES) - 1
     activity = 1 + clip % people
@@ -92,7 +92,7 @@ def compare(
     seed: int,
     quiet: bool = False,
 ) -> dict[Key, list[float]]:
-    """Mean figures by scene, map, ratio and denoiser, on clips with a person in them."""
+    """Mean scores by scene, map, ratio and denoiser, on clips with a person in them."""
     found: dict[Key, list[list[float]]] = {}
     jobs = [(scene, ratio, clip) for scene in scenes for ratio in ratios for clip in range(clips)]
     for scene, ratio, clip in tqdm(jobs, desc="maps", unit="clip", disable=quiet):

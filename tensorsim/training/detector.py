@@ -18,20 +18,20 @@ from tensorsim.training.pose_data import lean_deg
 from tensorsim.training.shards import Sample, Shards, find_shards, read_coco_shards
 from tensorsim.vision.detection.rtmdet import RTMDet
 
-#: Pictures without people that look as if there were some are shown this many times as often as others without.
+#: Pictures without people that look as if they had some are shown this many times as often as other empty ones.
 HARD = 3
-#: Heads stand out of the boxes of the street pictures by about this share of their height.
+#: In the street pictures, heads extend above the boxes by about this share of their height.
 PEDESTRIAN_HEAD = 0.18
-#: Sides of the pictures of a step, drawn anew for each, so often that all take about the same time.
+#: Picture sides, drawn anew for each step; the probabilities give each side about the same total time.
 SIDES = (224, 256, 320, 384, 416)
 #: Side at which the network is used.
 USED_SIDE = 320
-#: Overlap from which two boxes are one person: boxes of one are wider apart than those of a network trained for long.
+#: Overlap above which two boxes are one person: they lie farther apart than those of a network trained for longer.
 USED_IOU = 0.5
 
 
 class TrainedRTMDet(RTMDet):
-    """RTMDet whose ``forward`` is its network alone, as training needs it."""
+    """RTMDet whose ``forward`` is the bare network, for training."""
 
     def forward(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:  # type: ignore[override]
         """As :meth:`RTMDet.dense`."""
@@ -39,10 +39,10 @@ class TrainedRTMDet(RTMDet):
 
 
 def read_sources(data: Path) -> tuple[Sources, list[Sample]]:
-    """What to train on but for rendered people, and the held-out pictures, of a folder of shards.
+    """Training sources, except rendered people, and held-out pictures from a folder of shards.
 
     Raises:
-        TensorsimError: shards are missing, or held-out pictures with or without people.
+        TensorsimError: shards are missing, or there are no held-out pictures with people, or none without.
     """
     coco, held_out = read_coco_shards(data)
     held_out = [sample for sample in held_out if sample.all_labelled]
@@ -77,13 +77,13 @@ class DetectorRecipe(Recipe):
 
     Args:
         net: the network.
-        sources: what to train on.
-        held_out: what to measure on.
-        seed: of the pictures.
-        learning_rate: highest learning rate.
+        sources: pictures to train on.
+        held_out: pictures to validate on.
+        seed: seed of the pictures.
+        learning_rate: peak learning rate.
         warm_up: steps until it is reached.
-        teacher: a better detector, whose answers in every cell are learnt besides the labels; None learns from labels
-            alone.
+        teacher: a better detector whose outputs in every cell are learnt in addition to the labels; None learns from
+            labels only.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class DetectorRecipe(Recipe):
         """A picture: image (3, s, s) uint8 RGB, boxes (n, 4), known (m, m)."""
         import cv2
 
-        cv2.setNumThreads(0)  # the processes of the loader are the parallel ones
+        cv2.setNumThreads(0)  # the loader's processes already run in parallel
         picture = self.maker(np.random.default_rng([self.seed, index]))
         return {
             "index": index,
@@ -125,7 +125,7 @@ class DetectorRecipe(Recipe):
         }
 
     def collate(self, samples: list[dict[str, Any]]) -> Batch:
-        """Pictures of one side: image (B, 3, s, s) in [0, 255], boxes (B, G, 4), valid (B, G), known (B, m, m)."""
+        """Pictures of the same side: image (B, 3, s, s) in [0, 255], boxes (B, G, 4), valid (B, G), known (B, m, m)."""
         most = max(len(sample["boxes"]) for sample in samples)
         boxes = torch.zeros(len(samples), most, 4)
         valid = torch.zeros(len(samples), most, dtype=torch.bool)
@@ -149,7 +149,7 @@ class DetectorRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Quality focal loss and twice the GIoU loss, and what the teacher's answers differ by."""
+        """Quality focal loss and twice the GIoU loss, plus the distillation loss if there is a teacher."""
         x = ((batch["image"] - self.detector.mean) / self.detector.std).flip(1)
         x = x.contiguous(memory_format=torch.channels_last)
         logits, distances = net(x)
@@ -171,7 +171,7 @@ class DetectorRecipe(Recipe):
         return torch.optim.AdamW(decay_groups(self.net, 0.05), lr=self.learning_rate)
 
     def rate(self, step: int, steps: int) -> float:
-        """Linear warm-up, flat to the half, then a cosine to one in twenty."""
+        """Linear warm-up, constant until half of the steps, then a cosine down to a twentieth."""
         warm = min(1.0, (step + 1) / self.warm_up)
         late = max(0.0, 2 * step / steps - 1)
         return warm * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * late)))

@@ -1,7 +1,7 @@
-"""Square pictures with people in them to train a detector on: real ones, mosaics of them, and people pasted.
+"""Square pictures with people to train a detector on: real ones, mosaics of them, and pasted people.
 
 Boxes are ``xyxy`` pixels with (0, 0) at the outer corner of the first pixel. Where a source does not label
-everybody, only the surroundings of its boxes count as known: beyond, nobody can say that there is no one.
+everybody, only the surroundings of its boxes count as known: elsewhere there may be unlabelled people.
 """
 
 import functools
@@ -18,11 +18,11 @@ from tensorsim.training.detector_people import outline
 from tensorsim.training.shards import Floats, Sample
 from tensorsim.training.views import random_turn
 
-#: Of people who are pasted one after the other, this share stands beside or in front of the one before.
+#: Probability that a pasted person stands beside or in front of the one pasted before.
 TOGETHER = 0.5
-#: With every person who is pasted, a piece of something else is, with this probability.
+#: Probability that a piece of something else is pasted along with a person.
 DISTRACTED = 0.5
-#: How often a picture is of which kind.
+#: Shares of the kinds of pictures.
 SHARES = {"complete": 0.55, "films": 0.12, "partial": 0.13, "pasted": 0.08, "empty": 0.12}
 
 
@@ -32,7 +32,7 @@ class Labelled(NamedTuple):
     Attributes:
         image: (s, s, 3) uint8 RGB.
         boxes: (n, 4) float32 ``xyxy`` pixels.
-        known: (KNOWN_CELLS, KNOWN_CELLS) bool, where the absence of people is known.
+        known: (KNOWN_CELLS, KNOWN_CELLS) bool, where the absence of unlabelled people is known.
     """
 
     image: Picture
@@ -42,17 +42,17 @@ class Labelled(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """What pictures are made of.
+    """What pictures are made from.
 
     Attributes:
         complete: pictures with people, all labelled.
         empty: pictures without people.
-        partial: lists of pictures where only some people are labelled, each list as likely as the next.
-        films: frames of films with people, all labelled; none is fine.
-        cutouts: rendered people, who are pasted; none is fine.
-        outlined: pictures whose first person is cut out of them, as often as a rendered one is taken; none is fine.
-        shares: how often a picture, or a part of a mosaic, is of which kind, in relation to each other; in pasted
-            ones, cut-outs are put on pictures without people. Kinds without pictures are left out.
+        partial: lists of pictures in which only some people are labelled; all lists are equally likely.
+        films: frames of films with people, all labelled; may be empty.
+        cutouts: rendered people for pasting; may be empty.
+        outlined: pictures whose first person is cut out and pasted in place of some rendered ones; may be empty.
+        shares: relative frequencies of the kinds of a picture, or part of a mosaic; in pasted ones, cut-outs are put
+            on pictures without people. Kinds without pictures are left out.
     """
 
     complete: Sequence[Sample]
@@ -64,7 +64,7 @@ class Sources:
     shares: Mapping[str, float] = field(default_factory=lambda: SHARES)
 
     def kinds(self) -> tuple[list[str], Floats]:
-        """The kinds that there are pictures of, and their probabilities."""
+        """The kinds that have pictures, and their probabilities."""
         kinds = [
             kind for kind in self.shares if len(self.cutouts if kind == "pasted" else getattr(self, kind))
         ]
@@ -76,14 +76,14 @@ _outlined = functools.lru_cache(maxsize=4096)(outline)
 
 
 class PictureMaker:
-    """Makes labelled pictures, each from random numbers of its own.
+    """Makes labelled pictures, each from its own random numbers.
 
     Args:
-        sources: what they are made of.
+        sources: what they are made from.
         size: side of the pictures in pixels.
-        mosaic: probability that a picture is made of four.
-        film: probability that one that is not is wider than high, with grey below it, as films come to the detector.
-        turned: probability that a picture is as a turned camera would have taken it (:func:`random_turn`).
+        mosaic: probability that a picture is a mosaic of four.
+        film: probability that any other picture is in landscape format with grey below it, as films reach the detector.
+        turned: probability that a picture looks as if taken by a rotated camera (:func:`random_turn`).
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class PictureMaker:
         canvas.place(sample, rect, rng, turn)
 
     def _person(self, rng: np.random.Generator) -> Picture:
-        """Somebody cut out of a photograph, or rendered."""
+        """A person cut out of a photograph, or rendered."""
         if len(self.sources.outlined) and rng.random() < 0.3:
             person = _outlined(_one_of(self.sources.outlined, rng))
             if person is not None:
@@ -154,7 +154,7 @@ def _restyled(rgba: Picture, rng: np.random.Generator) -> Picture:
 
     mix = np.eye(3) * rng.uniform(0.5, 1.2) + rng.uniform(-0.2, 0.25, (3, 3))
     colour = cv2.transform(rgba[..., :3], mix)
-    # Coarse shade over the body, as from windows and trees.
+    # Coarse shading over the body, as from windows and trees.
     coarse = rng.uniform(0.6, 1.3, (4, 3)).astype(np.float32)
     shade = cv2.resize(coarse, (rgba.shape[1], rgba.shape[0]), interpolation=cv2.INTER_LINEAR)
     colour = np.clip(colour * shade[..., None], 0, 255).astype(np.uint8)

@@ -28,13 +28,13 @@ HALF_PRECISION = 0.01
 def measure(
     detector: RTMDet | AcfDetector, samples: Sequence[Sample], score: float = 0.5
 ) -> dict[str, float]:
-    """Figures of a detector on pictures in which everybody is labelled or in a crowd that is.
+    """Scores of a detector on pictures in which everybody is labelled, alone or as part of a labelled crowd.
 
-    Detections that lie in a crowd, by at least the overlap in question, count neither way.
+    Detections that lie in a crowd, by at least the overlap in question, are ignored.
 
     Returns:
-        ``ap`` and ``ap50`` as COCO defines them (averaged over overlaps from 0.5 to 0.95, and at 0.5), and with
-        detections of more than ``score``: ``recall`` and ``recall_large`` (share of the people, and of those
+        ``ap`` and ``ap50`` as defined by COCO (averaged over overlaps from 0.5 to 0.95, and at 0.5), and for
+        detections scored above ``score``: ``recall`` and ``recall_large`` (share of the people, and of those
         taller than a fifth of their picture, that one detection overlaps by at least 0.5),
         ``false_per_picture`` (detections that overlap nobody by 0.5) and ``alarms_per_picture`` (detections per
         picture without people or crowds; NaN if there is none).
@@ -86,7 +86,7 @@ def average_precision(
     Args:
         truths: per picture (n, 4) ``xyxy``.
         found: per picture (m, 5) ``xyxy`` and score.
-        crowds: per picture (k, 4) ``xyxy``; what is found in them does not count.
+        crowds: per picture (k, 4) ``xyxy``; detections in them are ignored.
     """
     try:
         from pycocotools.coco import COCO
@@ -133,7 +133,7 @@ def average_precision(
 
 
 def people_in(detector: RTMDet | AcfDetector, image: npt.NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
-    """Boxes (n, 4) and scores (n,) of the people that a detector finds in a picture (H, W, 3) RGB, on the CPU."""
+    """Boxes (n, 4) and scores (n,) of people found by a detector in a picture (H, W, 3) RGB, on the CPU."""
     picture = torch.from_numpy(image).permute(2, 0, 1)[None]
     with torch.no_grad():
         seen: Detections = detector(picture.to(next(detector.buffers()).device))
@@ -144,16 +144,16 @@ def people_in(detector: RTMDet | AcfDetector, image: npt.NDArray[np.uint8]) -> t
 def calibrate(
     detector: RTMDet, samples: Sequence[Sample], alarms_per_picture: float = 0.1, quiet: bool = False
 ) -> float:
-    """Shift the scores of a one-class detector so that one of 0.5 means the same as in others.
+    """Shift the scores of a one-class detector so that a score of 0.5 means the same as for other detectors.
 
-    A network that is not trained to the end doubts what it rightly finds. A constant is added to its logits, in
-    place, with which it makes this many detections above a score of 0.5 per picture that shows nobody. Only
-    these pictures count: a box that is badly placed on a person is an error, but follows no one who is not there.
-    The order of detections, and with it average precision, stays.
+    A network that is not fully trained gives low scores even to correct detections. A constant is added to its logits,
+    in place, so that it makes this many detections above a score of 0.5 per picture without people. Only these
+    pictures count: a badly placed box on a person is an error, but does not invent a person. The order of
+    detections, and so average precision, is unchanged.
 
     Args:
         detector: the detector, changed in place.
-        samples: pictures that it has not learnt from; those with people are passed over.
+        samples: pictures that it was not trained on; those with people are skipped.
         alarms_per_picture: detections per picture without people.
         quiet: no progress bar.
 
@@ -182,12 +182,12 @@ def calibrate(
 
 
 def _matches(boxes: Tensor, truth: Tensor) -> Tensor:
-    """(n, m) bool, which detections overlap which people by at least one half."""
+    """(n, m) bool: which detections overlap which people by at least one half."""
     return box_iou(boxes[:, None], truth[None]) >= 0.5
 
 
 def _in_crowd(boxes: Tensor, crowds: Tensor) -> Tensor:
-    """(n,) bool, which detections (n, 4) lie by at least one half in one of the crowds (m, 4)."""
+    """(n,) bool: which detections (n, 4) lie at least half inside one of the crowds (m, 4)."""
     low = torch.maximum(boxes[:, None, :2], crowds[None, :, :2])
     high = torch.minimum(boxes[:, None, 2:], crowds[None, :, 2:])
     shared = (high - low).clamp_min(0).prod(-1)
@@ -199,7 +199,7 @@ class Followed(NamedTuple):
 
     Attributes:
         frames: person-frames of the detector's tracks.
-        reference_frames: those of the reference's.
+        reference_frames: person-frames of the reference's tracks.
         shared: the reference's person-frames that a track of the detector overlaps by at least one half.
     """
 
@@ -224,7 +224,7 @@ def tracks_of_film(detector: RTMDet | AcfDetector, path: str | os.PathLike[str],
             observed[-1] = True
     whole = Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
     mask = torch.tensor(observed, device=device)
-    # The detections of the last observed frame fill those between: there they do not count.
+    # Detections of the last observed frame fill the frames between, where they do not count.
     place = mask.cumsum(0) - 1
     spread = Detections(*(part[place].unsqueeze(0) for part in whole))
     return GNNTracker()(spread, mask)

@@ -1,4 +1,4 @@
-"""People cut out of photographs along their outlines, told from the ground by colour around the labelled joints."""
+"""People cut out of photographs along their outlines, separated from the background by colour around their joints."""
 
 import numpy as np
 import numpy.typing as npt
@@ -7,7 +7,7 @@ from tensorsim.training.shards import POINTS, Floats, Sample
 
 Picture = npt.NDArray[np.uint8]
 
-#: Bones, and how thick the body is around them in lengths of the trunk.
+#: Bones, and the thickness of the body around them relative to the length of the trunk.
 BONES = (
     ("left_shoulder", "left_hip", 0.32), ("right_shoulder", "right_hip", 0.32), ("left_shoulder", "right_hip", 0.32),
     ("right_shoulder", "left_hip", 0.32), ("left_shoulder", "right_shoulder", 0.32), ("left_hip", "right_hip", 0.32),
@@ -17,9 +17,9 @@ BONES = (
     ("left_shoulder", "left_elbow", 0.14), ("left_elbow", "left_wrist", 0.14),
     ("right_shoulder", "right_elbow", 0.14), ("right_elbow", "right_wrist", 0.14),
 )  # fmt: skip
-#: Around the bones, in these thicknesses: what is surely the body, what is likely it, and beyond what nothing is.
+#: Distances around the bones in these thicknesses: surely body, probably body, and the limit beyond which nothing is.
 SURELY, LIKELY, AT_MOST = 0.35, 1.0, 2.6
-#: The outline failed if less than this share of the likely body is inside, or more of what is around it.
+#: The outline failed if less than the first share of the probable body is inside, or more than the second around it.
 LEAST_INSIDE, MOST_AROUND = 0.7, 0.4
 
 
@@ -32,11 +32,11 @@ def outline(sample: Sample, person: int = 0, side: int = 160) -> Picture | None:
         side: longest side of the region looked at, pixels of the result.
 
     Returns:
-        (h, w, 4) uint8 RGB and straight alpha, cropped to the person; None where joints are not labelled or the
-        colours of body and ground do not part.
+        (h, w, 4) uint8 RGB and straight alpha, cropped to the person; None where joints are not labelled or body and
+        background cannot be separated by colour.
 
     Reference:
-        Rother et al., "GrabCut", 2004, started from the skeleton in place of a rectangle.
+        Rother et al., "GrabCut", 2004, started from the skeleton instead of a rectangle.
     """
     import cv2
 
@@ -65,7 +65,7 @@ def outline(sample: Sample, person: int = 0, side: int = 160) -> Picture | None:
     ground, body = np.zeros((1, 65)), np.zeros((1, 65))  # the colours of both, fitted there
     cv2.grabCut(region, labels, (0, 0, 0, 0), ground, body, 3, cv2.GC_INIT_WITH_MASK)
     inside = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
-    # Pieces that hold no bone are ground of a like colour.
+    # Pieces without a bone are background of similar colour.
     pieces = cv2.connectedComponents(inside.astype(np.uint8))[1]
     inside &= np.isin(pieces, np.unique(pieces[surely]))
     if inside[likely].mean() < LEAST_INSIDE or inside[at_most & ~likely].mean() > MOST_AROUND:
@@ -77,7 +77,7 @@ def outline(sample: Sample, person: int = 0, side: int = 160) -> Picture | None:
 
 
 def _body(shape: tuple[int, ...], joints: Floats, thickness: float) -> npt.NDArray[np.bool_]:
-    """(h, w) what lies within the bones thickened ``thickness`` times."""
+    """(h, w) mask of the bones thickened ``thickness`` times."""
     import cv2
 
     at = {name: joints[POINTS.index(name)] for bone in BONES for name in bone[:2]}

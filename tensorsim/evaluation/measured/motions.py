@@ -93,7 +93,7 @@ def stage_people(
 
 
 def act_out(script: Script, time: Tensor, people: People) -> Tensor:
-    """Joints (N, K, 14, 3) of people who follow a script from the origin, heading as drawn, left-handed mirrored."""
+    """Joints (N, K, 14, 3) of people following a script from the origin, heading as drawn; the left-handed mirrored."""
     joints = perform(script, time, people)
     joints = torch.where(people.left_handed[:, None, None, None], mirror(joints), joints)
     return (rotation(2, people.heading_rad)[:, None, None] @ joints[..., None])[..., 0]
