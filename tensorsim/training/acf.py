@@ -79,12 +79,12 @@ def upright_boxes(sample: Sample) -> Floats:
 
 
 def crop(image: npt.NDArray[np.uint8], box: Floats, mirrored: bool) -> npt.NDArray[np.uint8]:
-    """A window with its margin, the person of a box 100 pixels high in its middle."""
+    """A window with its margin, with the person of a box scaled to 100 pixels in height and centred."""
     import cv2
 
     scale = PERSON_HEIGHT / float(box[3] - box[1])
     source: npt.NDArray[Any] = image
-    # Averages first: bilinear interpolation alone would alias.
+    # Area averages first: bilinear interpolation alone would alias.
     if scale < 0.5:
         source = cv2.resize(image, None, fx=2 * scale, fy=2 * scale, interpolation=cv2.INTER_AREA)
     now = source.shape[0] / image.shape[0]

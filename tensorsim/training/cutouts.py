@@ -136,7 +136,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     Half of them are in sampled poses, half in moments of everyday movements, such as picking up (see
     :func:`~tensorsim.training.pose_pool.everyday_poses`).
 
-    ``cutouts.json`` beside them tells number and seed. A folder of shards without one is taken as it is.
+    ``cutouts.json`` next to them states number and seed. A folder of shards without it is taken as it is.
 
     Args:
         count: number of people, at least 13.

@@ -36,7 +36,7 @@ NOISY_DB = (0.0, 40.0)
 #: Stored patches are a little larger than trained ones, which are cut from them at random.
 STORED, TRAINED = 64, 50
 _MOTION_HZ = 240.0
-#: Range-time maps hardly change from pulse to pulse; those of radars with high pulse rates are reduced to this rate.
+#: Range-time maps hardly change from pulse to pulse; at higher pulse rates, maps at about this rate are used as well.
 _DISPLAY_HZ = 256.0
 
 

@@ -21,7 +21,7 @@ from tensorsim.vision.detection.acf import AcfDetector
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.tracking.tracker import GNNTracker
 
-#: By which logits may rise when weights are stored in half precision.
+#: Largest rise of logits when weights are stored in half precision.
 HALF_PRECISION = 0.01
 
 

@@ -1,4 +1,4 @@
-"""The twelve activities as everyday people do them: any heading, place, moment and speed, from a list of variants."""
+"""The twelve activities as people do them in daily life: any heading, place, time and speed, in many variants."""
 
 import math
 from collections.abc import Callable
@@ -26,19 +26,19 @@ from tensorsim.motion.footwork import step_about
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.timing import bell, segment
 
-#: Bodies and manners: untrained people, in every heading.
+#: Bodies and ways of moving: untrained people, in all headings.
 PEOPLE = PeopleConfig(
     height_m=(1.5, 1.95), speed_m_s=(0.6, 1.7), heading_rad=math.pi, variation=0.18, tempo=(0.55, 1.05)
 )
-#: Where the middle of a path is: x to either side, and nearest and farthest y, in metres.
+#: Bounds of the middle of a path in metres: x to either side, and nearest and farthest y.
 SIDE_M, RANGE_M = 1.2, (2.2, 6.5)
-#: Shares of those who walk in curves, of those who walk round corners, and of those who go round and round.
+#: Shares of people who walk in curves, who walk round corners, and who walk round and round a room.
 _STROLLING, _CORNERING, _ROUND = 0.2, 0.15, 0.35
-#: Shortest and longest sides of the ways of those who go round and round, in metres.
+#: Shortest and longest length of both sides of the paths of people who walk round and round, in metres.
 _ROOM_M = ((0.8, 3.5), (0.5, 2.5))
-#: Slowest and fastest clock of falls: gravity does not let them go faster.
+#: Slowest and fastest clock of falls, whose speed is set by gravity.
 _FALLING = (0.8, 1.05)
-#: Steps per second of those who step about while they do something.
+#: Steps per second of people who step about while doing something else.
 _STEPS_HZ = 1.0
 
 
@@ -48,11 +48,11 @@ class Variant(NamedTuple):
     Attributes:
         script: what is done.
         first_s: time of the script at which the movement begins.
-        lasts_s: how long it takes; None for what goes on for as long as it is watched.
-        share: of the clips of its activity.
+        lasts_s: how long it takes; None for movements without end.
+        share: share of the clips of its activity.
         rate: lowest and highest speed of the script's clock.
-        steps: share of those who step about meanwhile.
-        lunges: share of those who step far forward into the first blow, at time 0 of the script.
+        steps: share of people who step about meanwhile.
+        lunges: share of people who step far forward into the first blow, at time 0 of the script.
     """
 
     script: Callable[[Tensor, People], Act]
@@ -64,7 +64,7 @@ class Variant(NamedTuple):
     lunges: float = 0.0
 
 
-#: Variants by index of the activity; nobody is there in the first.
+#: Variants by index of the activity; the first is the empty scene.
 VARIANTS: tuple[tuple[Variant, ...], ...] = (
     (),
     (
@@ -105,7 +105,7 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
 
 
 def _began(variant: Variant, duration_s: Tensor, rate: Tensor, draw: Draw) -> Tensor:
-    """Seconds (N, 1) after which a movement begins, such that nearly all of it lies in the clip."""
+    """Start times (N, 1) in s, such that nearly all of the movement lies in the clip."""
     if variant.lasts_s is None:
         return draw(-1.5, 0.6)
     spare = (duration_s - 0.9 * variant.lasts_s / rate).clamp(min=0.1)
@@ -113,7 +113,7 @@ def _began(variant: Variant, duration_s: Tensor, rate: Tensor, draw: Draw) -> Te
 
 
 def _stroll(time: Tensor, people: People, draw: Draw) -> Tensor:
-    """Joints (N, K, 14, 3) of people who walk in curves, some round and round, at a pace that changes."""
+    """Joints (N, K, 14, 3) of people who walk in curves, some in circles, at a varying pace."""
     knots = time.shape[1]
     band = torch.full((len(time), 1), 0.15, dtype=torch.float64)
     bent, unsteady = smooth_noise(draw, knots, KNOT_HZ, band, 2).unbind(-1)
@@ -137,7 +137,7 @@ def _with_turns(
     Args:
         time: (N, K) seconds.
         people: N people.
-        heading: (N, 1) at first, besides their own, in radians.
+        heading: (N, 1) initial heading relative to their own, in radians.
         start, lasts: (N, C) seconds.
         angle: (N, C) radians, counter-clockwise.
         slower: (N, C) share of the speed that is lost in the middle of a turn.
@@ -156,7 +156,7 @@ def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
     corners = 5
     start = torch.cumsum(draw(0.8, 3.0, corners), dim=1) - draw(0.0, 2.5)
     lasts = draw(0.4, 1.0, corners)
-    # Most go round one way.
+    # Most turn to the same side each time.
     side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0) * torch.where(
         draw(0.0, 1.0, corners) < 0.8, 1.0, -1.0
     )
@@ -165,7 +165,7 @@ def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
 
 
 def _round_and_round(time: Tensor, people: People, draw: Draw) -> Tensor:
-    """Joints (N, K, 14, 3) of people who walk round in a room, most along its walls, which the radar faces squarely."""
+    """Joints (N, K, 14, 3) of people who walk round a room, most along its walls, one of which the radar faces."""
     corners = 12
     side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0).double()
     turns_s = draw(0.4, 1.1)
@@ -180,7 +180,7 @@ def _round_and_round(time: Tensor, people: People, draw: Draw) -> Tensor:
 
 
 def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:
-    """Clocks (N, K) of which half run unevenly: the person now and then slows down or holds still."""
+    """Clocks (N, K), half of which run unevenly: the person slows down or pauses now and then."""
     band = draw(0.2, 0.5)
     uneven = smooth_noise(draw, clock.shape[1], KNOT_HZ, band, 1)[..., 0]
     pace = torch.where(draw(0.0, 1.0) < 0.5, (0.8 + 0.6 * uneven).clamp(0.0, 1.2), 1.0)
@@ -189,9 +189,9 @@ def _with_pauses(clock: Tensor, draw: Draw) -> Tensor:
 
 
 def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, draw: Draw) -> Tensor:
-    """Joints (N, K, 14, 3) at ``KNOT_HZ`` about the origin, turned to the people's headings."""
+    """Joints (N, K, 14, 3) at ``KNOT_HZ`` near the origin, turned to the people's headings."""
     if variant.script is scripts.walk:
-        # Half of those who keep a straight line go on, half turn round within some metres.
+        # Half of those who walk in a straight line keep going, half turn round within a few metres.
         long = torch.where(draw(0.0, 1.0) < 0.5, 20.0, draw(1.5, 4.5))
         first = torch.where(long > 10, 0.0 * long, draw(0.0, 1.0) * long)
         straight = to_and_fro(variant.script, time, people, draw, long, draw(0.7, 1.6), first)
@@ -229,13 +229,13 @@ def _acted(variant: Variant, time: Tensor, duration_s: Tensor, people: People, d
 def everyday_motion(
     activity: int, count: int, duration_s: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """People who do an activity in ways, headings, places and at moments of their own.
+    """People who do an activity, each with their own variant, heading, place and time.
 
     Args:
-        activity: index of ``tensorsim.ACTIVITIES``, of one in which somebody is there.
+        activity: index into ``tensorsim.ACTIVITIES``, except the empty scene.
         count: N people.
         duration_s: (N,) length of each clip.
-        generator: of everything random.
+        generator: random generator of everything.
 
     Returns:
         Joints (N, K, 14, 3) m at ``KNOT_HZ`` for the longest clip, z up from the floor, and heights (N,) m.
@@ -261,7 +261,7 @@ def everyday_motion(
     hips = joints[:, :, (8, 11), :2].mean(2)
     middle = (hips.amin(1) + hips.amax(1)) / 2
     spot = torch.cat([draw(-SIDE_M, SIDE_M), draw(*RANGE_M)], 1)
-    # Nobody comes nearer than 1.2 m.
+    # Nobody comes closer than 1.2 m.
     nearest = (hips[..., 1] - middle[:, None, 1] + spot[:, None, 1]).amin(1)
     spot[:, 1] += (1.2 - nearest).clamp(min=0.0)
     shift = torch.nn.functional.pad(spot - middle, (0, 1))
@@ -275,7 +275,7 @@ def at_rate(joints: Tensor, frames: int, rate_hz: float) -> Tensor:
 
 
 def bystander(duration_s: float, generator: torch.Generator) -> Tensor:
-    """Somebody who stands or sits at the side and hardly moves: joints (K, 14, 3) m at ``KNOT_HZ``."""
+    """A bystander who stands or sits and hardly moves: joints (K, 14, 3) m at ``KNOT_HZ``."""
     draw = Draw(1, generator)
     people = draw_people(1, PEOPLE, generator)
     knots = round(duration_s * KNOT_HZ) + 8

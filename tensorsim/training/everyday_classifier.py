@@ -22,44 +22,44 @@ from tensorsim.training.maps import SCENES
 from tensorsim.training.order import shuffled
 from tensorsim.weights import load_state_dict, load_strict, save_weights
 
-#: Level of the noise that is added, in dB against the peak of the picture.
+#: Level of the added noise, in dB relative to the peak of the picture.
 NOISE_DB = (-70.0, -8.0)
-#: Largest part of a clip that is cut off at each end, and of rows and columns that are masked.
+#: Largest part of a clip that is cut off at each end, and of the rows and columns that are masked.
 CUT, MASKED = 0.08, 0.12
-#: Share of the pictures that are folded, and of the walks in which somebody comes or leaves.
+#: Share of the pictures that are folded, and of the walks in which the person arrives late or leaves early.
 FOLDED, PASSING = 0.2, 0.4
 WALKING = ACTIVITIES.index("S8 Walking")
-#: Activities by index and what they are backwards in time; getting up and falling are not each other's reverse.
+#: Activities by index, and the activity that each becomes when reversed in time; some have no reverse.
 REVERSED = {0: 0, 1: 1, 2: 2, 3: 3, 4: 5, 5: 4, 6: 6, 7: 7, 8: 9, 9: 8}
-#: The label has this much less than all of the probability, spread over all classes.
+#: Label smoothing: this much of the probability is spread over all classes.
 SMOOTHING = 0.05
 
 
 def folded(power: Tensor) -> Tensor:
-    """A power picture (H, W) with both signs of speed in one, as a radar of one channel without range has it."""
+    """A power picture (H, W) with both signs of speed added, as from a single-channel radar without range."""
     both = power + power.flip(0)
     return both / both.max().clamp(min=1e-30)
 
 
 def passing(power: Tensor, late: float, early: float) -> Tensor:
-    """A power picture (H, W) of somebody who comes after a share of the time and leaves before the end; peak 1."""
+    """A power picture (H, W) of a person present only between shares of the time from both ends; peak 1."""
     time = (torch.arange(power.shape[1]) + 0.5) / power.shape[1]
     seen = power * ((time >= late) & (time <= 1 - early))
     return seen / seen.max().clamp(min=1e-30)
 
 
 def augmented(power: Tensor, activity: int, noise: Tensor, generator: torch.Generator) -> tuple[Tensor, int]:
-    """A power picture (H, W) as another clip could have it, and the activity of that clip.
+    """A power picture (H, W) changed to look like another clip, and the activity of that clip.
 
-    Approach and retreat change places in half of the cases (every activity is done in every heading), some pictures
-    are folded, some who walk come late or leave early (which is not a fall), time runs backwards in half of those of
+    Approach and retreat are swapped in half of the cases (every activity is done in every heading), some pictures
+    are folded, some walkers arrive late or leave early (which is not a fall), time runs backwards in half of those in
     :data:`REVERSED`, the ends are cut a little, and noise is added.
 
     Args:
         power: (H, W) with a peak of 1.
         activity: its index.
         noise: (H,) expected power of noise in the rows, with a peak of 1.
-        generator: of everything random.
+        generator: random generator of everything.
     """
     flip, back, first, last, level, fold, passes, late, early = torch.rand(9, generator=generator).tolist()
     if flip < 0.5:
@@ -67,7 +67,7 @@ def augmented(power: Tensor, activity: int, noise: Tensor, generator: torch.Gene
     if fold < FOLDED:
         power = folded(power)
     if activity == WALKING and passes < PASSING:
-        # Half of them are there from the start, and half to the end.
+        # Half of them are present from the start, and half until the end.
         power = passing(power, max(0.0, 0.9 * late - 0.45), max(0.0, 0.9 * early - 0.45))
     if back < 0.5 and activity in REVERSED:
         power, activity = power.flip(1), REVERSED[activity]
@@ -99,11 +99,11 @@ class EverydayRecipe(Recipe):
     Args:
         network: a name of :data:`tensorsim.recognition.networks.CLASSIFIERS`.
         store: pictures; every fifth group is held out.
-        size: height and width of the pictures, a divisor of the store's; None takes what the network's authors take,
-            at most the store's.
-        seed: of weights, order and augmentation.
+        size: height and width of the pictures, a divisor of the store's; None takes the size used by the network's
+            authors, at most the store's.
+        seed: seed of weights, order and augmentation.
         init: weights to start from.
-        learning_rate: the highest.
+        learning_rate: peak learning rate.
 
     Raises:
         TensorsimError: an unknown network, a size that does not divide the store's, or a store without groups for
@@ -184,7 +184,7 @@ class EverydayRecipe(Recipe):
         return {"picture": masked(batch["picture"], generator), "label": batch["label"]}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Cross-entropy with smooth labels, and accuracy."""
+        """Cross-entropy with smoothed labels, and accuracy."""
         logits = net(batch["picture"]).float()
         accuracy = (logits.argmax(-1) == batch["label"]).float().mean()
         return {
@@ -197,15 +197,15 @@ class EverydayRecipe(Recipe):
         return torch.optim.AdamW(decay_groups(self.net, 0.02), lr=self.settings["learning_rate"])
 
     def rate(self, step: int, steps: int) -> float:
-        """A short rise, then half a cosine down to a hundredth."""
+        """A short warm-up, then half a cosine down to a hundredth."""
         rise = min(1.0, (step + 1) / (0.03 * steps + 1))
         return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
     @torch.no_grad()
     def judged(self, net: nn.Module, fold: bool = False) -> tuple[Tensor, Tensor]:
-        """Logits (N, classes) and labels (N,) of the held-out clips, perhaps folded, clip by clip in both scenes.
+        """Logits (N, classes) and labels (N,) of the held-out clips, optionally folded, clip by clip in both scenes.
 
-        Logits are the mean over both ways round, as :class:`~tensorsim.recognition.ActivityRecognizer` takes it.
+        Logits are averaged over both Doppler directions, as :class:`~tensorsim.recognition.ActivityRecognizer` does.
         """
         powers = [self.store.picture(clip, scene) for clip, scene in self.validation.tolist()]
         pictures = torch.stack([self._input(folded(power) if fold else power) for power in powers])
@@ -215,7 +215,7 @@ class EverydayRecipe(Recipe):
         return torch.cat(logits), self.store.activity[self.validation[:, 0]]
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Accuracy of filmed, true and folded true motion in each scene, the loss, and its negative as the score."""
+        """Accuracy on filmed, true and folded true motion in each scene; the loss; its negative as the score."""
         logits, labels = self.judged(net)
         right = (logits.argmax(-1) == labels).float()
         right_folded = (self.judged(net, fold=True)[0].argmax(-1) == labels).float()
@@ -232,16 +232,16 @@ class EverydayRecipe(Recipe):
 
 
 def load_between(net: nn.Module, first: Path, trained: Path, share: float) -> None:
-    """Give a network the weights on the straight line from those that training began with to the trained ones.
+    """Give a network weights interpolated linearly between those before and after a training.
 
-    A network that is trained further on other data forgets some of the first; the mean of the weights before and after
+    A network trained further on other data forgets some of the first data; the mean of the weights before and after
     keeps most of both (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
 
     Args:
         net: the network.
         first: weights at the start.
         trained: weights at the end.
-        share: of the way, 0 to 1.
+        share: fraction of the way from first to trained, 0 to 1.
 
     Raises:
         TensorsimError: a share outside of 0 to 1, or weights of another network.
@@ -257,10 +257,10 @@ def load_between(net: nn.Module, first: Path, trained: Path, share: float) -> No
 
 
 def save_calibrated(recipe: EverydayRecipe, path: Path) -> tuple[float, float]:
-    """Write the recipe's network with the temperature that fits the held-out films.
+    """Write the recipe's network with a softmax temperature fitted to the held-out films.
 
     Returns:
-        The temperature, and the expected calibration error of these films with it.
+        The temperature, and the expected calibration error on these films with it.
     """
     logits, labels = recipe.judged(recipe.net.eval())
     chosen = recipe.store.filmed[recipe.validation[:, 0]]

@@ -1,7 +1,7 @@
 """A store of Doppler-time pictures of everyday motion, true and as the pipeline finds it in films, for both presets.
 
-Free space comes from :class:`~tensorsim.training.expected_map.ExpectedMap`, the wall from the range bins in closed
-form, each with one of three bodies, and with sway and vital signs in half of the clips. Noise is added in training.
+Free space uses :class:`~tensorsim.training.expected_map.ExpectedMap`, the wall the range bins in closed form, each
+with one of three body models, and with sway and vital signs in half of the clips. Noise is added in training.
 """
 
 from collections.abc import Sequence
@@ -36,17 +36,17 @@ from tensorsim.training.expected_map import ExpectedMap, noise_rows
 from tensorsim.training.key_point_errors import FilmedMotion
 from tensorsim.training.maps import SCENES, from_bytes, to_bytes
 
-#: Frame rates of films; true motion is sampled at the last one.
+#: Frame rates of films, and the rate at which true motion is sampled.
 _FILM_HZ, _TRUE_HZ = (15.0, 18.0, 20.0, 25.0), 60.0
 #: Rate at which scatterers are sampled for the expected picture.
 _EXPECTED_HZ = 256.0
-#: Range bins farther away are left out: nobody is there.
+#: Range bins farther away are left out, as nobody is there.
 _FARTHEST_M = 12.0
-#: Bodies with the share of each.
+#: Body models and the share of each.
 BODIES = {"joints": 0.35, "limbs": 0.15, "surface": 0.5}
-#: Share of films with a second person, who stands or sits.
+#: Share of films with a second person, who stands or sits still.
 _COMPANY = 0.22
-#: Share of clips of an activity done towards the radar, at the moments of a clip of 4 s, as in generated data sets.
+#: Share of clips with an activity done towards the radar with the timing of a 4 s clip, as in generated data sets.
 _REHEARSED = 0.25
 
 
@@ -55,11 +55,11 @@ class EverydaySettings:
     """Contents of a store.
 
     Attributes:
-        seed: of everything random; group k of a seed is always the same.
+        seed: seed of everything random; group k of a seed is always the same.
         size: height and width of the pictures.
-        speed_m_s: radial speeds that they show, either way.
+        speed_m_s: largest radial speed shown, in either direction.
         filmed: clips per activity and group as the pipeline finds them in films.
-        true: clips per activity and group of the motion itself.
+        true: clips per activity and group of the true motion.
 
     Raises:
         TensorsimError: a size or speed that is not positive, or no clips.
@@ -77,7 +77,7 @@ class EverydaySettings:
 
     @classmethod
     def read(cls, folder: Path) -> "EverydaySettings":
-        """Those of the store in a folder.
+        """The settings of the store in a folder.
 
         Raises:
             TensorsimError: no store there, or one of another kind.
@@ -99,7 +99,7 @@ class EverydaySettings:
 
 
 class Watched(NamedTuple):
-    """A clip before the radar.
+    """A clip in front of the radar.
 
     Attributes:
         joints: (P, T, 14, 3) m.
@@ -116,7 +116,7 @@ class Radars:
     """Pictures of clips in both scenes.
 
     Args:
-        size, speed_m_s: of the pictures.
+        size, speed_m_s: see :class:`EverydaySettings`.
     """
 
     def __init__(self, size: int, speed_m_s: float) -> None:
@@ -152,7 +152,7 @@ class Radars:
             clip: people.
             body: a name of :data:`BODIES`.
             alive: whether they sway, breathe and have a heartbeat.
-            seed: of these.
+            seed: seed of these.
         """
         scenes = []
         for resampler, bodies in zip(self.resamplers, self.bodies, strict=True):
@@ -185,7 +185,7 @@ class ClipMaker:
         self.generator = ActivityGenerator()
 
     def __call__(self, activity: int, count: int, filmed: bool, generator: torch.Generator) -> list[Watched]:
-        """``count`` clips of one length, before one camera; fewer where somebody was never found."""
+        """``count`` clips of the same length in front of one camera; fewer if a person was never found."""
         draw = Draw(1, generator)
         rehearsed = bool(draw(0.0, 1.0) < _REHEARSED)
         length_s = 4.0 if rehearsed or bool(draw(0.0, 1.0) < 0.7) else float(draw(2.4, 4.9))
@@ -234,7 +234,7 @@ def make_group(index: int, settings: EverydaySettings, maker: ClipMaker, radars:
                     body = list(BODIES)[int(torch.multinomial(shares, 1, generator=generator))]
                     seed = int(one(0.0, 2.0**20))
                     seen = radars(clip, body, bool(one(0.0, 1.0) < 0.5), seed)
-                    # Somebody beyond the range axis of a radar teaches nothing.
+                    # A person beyond the range axis of a radar is of no use for training.
                     if bool((seen.flatten(1).amax(-1) > 0).all()):
                         pictures.append(seen)
             labels += [activity] * (len(pictures) - len(labels))
@@ -273,10 +273,10 @@ class EverydayStore:
 
     Args:
         folder: made by :func:`build_everyday`.
-        groups: their indices; None takes all that are there.
+        groups: indices of the groups; None takes all existing ones.
 
     Attributes:
-        settings: what it holds.
+        settings: settings of the store.
         power: (N, 2, size, size) uint8, see :func:`tensorsim.training.maps.to_bytes`; free space first.
         activity: (N,) int64.
         filmed: (N,) bool.

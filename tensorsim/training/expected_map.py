@@ -1,11 +1,11 @@
 """The expected Doppler-time picture of scatterers whose echoes add with random phases, without synthesis of pulses.
 
-Where range bins are centimetres, the scatterers of a body are in bins of their own, and the powers of their spectra
-add. The spectrum of a scatterer over a short window is that of the window, shifted to its Doppler frequency, as far as
+With range bins of centimetres, the scatterers of a body are in different bins, and the powers of their spectra add.
+The spectrum of a scatterer over a short window is that of the window shifted to its Doppler frequency, provided that
 its speed changes little within it. So the power of a pixel is a histogram of radial speeds, weighted with received
 power and the gain of the moving target indicator, smoothed by the window in time and by its spectrum in Doppler
 (V. C. Chen, *The Micro-Doppler Effect in Radar*, 2011, chapter 2, for the kinematics). A clip of four seconds takes
-milliseconds where a synthesis of 32768 pulses takes most of a second.
+milliseconds, whereas a synthesis of 32768 pulses takes most of a second.
 """
 
 import math
@@ -18,7 +18,7 @@ from tensorsim.errors import TensorsimError, check_points
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.recognition.map_image import MapToImage, area_weights
 
-#: Doppler bins to each side over which the spectrum of the window is spread.
+#: Doppler bins on each side over which the spectrum of the window is spread.
 _REACH = 8
 
 
@@ -37,13 +37,13 @@ def noise_rows(radar: RadarConfig, image: MapToImage) -> Tensor:
 
 
 class ExpectedMap:
-    """Pictures of scatterers, for a radar in free space with one antenna of each kind and the two-pulse MTI.
+    """Pictures of scatterers, for a radar in free space with one transmitter, one receiver and the two-pulse MTI.
 
     Args:
         radar: the radar.
-        rate_hz: at which the scatterers are sampled.
+        rate_hz: sampling rate of the scatterers.
         size: height and width of the pictures.
-        speed_m_s: radial speeds that they show, either way.
+        speed_m_s: largest radial speed shown, in either direction.
 
     Raises:
         TensorsimError: a radar with several antennas.
@@ -84,7 +84,7 @@ class ExpectedMap:
         Args:
             points: (M, S, 3) m.
             rcs: (M, S) m^2.
-            snr_db: of an IF sample, the mean power of the echo against that of the noise; None is free of noise.
+            snr_db: mean power of the echo relative to that of the noise in an IF sample; None is free of noise.
 
         Raises:
             TensorsimError: another shape, or fewer instants than a window of the Doppler-time map has.
@@ -105,7 +105,7 @@ class ExpectedMap:
         spread = self._columns(len(points)) @ histogram  # (size, bins)
         ring = torch.nn.functional.pad(spread[:, None], (_REACH, _REACH), mode="circular")
         smooth = torch.nn.functional.conv1d(ring, self.kernel[None, None])[:, 0]
-        # Of all Doppler bins, a target's power is in a few: per bin it is this many times the mean.
+        # A target's power is in few of all the Doppler bins: per bin it is this many times the mean.
         picture = self.image.rows(self.bins) @ (smooth * self.mti_gain * self.bins).T
         if snr_db is not None:
             picture = picture + (echo * 10 ** (-snr_db / 10) * self.noise_rows)[:, None]

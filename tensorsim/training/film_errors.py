@@ -1,10 +1,10 @@
-"""Errors of pose networks on films, transferred to other motion from the most similar moments.
+"""Errors of pose networks on films, transferred to other motion from the most similar segments.
 
 Errors of networks are not random: an arm in front of the body has the same wrong position for as long as it is there,
 a left leg is mistaken for the right one from some directions, and clothes cause errors throughout a film. The errors
-are therefore copied and not modelled. Films whose true motion is known are stored with the networks' results; another
-motion gets, segment by segment, the errors of similar segments. They are chosen by dynamic programming (Viterbi, 1967)
-over the dissimilarity and a penalty for changing to another film.
+are therefore copied, not modelled. Films with known true motion are stored with the networks' results; another motion
+gets, segment by segment, the errors of similar segments, chosen by dynamic programming (Viterbi, 1967) over the
+dissimilarity and a penalty for changing to another film.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ _EVERY = 2
 #: Dissimilarity, in body heights, of a key point outside the picture to one inside, and the penalty for changing to
 #: another film.
 _EDGE, _LEAVE = 0.15, 0.15
-#: Share of the films that a motion takes errors from, drawn anew for each motion, so that results vary.
+#: Share of the films from which a motion takes errors, drawn anew for each motion, so that results vary.
 _SHARE = 0.3
 
 
@@ -67,7 +67,7 @@ class Watched(NamedTuple):
         shape, inside: see :class:`Look`.
         error: (T, 17, 2) found minus true key points, in body heights.
         scores: (T, 17).
-        found: (T,) whether the person was followed.
+        found: (T,) whether the person was tracked.
     """
 
     shape: Tensor
@@ -78,7 +78,7 @@ class Watched(NamedTuple):
 
     @classmethod
     def of(cls, clip: Clip, seen: Observed) -> "Watched":
-        """From the track nearest to the person in each frame; one farther than half a body height does not count."""
+        """From the track nearest to the person in each frame, if it is within half a body height."""
         look = Look.of(clip.joints(FPS), clip.height_m)
         away = (seen.keypoints.double() - look.pixels).norm(dim=-1).median(-1).values
         away, track = away.where(seen.valid, torch.inf).min(0)
@@ -94,7 +94,7 @@ class Watched(NamedTuple):
         )
 
     def mirrored(self) -> "Watched":
-        """The mirror image: left and right exchanged."""
+        """The mirror image: left and right swapped."""
         other = list(MIRRORED)
         turn = self.shape.new_tensor([-1.0, 1.0])
         return Watched(
@@ -107,13 +107,13 @@ class Watched(NamedTuple):
 
 
 def activity_of_folder(path: Path) -> int | None:
-    """Index of the activity whose number, S1 to S12, begins the name of the folder of a file; None without one."""
+    """Index of the activity S1 to S12 that the name of a file's folder begins with; None without one."""
     name = re.match(r"S(\d+)(?!\d)", path.parent.name)
     return int(name[1]) - 1 if name is not None and 1 <= int(name[1]) <= len(ACTIVITIES) else None
 
 
 def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
-    """Path, clip and people found of each film that ``tensorsim evaluate truth`` keeps for its setting c.
+    """Path, clip and people found for each film that ``tensorsim evaluate truth`` stores for its setting c.
 
     Raises:
         TensorsimError: none below this folder.
@@ -131,7 +131,7 @@ def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
 
 
 def watched_films(folder: Path) -> dict[str, Watched]:
-    """The films of :func:`films_of` that show a person whom the networks found."""
+    """The films of :func:`films_of` in which the networks found a person who is present."""
     return {
         name: Watched.of(clip, seen)
         for name, clip, seen in films_of(folder)
@@ -150,7 +150,7 @@ class FilmErrors:
     """Adds the errors of networks on films to motion.
 
     Args:
-        films: see :func:`watched_films`; at least 12 frames each. The mirror image of each is used too.
+        films: see :func:`watched_films`; at least 12 frames each. Their mirror images are used too.
 
     Attributes:
         digest: identifies the set of films.
@@ -203,7 +203,7 @@ class FilmErrors:
         )
 
     def _pieces(self, look: Look, starts: Tensor, generator: torch.Generator) -> list[tuple[Watched, int]]:
-        """For each segment, the film and the frame in it that its errors are from."""
+        """For each segment, the film and start frame that its errors are taken from."""
         order = torch.randperm(len(self.films), generator=generator)
         chosen = order[: max(1, round(_SHARE * len(order)))].tolist()
         film = torch.cat([torch.full_like(self._starts[c], c) for c in chosen])

@@ -1,4 +1,4 @@
-"""Poses estimated from films in place of true motion: real ones to test classifiers, simulated ones to train them."""
+"""Poses estimated from films instead of true motion: real ones to test classifiers, simulated ones to train them."""
 
 import warnings
 from pathlib import Path
@@ -29,7 +29,7 @@ class FilmLoss:
     The camera is that of ``tensorsim.evaluation.films``; nothing is rendered.
 
     Args:
-        errors: of the key points.
+        errors: errors of the key points.
     """
 
     def __init__(self, errors: FilmErrors) -> None:
@@ -38,7 +38,7 @@ class FilmLoss:
 
     @torch.no_grad()
     def __call__(self, joints: Tensor, height_m: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Joints (T, 14, 3) of one person to those that the pipeline estimates, and in which frames (T,) it does.
+        """Joints (T, 14, 3) of one person to those that the pipeline estimates, and the frames (T,) where it does.
 
         The frame rate is ``tensorsim.evaluation.films.FPS``.
         """
@@ -89,7 +89,7 @@ def labelled_poses(folder: Path) -> list[LabelledPose]:
 
 
 def film_poses(folder: Path) -> list[LabelledPose]:
-    """The people of every film that ``tensorsim evaluate truth`` stores for its setting c, lifted as it does.
+    """The people of every film that ``tensorsim evaluate truth`` stores for its setting c, lifted in the same way.
 
     Raises:
         TensorsimError: see :func:`~tensorsim.training.film_errors.films_of`.
@@ -117,7 +117,7 @@ def classify_poses(
     for number, pose in enumerate(tqdm(poses, desc=scene, unit="film", disable=quiet)):
         torch.manual_seed(number)
         with warnings.catch_warnings():
-            # Motion too fast for the preset aliases, as it did in training.
+            # Motion too fast for the preset aliases, as in training.
             warnings.simplefilter("ignore", TensorsimWarning)
             maps = stage(pose.joints.unsqueeze(0), pose.valid.unsqueeze(0), pose.fps)
         recognised.append(int(recognise(maps).argmax()))

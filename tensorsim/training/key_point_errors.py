@@ -1,8 +1,8 @@
-"""Key points as networks find them in films from any camera, and what the pipeline makes of them.
+"""Simulated key points as networks find them in films from any camera, and the motion that the pipeline makes of them.
 
 Networks do not err at random: a hidden arm stays in the wrong place for as long as it is hidden, left and right are
 mixed up for a while, a wrist or ankle jumps to something else for a moment, people who lie down are lost. Sizes of
-errors are shares of the body's height in the picture.
+errors are fractions of the body's height in the picture.
 """
 
 import math
@@ -23,8 +23,8 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
 #: Errors of each COCO key point relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
 RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2
-#: Jumps per second of each: a limb is taken for something else, or for that of the other side, for some frames. Their
-#: mean length in seconds, and how far they lead.
+#: Jumps per second of each: a limb is taken for something else, or for that of the other side, for some frames; then
+#: their mean duration in seconds and their distance.
 JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
 JUMP_S, JUMP = 0.12, 0.2
 #: Key points that are mixed up with those of the other side: arms, legs, all.
@@ -34,12 +34,12 @@ SIZES = ((360, 640), (480, 640), (640, 360))
 
 
 class Seen(NamedTuple):
-    """Somebody in a film.
+    """A person in a film.
 
     Attributes:
         keypoints: (T, 17, 2) pixels.
         scores: (T, 17).
-        valid: (T,) bool, whether followed.
+        valid: (T,) bool, whether tracked.
     """
 
     keypoints: Tensor
@@ -48,7 +48,7 @@ class Seen(NamedTuple):
 
 
 class Filming(NamedTuple):
-    """A camera, what is believed of it, and the size of its pictures."""
+    """A camera, its calibration as known to the pipeline, and the size of its pictures."""
 
     camera: CameraConfig
     believed: CameraConfig
@@ -66,7 +66,7 @@ def draw_camera(hips: Tensor, draw: Draw) -> Filming:
     half = math.atan(math.tan(fov / 2) * height / width)
     thought = towards + float(draw(-0.45, 0.45)) * half
     pitch = thought + math.radians(4.0) * float(draw.normal(1))
-    # Where nobody walks far, the focal length is hardly known.
+    # In films where nobody walks far, the focal length is poorly known.
     unsure = 0.12 if float(draw(0.0, 1.0)) < 0.75 else 0.3
     stretch = math.exp(unsure * float(draw.normal(1)))
     lifted = max(0.3, above * stretch + 0.1 * float(draw.normal(1)))
@@ -80,7 +80,7 @@ def draw_camera(hips: Tensor, draw: Draw) -> Filming:
 
 
 def _spell(frames: int, rate: float, shortest: float, longest: float, draw: Draw) -> Tensor:
-    """(N, T) bool: with probability ``rate`` one spell, of a share of the frames, anywhere."""
+    """(N, T) bool: with probability ``rate``, one period at a random time, of a random share of the frames."""
     length = draw(shortest, longest) * frames
     start = draw(-0.2, 1.0) * frames
     time = torch.arange(frames)
@@ -88,7 +88,7 @@ def _spell(frames: int, rate: float, shortest: float, longest: float, draw: Draw
 
 
 def _jumps(frames: int, fps: float, often: Tensor, each: Draw) -> tuple[Tensor, Tensor]:
-    """Which of N points jump (T, N) bool, and in which frame each last began to (T, N); ``often`` is their factor."""
+    """Which of N points jump (T, N) bool, and the frame of each latest jump (T, N); ``often`` scales the rate."""
     time = torch.arange(frames)[:, None]
     chance = often * torch.tensor(JUMPS_HZ, dtype=torch.float64) / fps
     began = chance > each(0.0, 1.0, frames).T
@@ -120,20 +120,20 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
         for band in (4.0, 0.6)
     )
     error = level * (0.0025 * quick + 0.009 * slow)
-    # Somebody whose trunk is not upright is found badly, half of those who lie not at all: points anywhere on them.
+    # People whose trunk is not upright are found badly, half of those who lie not at all: points anywhere on them.
     trunk = (joints[:, 1] - (joints[:, 8] + joints[:, 11]) / 2)[:, 2] / (0.3 * height_m)
     tilted = (1.0 - trunk).clamp(0.0, 1.0)
     worse = 2.0 + 10.0 * tilted * (draw(0.0, 1.0) < 0.5)[0]
     error = error * (1 + worse * tilted)[:, None, None]
     each = Draw(17, draw.generator)
-    # A point that is lost is taken for something else nearby, and its score is low for a part of that time.
+    # A lost point is taken for something else nearby, and its score is low for a part of that time.
     wild = _spell(frames, 0.06, 0.03, 0.3, each).T
     away = smooth_noise(draw, frames, fps, torch.full((1, 1), 1.0, dtype=torch.float64), 34)[0]
     error = error + 0.1 * wild[..., None] * away.unflatten(-1, (17, 2))
     found = true + unit * error
 
     other = found[:, list(MIRRORED)]
-    # The far arm or leg of somebody seen from the side is taken for the near one.
+    # The far arm or leg of a person seen from the side is taken for the near one.
     near = (true - true[:, list(MIRRORED)]).norm(dim=-1, keepdim=True) < 0.1 * unit
     far = (depth > depth[:, list(MIRRORED)] + 0.06)[..., None] & (torch.arange(17) > 6)[:, None]
     merged = near & far & _spell(frames, 0.4, 0.2, 1.0, each).T[..., None]
@@ -153,7 +153,7 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
 
     inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
     usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
-    # Networks are nearly as sure of points that are wrong.
+    # Networks are almost as confident of wrong points.
     scores = usual - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
     scores = (scores - jumps * each(0.15, 0.25, frames).T).clamp(0.35, 0.98)
     scores = torch.where(merged[..., 0], scores - 0.2, scores)
@@ -163,7 +163,7 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
 
 
 def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: Draw) -> Tensor:
-    """In which frames (T,) somebody is followed: many who lie down are lost, some come late or leave early."""
+    """Frames (T,) in which a person is tracked: many who lie down are lost, some arrive late or leave early."""
     frames = len(found)
     time = torch.arange(frames)
     seen = (scores >= 0.3).sum(-1) >= 4
@@ -175,11 +175,11 @@ def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: D
     lying = tilted > 0.7
     if bool(lying.any()):
         chance = float(draw(0.0, 1.0))
-        if chance < 0.35:  # lost for good on the way down or some time after
+        if chance < 0.35:  # lost on the way down or some time after
             lost = int(torch.nonzero(lying)[0]) + float(draw(-0.25, 1.2)) * fps
             if bool(lying[-1]):
                 followed &= time < lost
-            else:  # found again when up
+            else:  # found again after getting up
                 followed &= (time < lost) | (time > int(torch.nonzero(lying)[-1]))
         elif chance < 0.45:
             followed &= ~lying
@@ -206,7 +206,7 @@ class FilmedMotion:
 
     @torch.no_grad()
     def lifted(self, seen: list[Seen], filming: Filming, fps: float) -> tuple[Tensor, Tensor]:
-        """What the pipeline makes of key points before a camera: joints (P, T, 14, 3) and presence (P, T)."""
+        """What the pipeline makes of key points from a camera: joints (P, T, 14, 3) and presence (P, T)."""
         keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
         boxes = keypoint_boxes(keypoints, scores)
         if not bool(valid.any()):

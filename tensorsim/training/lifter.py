@@ -1,4 +1,4 @@
-"""The recipes of the lifters: windows of motion before random cameras, seen through errors, to joints."""
+"""The recipes of the lifters: windows of motion, seen by random cameras with key point errors, to joints."""
 
 import math
 from typing import Any
@@ -17,7 +17,7 @@ from tensorsim.vision.smoothing.along_time import nearest_valid
 
 #: Weights of the terms of the loss.
 _VELOCITY, _BONES, _RANGE, _SPREAD = 0.12, 0.3, 0.5, 0.03
-#: Errors of joints count relative to these: wrists and ankles move fastest, and the radar sees speed.
+#: Weights of joint errors: wrists and ankles move fastest, and the radar sees speed.
 _JOINTS = (1.0, 0.8, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3)
 
 
@@ -29,7 +29,7 @@ def target(window: Windows, sight: Sight) -> Tensor:
 
 
 def laplace(error: Tensor, log_spread: Tensor) -> Tensor:
-    """Negative logarithm of the likelihood of absolute errors of a known mean: ``|e| / b + log b``."""
+    """Negative log-likelihood of absolute errors under a Laplace distribution: ``|e| / b + log b``."""
     return error * torch.exp(-log_spread) + log_spread
 
 
@@ -41,9 +41,9 @@ def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> di
     """The loss and its terms.
 
     Args:
-        found: what the network says.
+        found: output of the network.
         true: (B, T, 14, 3), see :func:`target`.
-        weight: (B, T) of frames.
+        weight: (B, T) weights of frames.
         fps: (B,).
     """
     weight = weight / weight.sum().clamp(min=1.0)
@@ -52,7 +52,7 @@ def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> di
     error = (joints - about).abs()
     across, along = error[..., ::2].mean(dim=-1), error[..., 1]
     place = ((across + along) * each).mean(dim=-1)
-    # The angle of the hips and the logarithm of their distance: metres far away count as much as nearby.
+    # The angle of the hips and the logarithm of their distance: relative errors count equally far away and nearby.
     far = mid_hips(true)[..., 1].clamp(min=0.3)
     hips = mid_hips(found.joints)[..., 1].clamp(min=0.05)
     off_range = (hips / far).log().abs()
@@ -80,15 +80,15 @@ def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> di
 
 
 class LifterRecipe(Recipe):
-    """What :func:`tensorsim.training.loop.fit` trains.
+    """The recipe of the temporal lifter, for :func:`tensorsim.training.loop.fit`.
 
     Args:
         net: a :class:`~tensorsim.vision.lifting.temporal_net.TemporalNet`.
         pool: motion to train on.
         held_out: motion to validate on.
-        frames: of a window.
-        learning_rate: largest.
-        seed: of cameras and errors.
+        frames: frames of a window.
+        learning_rate: peak learning rate.
+        seed: seed of cameras and errors.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class LifterRecipe(Recipe):
         self.judged = [film(held_out, 64, frames, torch.Generator().manual_seed(k)) for k in range(6)]
 
     def sample(self, index: int) -> dict[str, Any]:
-        """Windows are made by the batch."""
+        """The index alone: windows are made batch by batch."""
         return {"index": index}
 
     def collate(self, samples: list[dict[str, Any]]) -> Batch:
@@ -122,7 +122,7 @@ class LifterRecipe(Recipe):
         return self.batch_of(film(self.pool, len(samples), self.frames, generator))
 
     def batch_of(self, window: Windows) -> Batch:
-        """What :meth:`loss` takes of filmed windows."""
+        """The input of :meth:`loss` for filmed windows."""
         sight = window.sight()
         return {
             "sight": tuple(sight),
@@ -132,7 +132,7 @@ class LifterRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Of a batch of :meth:`collate`."""
+        """The loss of a batch from :meth:`collate`."""
         found = net(Sight(*batch["sight"]))
         located = Located(*(part.float() for part in found))
         return lifter_loss(located, batch["target"], batch["weight"], batch["fps"])
@@ -148,7 +148,7 @@ class LifterRecipe(Recipe):
         return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Errors on held-out motion: of depths about the hips in cm of a body of 1.75 m, of ranges in per cent."""
+        """Errors on held-out motion: depths about the hips in cm for a body of 1.75 m, ranges in percent, and others."""
         totals: dict[str, float] = {}
         for window in self.judged:
             sight = window.sight()
@@ -166,17 +166,17 @@ class LifterRecipe(Recipe):
 
 
 def _weight(window: Windows) -> Tensor:
-    """Frames in which the person is followed count fully, gaps less; people beside the picture hardly."""
+    """Frames in which the person is tracked count fully, partly visible people less, gaps hardly."""
     count = (window.scores >= 0.3).sum(dim=-1) * window.valid
     return 0.05 + 0.25 * (count > 0) + 0.7 * (count >= 8)
 
 
-#: Of the bodies that VideoPose3D learns, in metres: its results are metric.
+#: Height of the bodies that VideoPose3D learns, in metres: its results are metric.
 _TALL_M = 1.75
 
 
 def picture_joints(window: Windows) -> Tensor:
-    """What VideoPose3D gets: (B, T, 17, 2) joints of Human3.6M, from the centre of the picture over half its width."""
+    """Input of VideoPose3D: (B, T, 17, 2) Human3.6M joints from the centre of the picture, over half its width."""
     joints, _ = coco_to_body(window.keypoints, window.scores, THRESHOLD)
     source = nearest_valid(window.valid)[..., None, None].expand_as(joints)
     centred = body_to_h36m(joints.gather(1, source)) - window.center[:, None, None]
@@ -184,7 +184,7 @@ def picture_joints(window: Windows) -> Tensor:
 
 
 class VideoPoseRecipe(LifterRecipe):
-    """The same for :class:`~tensorsim.vision.VideoPose3D`: the mean error of its joints, as its authors train it."""
+    """The recipe of :class:`~tensorsim.vision.VideoPose3D`: the mean joint error, as used by its authors."""
 
     def batch_of(self, window: Windows) -> Batch:
         """Joints in the picture and the true ones in camera axes, metres about the hips."""
@@ -199,7 +199,7 @@ class VideoPoseRecipe(LifterRecipe):
         return {"loss": (weight * (error + 1e-8).sqrt().mean(dim=-1)).sum()}
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Errors on held-out motion, in cm of a body of 1.75 m: of joints about the hips, and of depths alone."""
+        """Errors on held-out motion, in cm for a body of 1.75 m: of joints about the hips, and of depths alone."""
         place = depth = 0.0
         for window in self.judged:
             batch = self.batch_of(window)

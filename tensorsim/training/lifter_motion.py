@@ -1,7 +1,7 @@
-"""Motion to train a lifter on: activities and exercises in all their variants, falls, poses joined at random, captures.
+"""Motion to train a lifter on: activities, exercises, falls, randomly joined poses, captures, everyday motion.
 
-Everything is kept as joints at 60 frames a second, about 4 s each, on the floor, and is turned, placed and filmed anew
-every time it is used.
+Everything is stored as joints at 60 frames per second, about 4 s each, on the floor, and is turned, placed and filmed
+anew every time it is used.
 """
 
 import io
@@ -31,18 +31,18 @@ from tensorsim.motion.resample import PoseResampler
 from tensorsim.motion.scripts import SCRIPTS
 from tensorsim.motion.timing import minimum_jerk
 
-#: Frames per second and frames of a motion.
+#: Frames per second and number of frames of a motion.
 RATE_HZ, FRAMES = 60.0, 256
 #: People, and ways of moving, of all kinds and in all headings.
 _PEOPLE = PeopleConfig(
     height_m=(1.4, 2.0), limb_deviation=0.05, speed_m_s=(0.4, 1.8), heading_rad=math.pi, variation=0.2,
     tempo=(0.5, 1.1), start_range_m=(0.0, 0.0), keep_range_m=(0.0, 1e6), start_side_m=0.0,
 )  # fmt: skip
-#: People whose motion is worked out at once.
+#: Number of people whose motion is computed at once.
 _CHUNK = 24
-#: Captured joints that seem to move faster have lost a marker.
+#: Where captured joints seem to move faster, a marker was lost.
 _FASTEST_M_S = 20.0
-#: Segments whose lengths vary from body to body: joint, the joint that it hangs from, and the pair that varies alike.
+#: Segments whose lengths vary between bodies: joint, parent joint, and group that varies together.
 _CHAIN = (
     (2, 1, 0), (5, 1, 0), (0, 1, 1), (3, 2, 2), (6, 5, 2), (4, 3, 3), (7, 6, 3),
     (9, 8, 4), (12, 11, 4), (10, 9, 5), (13, 12, 5),
@@ -75,7 +75,7 @@ _EVERYDAY = (
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
-    """Falls as :func:`.everyday.fall_any_way`; some slowly, as those who lie down."""
+    """Falls as :func:`.everyday.fall_any_way`, some as slow as lying down."""
     slow = torch.where(who.gait_phase < 0.3, 0.45, 1.0)
     return everyday.fall_any_way(time, who._replace(tempo=slow * who.tempo))
 
@@ -85,7 +85,7 @@ def _performed(
 ) -> tuple[Tensor, Tensor]:
     """Joints (count, FRAMES, 14, 3) of people who follow a script, and their heights.
 
-    The motion begins at a moment of its own, between time 0 of the script and ``farthest_s``.
+    Each motion begins at a random time between 0 and ``farthest_s`` of the script.
     """
     who = draw_people(count, _PEOPLE, generator)
     start = farthest_s * torch.rand(count, 1, generator=generator, dtype=torch.float64)
@@ -94,7 +94,7 @@ def _performed(
 
 
 def _joined(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Bodies that go from one random pose to the next, drift and turn as they do; the lowest joint is on the floor."""
+    """Bodies that move from one random pose to the next while drifting and turning; the lowest joint is on the floor."""
     keys = 16
     who = draw_people(count, _PEOPLE, generator)
     families = torch.randint(FAMILIES, (2,), generator=generator).tolist()
@@ -134,7 +134,7 @@ def with_other_bones(joints: Tensor, factors: Tensor) -> Tensor:
 
     Args:
         joints: metres.
-        factors: (7,) of shoulders, head, upper arm, forearm, thigh, shank and trunk.
+        factors: (7,) for shoulders, head, upper arms, forearms, thighs, shanks and trunk.
     """
     moved = joints.clone()
     hips = mid_hips(joints)
@@ -148,8 +148,8 @@ def with_other_bones(joints: Tensor, factors: Tensor) -> Tensor:
 def captures(paths: tuple[Path, ...], held_out: bool) -> dict[str, tuple[Tensor, float]]:
     """Captured motion (T, 14, 3) and its frame rate by name: every second sequence is held out.
 
-    The first frame, often a calibration pose, is left out. A file that has no frame rate may have it in its name, as
-    ``walks_120hz.npz``.
+    The first frame, often a calibration pose, is left out. A file without a frame rate may state it in its name, such
+    as ``walks_120hz.npz``.
 
     Raises:
         TensorsimError: files that cannot be read.
@@ -166,7 +166,7 @@ def captures(paths: tuple[Path, ...], held_out: bool) -> dict[str, tuple[Tensor,
 def _captured(
     sequences: list[tuple[Tensor, float]], count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Pieces of captured motion at 0.75 to 1.3 of its speed, of bodies with other proportions and sizes."""
+    """Pieces of captured motion at 0.75 to 1.3 times its speed, of bodies with other proportions and sizes."""
     pieces: list[Tensor] = []
     heights: list[float] = []
     while len(pieces) < count:
@@ -176,7 +176,7 @@ def _captured(
         dense = PoseResampler(RATE_HZ)(joints, fps * speed)
         factors = 1 + 0.06 * torch.randn(7, generator=generator, dtype=torch.float64).clamp(-2, 2)
         dense = with_other_bones(dense, factors)
-        # Short captures are played to and fro.
+        # Short captures are played forwards and backwards.
         while len(dense) < FRAMES:
             dense = torch.cat([dense, dense.flip(0)[1:]])
         start = int(torch.randint(len(dense) - FRAMES + 1, (1,), generator=generator))
@@ -192,7 +192,7 @@ def _captured(
 def _batches(
     kind: str, count: int, sequences: list[tuple[Tensor, float]], generator: torch.Generator
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Motions of one kind and heights, a chunk at a time."""
+    """Motions of one kind with heights, a chunk at a time."""
     scripts = list(EXERCISES.values())
     for i, first in enumerate(range(0, count, _CHUNK)):
         size = min(_CHUNK, count - first)
@@ -202,7 +202,7 @@ def _batches(
             yield _performed(scripts[i % len(scripts)], size, 0.5, generator)
         elif kind == "falls":
             joints, heights = _performed(fall_any_way, size, 0.0, generator)
-            # Backwards in time they get up.
+            # Reversed in time, they get up.
             back = torch.rand(size, generator=generator) < 0.25
             yield torch.where(back[:, None, None, None], joints.flip(1), joints), heights
         elif kind == "captures":
@@ -225,10 +225,10 @@ def build_pool(
 
     Args:
         path: ``.pt`` file; None stores nothing.
-        count: motions of all kinds.
-        motions: motion capture files. Without any, the other kinds share.
-        seed: of everything random.
-        held_out: take those captures that are not trained on, see :func:`captures`.
+        count: total number of motions.
+        motions: motion capture files. Without any, the other kinds take their share.
+        seed: seed of everything random.
+        held_out: use the captures that are not trained on, see :func:`captures`.
         quiet: no progress bar.
 
     Raises:

@@ -1,4 +1,4 @@
-"""How well people are lifted: the whole way from key points to smooth joints, with known camera and height."""
+"""How well people are lifted, from key points to smoothed joints, with known camera and height."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,18 +21,18 @@ from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
 
-#: Frames of a window, 3 s, and people before each camera at a time.
+#: Frames of a window (3 s), and people in front of each camera.
 FRAMES, PEOPLE = 90, 48
 #: Cameras: degrees below level, metres above the floor, horizontal field of view in degrees.
 CAMERAS = ((0.0, 1.0, 60.0), (12.0, 1.8, 75.0), (28.0, 2.8, 60.0))
-#: Wrists and ankles, whose speeds the radar shows most.
+#: Wrists and ankles, whose speeds stand out most in the radar maps.
 ENDS = (4, 7, 10, 13)
 #: Peaks are these quantiles of the speed over time, and count from this speed on.
 _PEAK, _SLOWEST_M_S = 0.98, 0.5
 
 
 class LiftErrors(NamedTuple):
-    """Errors of lifted people; lower is better but for ``peak``, ``within`` and ``radial``, which are 1 at best.
+    """Errors of lifted people; lower is better, except for ``peak``, ``within`` and ``radial``, which are 1 at best.
 
     Attributes:
         depth_cm: mean absolute error along the horizontal line of sight of the joints about the hips.
@@ -41,8 +41,8 @@ class LiftErrors(NamedTuple):
         peak: median ratio of estimated and true peak speeds of wrists and ankles.
         within: share of these in which the ratio is within 20 %.
         speed_m_s: mean error of the velocity of all joints.
-        radial: how much of the velocity of wrists and ankles along the line of sight is found: the slope of estimated
-            over true velocities.
+        radial: share of the velocity of wrists and ankles along the line of sight that is recovered: the slope of
+            estimated over true velocities.
     """
 
     depth_cm: float
@@ -55,12 +55,12 @@ class LiftErrors(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """People before one camera: key points as :class:`~tensorsim.evaluation.films.Observed`, and the truth.
+    """People in front of one camera: key points as :class:`~tensorsim.evaluation.films.Observed`, and the truth.
 
     Attributes:
-        camera: it.
+        camera: the camera.
         extent: width and height of the picture.
-        heights: of the P people, metres.
+        heights: heights of the P people, metres.
         joints: (P, T, 14, 3) true joints in the world.
         boxes, keypoints, scores, valid: see :class:`~tensorsim.evaluation.films.Observed`.
     """
@@ -75,12 +75,12 @@ class Seen(NamedTuple):
     valid: Tensor
 
 
-#: People before a camera to the lifter for them.
+#: Makes the lifter for people in front of a camera.
 MakeLifter = Callable[[Seen], nn.Module]
 
 
 def views(pool: MotionPool, kinds: tuple[str, ...], errors: bool, seed: int = 0) -> Iterator[Seen]:
-    """People of some kinds of motion before each of ``CAMERAS``."""
+    """People of some kinds of motion in front of each of ``CAMERAS``."""
     chosen = torch.isin(pool.kind, torch.tensor([list(KINDS).index(kind) for kind in kinds]))
     some = MotionPool(*(field[chosen] for field in pool))
     for i, numbers in enumerate(CAMERAS):
@@ -96,7 +96,7 @@ def views(pool: MotionPool, kinds: tuple[str, ...], errors: bool, seed: int = 0)
 
 
 def watched(folder: Path) -> Iterator[Seen]:
-    """The one person of each film of ``tensorsim evaluate truth --settings c``, as far as the networks found it."""
+    """The person in each film of ``tensorsim evaluate truth --settings c`` in which the networks found one."""
     for _, clip, found in films_of(folder):
         if clip.present and found.valid.shape[0] > 0:
             one = int(found.valid.sum(dim=-1).argmax())
@@ -131,7 +131,7 @@ def video_pose(network: VideoPose3D) -> MakeLifter:
 
 @torch.inference_mode()
 def lifted(make: MakeLifter, seen: Seen) -> tuple[Tensor, Tensor]:
-    """Joints (P, T, 14, 3) that the pipeline makes of key points, and in which frames (P, T)."""
+    """Joints (P, T, 14, 3) that the pipeline makes of key points, and the frames (P, T) where they are valid."""
     nothing = nn.Identity()
     stage = VideoToPose(
         nothing,
@@ -151,7 +151,7 @@ def _peaks(joints: Tensor, valid: Tensor) -> Tensor:
 
 
 def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
-    """Mean errors over people; frames in which nobody is followed do not count."""
+    """Mean errors over people; frames in which a person is not tracked do not count."""
     sums, radial = torch.zeros(5, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     ratios = []
     for seen in people:

@@ -1,6 +1,6 @@
-"""Motion seen by random cameras, through errors as networks make them: what a lifter is trained on.
+"""Training data of a lifter: motion seen by random cameras, with key point errors like those of networks.
 
-Everything is worked out for a whole batch at once: B windows of T frames.
+Everything is computed for a whole batch at once: B windows of T frames.
 """
 
 import math
@@ -18,14 +18,14 @@ from tensorsim.vision.lifting.sight import Sight, level_sight
 
 #: Score below which a key point counts as hidden.
 THRESHOLD = 0.3
-#: Shares of the windows whose key points are exact, and of those whose camera is known.
+#: Share of the windows whose key points are exact, and of those whose camera is known.
 _LABELLED, _KNOWN = 0.1, 0.4
 #: Relative size of the errors of each COCO key point: face, shoulders, elbows, wrists, hips, knees, ankles.
 _ERROR = (0.7,) * 5 + (0.9,) * 2 + (1.2,) * 2 + (1.5,) * 2 + (1.2,) * 2 + (1.0,) * 2 + (1.2,) * 2
-#: Scores of key points that are found well, measured on films: of the head, of shoulders to ankles.
+#: Scores of well-found key points, measured on films: head, then shoulders to ankles.
 USUAL_SCORES = (0.92,) * 5 + (0.80,) * 12
-#: Body heights from the outermost key points to the left, top, right and bottom of the boxes that the detector finds,
-#: measured on rendered films: of people that are upright, and that lie.
+#: Distances in body heights from the outermost key points to the left, top, right and bottom of the detector's boxes,
+#: measured on rendered films: for upright people, and for people lying down.
 _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
 #: Key points that are mistaken for one another: (right, left) of arms, of legs, and all.
 _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
@@ -35,7 +35,7 @@ class Windows(NamedTuple):
     """A batch of windows.
 
     Attributes:
-        joints: (B, T, 14, 3) true joints from the camera in the world axes of the assumed one, body heights.
+        joints: (B, T, 14, 3) true joints relative to the camera, in the world axes of the assumed one, body heights.
         keypoints: (B, T, 17, 2) pixels with errors.
         scores: (B, T, 17).
         boxes: (B, T, 4).
@@ -61,7 +61,7 @@ class Windows(NamedTuple):
     camera_height: Tensor
 
     def sight(self) -> Sight:
-        """What the network gets."""
+        """The input of the network."""
         joints, joint_scores = coco_to_body(self.keypoints, self.scores, THRESHOLD)
         return level_sight(
             self.keypoints, self.scores, joints, joint_scores, self.boxes, self.valid, self.focal, self.center,
@@ -88,7 +88,7 @@ class Draw:
         return torch.rand(self.count, *tail, generator=self.generator) < probability
 
     def spells(self, frames: int, rate: float, shortest: float, longest: float, *tail: int) -> Tensor:
-        """(B, *tail, T) bool: with probability ``rate`` one spell of a share of the frames, anywhere."""
+        """(B, *tail, T) bool: with probability ``rate``, one period of a random share of the frames, anywhere."""
         length = self.number(shortest, longest, *tail) * frames
         start = self.number(-0.3, 1.1, *tail) * frames
         time = torch.arange(frames)
@@ -96,7 +96,7 @@ class Draw:
         return inside & self.chance(rate, *tail)[..., None]
 
     def correlated(self, frames: int, last: Tensor, *tail: int) -> Tensor:
-        """(B, T, *tail) noise of unit variance that lasts for ``last`` (B,) frames: a first-order process, twice."""
+        """(B, T, *tail) noise of unit variance from a first-order process, correlated over ``last`` (B,) frames."""
         white = self.normal(frames, *tail)
         keep = torch.exp(-1 / last.clamp(min=0.1)).reshape(-1, *(1 for _ in tail))
         drive = (1 - keep.square()).sqrt()
@@ -135,11 +135,11 @@ class View(NamedTuple):
     """Cameras.
 
     Attributes:
-        joints: (B, T, 14, 3) from the camera in world axes, metres.
+        joints: (B, T, 14, 3) relative to the camera in world axes, metres.
         rotation: (B, 3, 3) world from camera.
         focal: (B,) pixels.
         extent: (B, 2) width and height of the picture.
-        height_m: (B,) of the camera above the floor.
+        height_m: (B,) height of the camera above the floor.
     """
 
     joints: Tensor
@@ -167,14 +167,14 @@ def _any_camera(joints: Tensor, draw: Draw) -> View:
     up = torch.atan2(hips[:, 2], hips[:, 1])
     tall, wide = torch.atan(extent / 2 / focal[:, None]).flip(-1).unbind(-1)
     pitch = (up - 0.5 * tall * draw.normal().clamp(-2, 2)).clamp(-0.75, 0.3)
-    # Many cameras are level, if that has the hips in the picture.
+    # Many cameras are level if the hips are then in the picture.
     pitch = torch.where(draw.chance(0.25), (up + 0.8 * tall).clamp(max=0.0), pitch)
     yaw = 0.8 * wide * draw.number(-1.0, 1.0)
     return View(local, rotation(2, yaw) @ rotation(0, pitch) @ _LEVEL, focal, extent, height)
 
 
 def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int], draw: Draw) -> View:
-    """Joints (B, T, 14, 3) about a spot on the floor put before one camera: at a random place in its picture."""
+    """Joints (B, T, 14, 3) about a spot on the floor, put in front of one camera at a random place in its picture."""
     width, height = extent
     focal = torch.full((draw.count,), focal_length(camera, width))
     down, tall = -camera.pitch_rad, math.atan(height / 2 / float(focal[0]))
@@ -196,14 +196,14 @@ def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int],
 def _missed(
     points: Tensor, unit: Tensor, depth: Tensor, tilted: Tensor, scores: Tensor, fps: Tensor, draw: Draw
 ) -> tuple[Tensor, Tensor]:
-    """Key points (B, T, 17, 2) with errors as networks make them, and their scores.
+    """Key points (B, T, 17, 2) with errors like those of networks, and their scores.
 
     Args:
         points: true ones in pixels.
         unit: (B, T) pixels per body height.
         depth: (B, T, 17) distances from the camera in body heights.
-        tilted: (B, T) 0 for an upright trunk to 1 for one that lies.
-        scores: (B, T, 17) of the true ones.
+        tilted: (B, T) 0 for an upright trunk to 1 for a horizontal one.
+        scores: (B, T, 17) scores of the true ones.
         fps: (B,) frames per second.
         draw: random numbers.
     """
@@ -216,10 +216,10 @@ def _missed(
     error = error + 0.005 * good * draw.normal(1, 17, 2)
     wild = draw.spells(frames, 0.10, 0.03, 0.5, 17).transpose(1, 2)
     error = error + 0.12 * wild[..., None] * draw.correlated(frames, 0.5 * fps, 17, 2)
-    # Bodies come out a little small: faces low and ankles high, by 1 % on rendered films.
+    # Networks find bodies slightly too small: faces low and ankles high, by 1 % on rendered films.
     size = -0.010 + 0.012 * draw.normal(1, 1, 1)
     error = error + size * (points - points.mean(dim=2, keepdim=True)) / unit[..., None, None]
-    # People are found less well lying than standing, in half of the windows much less.
+    # People are found less accurately lying than standing, in half of the windows much less so.
     worse = 1 + draw.number(0.0, 1.0, 1) * torch.where(draw.chance(0.5), 1.0, 4.0)[:, None] * tilted
     error = error * worse[..., None, None]
     found = points + unit[..., None, None] * error
@@ -227,7 +227,7 @@ def _missed(
     other = points[:, :, list(MIRRORED)]
     near = (points - other).norm(dim=-1) < 0.12 * unit[..., None]
     behind = depth > depth[:, :, list(MIRRORED)] + 0.04
-    # The far arm or leg of somebody seen from the side is easily taken for the near one.
+    # The far arm or leg of a person seen from the side is easily taken for the near one.
     limbs = torch.arange(17) > 6
     covered = near & behind & limbs & draw.spells(frames, 0.35, 0.1, 1.0, 17).transpose(1, 2)
     pull = draw.number(0.0, 1.0, 1, 17)[..., None]
@@ -253,7 +253,7 @@ def _missed(
 def _followed(
     found: Tensor, scores: Tensor, unit: Tensor, tilted: Tensor, draw: Draw, gaps: bool
 ) -> tuple[Tensor, Tensor]:
-    """Boxes (B, T, 4) of key points, as detectors and trackers have them, and in which frames there is one (B, T)."""
+    """Boxes (B, T, 4) of key points, like those of detectors and trackers, and the frames (B, T) that have one."""
     frames = found.shape[1]
     seen = scores >= THRESHOLD
     low = torch.where(seen[..., None], found, torch.inf).amin(dim=-2)
@@ -270,10 +270,10 @@ def _followed(
 
 
 def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) -> Windows:
-    """``count`` windows of motion of the pool, in random places before random cameras.
+    """``count`` windows of motion from the pool, at random places in front of random cameras.
 
-    Four in ten cameras are known but for a hundredth, the others as badly as one that is estimated from the film; one
-    window in ten has the exact key points.
+    Four in ten cameras are known to within a percent, the others only as well as one estimated from the film; one
+    window in ten has exact key points.
     """
     draw = Draw(count, generator)
     joints, height, fps = windows_of(pool, frames, draw)
@@ -285,7 +285,7 @@ def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) 
           for true, found in zip(seen_in(view, height, fps, draw, errors=False), seen, strict=True))
     )  # fmt: skip
     known = draw.chance(_KNOWN)
-    # Tilt and roll are wrong by some degrees, the focal length by some per cent.
+    # Tilt and roll are wrong by a few degrees, the focal length by a few percent.
     wrong = torch.where(draw.chance(0.2), 0.10, 0.02)[:, None] * draw.normal(2)
     wrong = torch.where(known[:, None], 0.005 * draw.normal(2), wrong)
     tipped = rotation(0, wrong[:, 0]) @ rotation(1, 0.5 * wrong[:, 1])
@@ -294,7 +294,7 @@ def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) 
     forward = view.rotation[:, :, 2]
     shift = (stretch - 1)[:, None] * (mid_hips(view.joints) * forward[:, None]).sum(dim=-1)
     joints = (view.joints + (shift[..., None] * forward[:, None])[:, :, None]) @ tipped[:, None].mT
-    # Mostly the height of the camera is estimated along with them, so that people stay on the floor.
+    # Usually the height of the camera is estimated with them, so that people stay on the floor.
     sunk = mid_hips(view.joints)[..., 2].mean(dim=-1) - mid_hips(joints)[..., 2].mean(dim=-1)
     above = view.height_m + torch.where(draw.chance(0.7), sunk, torch.zeros_like(sunk))
     spread = torch.where(known, 0.01, torch.where(draw.chance(0.3), 0.20, 0.04))
@@ -308,14 +308,14 @@ def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) 
 
 
 def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = True) -> Windows:
-    """What networks see of people before cameras.
+    """What networks see of people in front of cameras.
 
     Args:
         view: people and cameras.
         height: (B) standing heights, metres.
         fps: (B) frames per second.
         draw: random numbers.
-        errors: False gives the exact key points, those beside the picture with a score of 0.
+        errors: False gives the exact key points, those outside the picture with a score of 0.
     """
     frames, extent = view.joints.shape[1], view.extent
     center = (extent - 1) / 2
@@ -329,7 +329,7 @@ def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = 
     tilted = 1 - (trunk[..., 2] / trunk.norm(dim=-1).clamp(min=1e-6)).clamp(min=0.0)
     if errors:
         scores = torch.ones_like(away)
-        # From behind, eyes and nose are hidden; many networks place them all the same, with high scores.
+        # From behind, eyes and nose are hidden; many networks still place them, with high scores.
         ahead = eyes[:, :, 0] - eyes[:, :, 3:5].mean(dim=2)
         toward = -(ahead * eyes[:, :, 0]).sum(dim=-1)
         toward = toward / (ahead.norm(dim=-1) * eyes[:, :, 0].norm(dim=-1)).clamp(min=1e-6)
