@@ -27,7 +27,7 @@ AS_IT_IS = 0.5
 
 @functools.lru_cache(maxsize=256)
 def shrunk_picture(sample: Sample, longest: int = 448) -> tuple[Picture, float]:
-    """A picture, shrunk to at most ``longest`` pixels a side, and the factor."""
+    """A picture, shrunk to at most ``longest`` pixels a side, and the factor; results are cached."""
     import cv2
 
     image = sample.image()

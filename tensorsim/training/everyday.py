@@ -165,7 +165,7 @@ def _round_corners(time: Tensor, people: People, draw: Draw) -> Tensor:
 
 
 def _round_and_round(time: Tensor, people: People, draw: Draw) -> Tensor:
-    """Joints (N, K, 14, 3) of people who walk round a room, most along its walls, one of which the radar faces."""
+    """Joints (N, K, 14, 3) of people who walk round a room, most along its walls, which are square to the radar."""
     corners = 12
     side = torch.where(draw(0.0, 1.0) < 0.5, -1.0, 1.0).double()
     turns_s = draw(0.4, 1.1)

@@ -29,7 +29,7 @@ CUT, MASKED = 0.08, 0.12
 #: Share of the pictures that are folded, and of the walks in which the person arrives late or leaves early.
 FOLDED, PASSING = 0.2, 0.4
 WALKING = ACTIVITIES.index("S8 Walking")
-#: Activities by index, and the activity that each becomes when reversed in time; some have no reverse.
+#: Activities by index, and what each becomes when reversed in time; falling and getting up do not become each other.
 REVERSED = {0: 0, 1: 1, 2: 2, 3: 3, 4: 5, 5: 4, 6: 6, 7: 7, 8: 9, 9: 8}
 #: Label smoothing: this much of the probability is spread over all classes.
 SMOOTHING = 0.05
@@ -42,7 +42,7 @@ def folded(power: Tensor) -> Tensor:
 
 
 def passing(power: Tensor, late: float, early: float) -> Tensor:
-    """A power picture (H, W) of a person present only between shares of the time from both ends; peak 1."""
+    """A power picture (H, W) without a share of the time at its start (``late``) and end (``early``); peak 1."""
     time = (torch.arange(power.shape[1]) + 0.5) / power.shape[1]
     seen = power * ((time >= late) & (time <= 1 - early))
     return seen / seen.max().clamp(min=1e-30)

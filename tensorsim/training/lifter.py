@@ -148,7 +148,7 @@ class LifterRecipe(Recipe):
         return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Errors on held-out motion: depths about the hips in cm for a body of 1.75 m, ranges in percent, and others."""
+        """Errors on held-out motion: depths about the hips and positions for a body of 1.75 m, ranges, speeds."""
         totals: dict[str, float] = {}
         for window in self.judged:
             sight = window.sight()

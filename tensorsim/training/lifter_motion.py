@@ -94,7 +94,7 @@ def _performed(
 
 
 def _joined(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Bodies that move from one random pose to the next while drifting and turning; the lowest joint is on the floor."""
+    """Bodies that move between random poses while drifting and turning; the lowest joint is on the floor."""
     keys = 16
     who = draw_people(count, _PEOPLE, generator)
     families = torch.randint(FAMILIES, (2,), generator=generator).tolist()

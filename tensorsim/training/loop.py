@@ -1,9 +1,9 @@
-"""The loop that every training recipe runs in: seeded, resumable, logged, on one device or several.
+"""The training loop of all recipes: seeded, resumable, logged, on one device or several.
 
-A recipe says what is trained, on which samples and by which loss; the loop does the rest. Samples come from an
-endless stream and depend on their number alone, and the random state is set anew before every step, so a run
-that was interrupted goes on to the same result. Several GPUs: ``torchrun --nproc-per-node N -m tensorsim train
-...``; each process takes its share of every batch.
+A recipe defines what is trained, on which samples and with which loss; the loop does the rest. Samples come from an
+endless stream and depend only on their number, and the random state is reset before every step, so an interrupted
+run continues to the same result. Several GPUs: ``torchrun --nproc-per-node N -m tensorsim train ...``; each process
+takes its share of every batch.
 """
 
 import csv
@@ -32,7 +32,7 @@ Batch = dict[str, Any]
 
 
 def decay_groups(net: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """Parameters for an optimiser: those of products and convolutions decay, biases and normalisation do not."""
+    """Parameter groups for an optimiser: weight matrices and kernels decay, biases and normalisation do not."""
     parameters = list(net.parameters())
     return [
         {"params": [p for p in parameters if p.dim() > 1], "weight_decay": weight_decay},
@@ -45,9 +45,9 @@ class Recipe:
 
     Attributes:
         net: the network to train.
-        settings: everything that must be equal for a run to go on from a checkpoint; the name of the recipe is added.
-        metadata: strings stored in the weight file, for those who load it.
-        processor_s: processor time of the training so far, as far as a checkpoint has it.
+        settings: everything that must be equal for a run to resume from a checkpoint; the recipe's name is added.
+        metadata: strings stored in the weight file for its users.
+        processor_s: processor time of the training so far, including that recorded in a checkpoint.
     """
 
     net: nn.Module
@@ -69,7 +69,7 @@ class Recipe:
         return default_collate(samples)
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Scalars to log; the one called ``loss`` is minimised. ``net`` is the network as the loop wraps it."""
+        """Scalars to log; the one called ``loss`` is minimised. ``net`` is the network as wrapped by the loop."""
         raise NotImplementedError
 
     def optimiser(self) -> torch.optim.Optimizer:
@@ -81,7 +81,7 @@ class Recipe:
         raise NotImplementedError
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Figures on held-out data; the weights with the largest ``score`` are kept as the best."""
+        """Scores on held-out data; the weights with the largest ``score`` are kept as the best."""
         raise NotImplementedError
 
 
@@ -90,17 +90,18 @@ class LoopConfig:
     """Settings of a run.
 
     Attributes:
-        out: folder of ``last.pt`` (to go on from), ``best.safetensors``, ``metrics.csv`` and TensorBoard's events.
-        steps: optimiser steps in all.
+        out: folder of ``last.pt`` (to resume from), ``best.safetensors``, ``metrics.csv`` and TensorBoard's events.
+        steps: total number of optimiser steps.
         batch: samples per step, over all processes.
-        seed: of everything random in the loop.
-        device: ``"auto"`` takes a GPU where there is one.
-        workers: processes that prepare samples; 0 prepares them in this one.
+        seed: seed of everything random in the loop.
+        device: ``"auto"`` takes a GPU if there is one.
+        workers: processes that prepare samples; 0 prepares them in the main process.
         precision: ``"bfloat16"`` is mixed precision: convolutions and products in bfloat16, weights in float32.
-        checkpoint_every, validate_every, log_every: steps between.
-        ema_decay: of the moving average of the weights that is validated and saved; 0 takes the weights as they are.
+        checkpoint_every, validate_every, log_every: intervals in steps.
+        ema_decay: decay of the moving average of the weights that is validated and saved; 0 uses the weights as they
+            are.
         quiet: no progress bar.
-        events: write events for TensorBoard as well as ``metrics.csv``.
+        events: write events for TensorBoard in addition to ``metrics.csv``.
 
     Raises:
         TensorsimError: counts below one, a decay outside of [0, 1), an unknown precision.
@@ -147,7 +148,7 @@ class _Stream(Dataset[Batch]):
 
 
 class _Shares:
-    """Numbers of the samples of each step that belong to this process."""
+    """Numbers of the samples in each step that belong to this process."""
 
     def __init__(self, first: int, config: LoopConfig, rank: int, processes: int) -> None:
         self.first, self.config, self.rank, self.processes = first, config, rank, processes
@@ -188,7 +189,7 @@ class _Log:
 
 
 def _events(out: Path, step: int) -> Any:
-    """A writer of TensorBoard's events after ``step``."""
+    """A writer of TensorBoard events after ``step``."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -199,20 +200,20 @@ def _events(out: Path, step: int) -> Any:
     return SummaryWriter(str(out), purge_step=step + 1)
 
 
-# One function, although a long one: the steps of a run share nearly all of its state.
+# A single long function, because the steps of a run share nearly all of its state.
 def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
     """Train, from the start or from the last checkpoint in ``config.out``.
 
     Returns:
-        The figures of the best weights, with their ``step``.
+        The scores of the best weights, with their ``step``.
 
     Raises:
-        TensorsimError: the checkpoint is damaged or belongs to another run, a loss or score that is not finite,
-            TensorBoard missing.
+        TensorsimError: the checkpoint is damaged or belongs to another run, a loss or score is not finite, or
+            TensorBoard is missing.
     """
     rank, processes = rank_and_processes()
     device = _joined(config, processes)
-    recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, in bfloat16 above all
+    recipe.net.to(device).to(memory_format=torch.channels_last)  # faster convolutions, especially in bfloat16
     averaged = AveragedModel(
         recipe.net,
         multi_avg_fn=lambda means, new, count: get_ema_multi_avg_fn(_decay(config.ema_decay, int(count)))(
@@ -287,7 +288,7 @@ def fit(recipe: Recipe, config: LoopConfig) -> dict[str, float]:
 
 
 def _joined(config: LoopConfig, processes: int) -> torch.device:
-    """The device of this process, which joins the others where there are several."""
+    """The device of this process, which joins the process group if there are several."""
     device = usable_device(config.device)
     if processes > 1:
         if device.type == "cuda":
@@ -304,7 +305,7 @@ def _joined(config: LoopConfig, processes: int) -> torch.device:
 def _optimise(
     recipe: Recipe, net: nn.Module, optimiser: torch.optim.Optimizer, batch: Batch, precision: str
 ) -> dict[str, Tensor]:
-    """One step of the optimiser; the losses before it."""
+    """One optimiser step; returns the losses before it."""
     recipe.net.train()
     device = next(net.parameters()).device.type
     with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
@@ -316,7 +317,7 @@ def _optimise(
 
 
 def _batches(loader: DataLoader[Batch]) -> Iterator[Batch]:
-    """Batches; an error in a worker is raised as it was there, without the traceback that torch adds."""
+    """Batches; an error in a worker is re-raised without the traceback that torch adds to its message."""
     try:
         yield from loader
     except TensorsimError as error:
@@ -324,7 +325,7 @@ def _batches(loader: DataLoader[Batch]) -> Iterator[Batch]:
 
 
 def _decay(decay: float, count: int) -> float:
-    # A short average at first; otherwise the random initial weights would remain in it for long.
+    # A short average at first; otherwise the random initial weights would stay in it for long.
     return min(decay, (1 + count) / (10 + count))
 
 
@@ -371,14 +372,14 @@ def _save(
         "averaged": averaged.state_dict(),
         "optimiser": optimiser.state_dict(),
     }
-    # Not into the file: what torch says of a full disk is an assertion of its own.
+    # Not directly into the file: torch reports a full disk as an internal assertion.
     content = io.BytesIO()
     torch.save(state, content)
     write_bytes(path, content.getbuffer())
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What :func:`_save` wrote."""
+    """Read what :func:`_save` wrote."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     # A truncated file fails in the archive, in the pickle or in the tensors, each with its own exception.

@@ -1,4 +1,4 @@
-"""The recipe of a classifier of your own classes: cross-entropy on a data set that ``tensorsim dataset build`` made."""
+"""The recipe of a classifier for your own classes: cross-entropy on a data set made by ``tensorsim dataset build``."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,11 +21,11 @@ from tensorsim.weights import load_state_dict
 
 
 class PictureToLabel(nn.Module):
-    """Maps of a data set to logits: resized to the pictures that the network takes.
+    """Maps of a data set to logits: resized to the input size of the network.
 
     Args:
         network: pictures (B, C, size, size) in [0, 1] -> logits (B, classes).
-        size: height and width.
+        size: height and width of the input.
 
     Shapes: maps (B, C, H, W) in [0, 1] -> (B, classes). Differentiable.
     """
@@ -40,12 +40,12 @@ class PictureToLabel(nn.Module):
 
 
 def transfer(net: nn.Module, weights: dict[str, Tensor]) -> list[str]:
-    """Copy the tensors that fit into a network; returns the names of those that stay as they were.
+    """Copy the weights whose shapes fit into a network; returns the names of its other tensors, which are unchanged.
 
-    A network for other classes keeps all but its last layer.
+    For other classes, all but the last layer is copied.
 
     Raises:
-        TensorsimError: less than half of its numbers fit.
+        TensorsimError: fewer than half of the network's values fit.
     """
     own = net.state_dict()
     fitting = {k: v for k, v in weights.items() if k in own and v.shape == own[k].shape}
@@ -58,24 +58,24 @@ def transfer(net: nn.Module, weights: dict[str, Tensor]) -> list[str]:
 
 
 class MapRecipe(Recipe):
-    """Adam, coupled L2 1e-4 on weights, a tenth of the rate after half of the steps, as the shipped classifiers have.
+    """Adam, coupled L2 1e-4 on weights, a tenth of the rate after half of the steps, as for the shipped classifiers.
 
-    Every class counts alike, whatever its number of samples. Training maps are moved a little in speed and time, and
-    masked by SpecAugment.
+    All classes have equal weight, whatever their numbers of samples. Training maps are shifted slightly in speed and
+    time, and masked by SpecAugment.
 
     Args:
-        folder: of the data set, with a part for validation.
-        network: a name of ``tensorsim.training.classifier.NETWORKS``.
+        folder: folder of the data set, with a validation part.
+        network: a name in ``tensorsim.training.classifier.NETWORKS``.
         labels: classes to train on; None: all.
         output, radars: see :class:`~tensorsim.data.MapDataset`.
         size: height and width of the network's pictures; None takes that of its authors.
-        init: weights to start from, of the same network; layers of another shape start anew.
-        seed: of weights, order and augmentation.
-        learning_rate: of the first half.
+        init: weights of the same network to start from; layers of another shape are newly initialised.
+        seed: seed of weights, order and augmentation.
+        learning_rate: learning rate of the first half.
         masks: largest parts of rows and columns that are masked.
 
     Raises:
-        TensorsimError: no such data set, or one without a part for training or validation; see :class:`MapDataset`.
+        TensorsimError: no such data set, or one without a training or validation part; see :class:`MapDataset`.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class MapRecipe(Recipe):
         some = torch.stack([self.training[k]["map"].mean() for k in range(min(200, len(self.training)))])
         net.network.get_buffer("mean").fill_(float(some.mean()))
         if init is not None:
-            # The weight files of recognisers hold the network alone.
+            # Weight files of recognisers hold only the network.
             found = load_state_dict(init)
             prefixed = {k if k.startswith("network.") else f"network.{k}": v for k, v in found.items()}
             self.new_layers = transfer(net, prefixed)
@@ -163,7 +163,7 @@ class MapRecipe(Recipe):
 
 @torch.no_grad()
 def logits_of(net: nn.Module, maps: MapDataset, batch: int = 64) -> Tensor:
-    """Logits (N, classes) of all samples, in their order, on the CPU."""
+    """Logits (N, classes) of all samples in order, on the CPU."""
     device = next(net.parameters()).device
     loader: DataLoader[dict[str, Any]] = DataLoader(maps, batch, collate_fn=collate_maps)
     return torch.cat([net(part["map"].to(device)).float().cpu() for part in loader])
@@ -178,9 +178,9 @@ def confusion_markdown(table: Tensor, labels: Sequence[str]) -> str:
 
 
 def write_outcome(recipe: MapRecipe, best: Path) -> None:
-    """Write what the best weights do beside them: confusion matrix, and the network as TorchScript and ONNX.
+    """Write the results of the best weights next to them: confusion matrix, and the network as TorchScript and ONNX.
 
-    Where pictures of one radar were trained on at their own size, ``recognizer.safetensors`` is for
+    If it was trained on pictures of a single radar at their own size, ``recognizer.safetensors`` is written too, for
     :class:`~tensorsim.recognition.ActivityRecognizer` and ``tensorsim simulate --classifier``.
     """
     from tensorsim.export import to_onnx, to_torchscript

@@ -6,10 +6,10 @@ noise, s the noise amplitude, and
     A = sum |S|^2,    B = sum Re(S N*),    C = sum |N|^2.
 
 Pixels average power, so the same holds for pictures: a clip is stored as the pictures of A, ``B / sqrt(A C)`` (which
-lies in [-1, 1]) and C, a byte per pixel each, and gives the exact picture at any ratio.
+lies in [-1, 1]) and C, with one byte per pixel each, from which the picture at any ratio follows.
 
-A person does all twelve activities, each with another heading, distance and speed. One file holds what one person
-did in one scene, so that people can be held out whole and an interrupted run goes on.
+Each person does all twelve activities, each with a different heading, distance and speed. A file holds one person in
+one scene, so that whole people can be held out and an interrupted run can continue.
 """
 
 import json
@@ -43,11 +43,11 @@ from tensorsim.training.film_maps import FilmLoss
 
 SCENES = ("free-space", "through-wall")
 
-#: Rate of the generator's own knots; its spline does the rest.
+#: Rate of the generator's own knots; its spline interpolates between them.
 _MOTION_HZ = 240.0
-#: Bytes hold decibels below the peak in these steps: 102 dB in all.
+#: Bytes hold decibels below the peak in steps of this size: 102 dB in total.
 _STEP_DB = 0.4
-#: Range bins beside the body that are worked out, and what bounces inside the wall add to the range.
+#: Range bins computed on either side of the body, and the extra range of reflections inside the wall.
 _MARGIN_BINS, _WALL_M = 5, 2.0
 
 
@@ -56,13 +56,13 @@ class MapSettings:
     """Contents of a store.
 
     Attributes:
-        seed: of people, motion and noise; person k of a seed is always the same.
+        seed: seed of people, motion and noise; person k of a seed is always the same.
         size: height and width of the pictures.
-        speed_m_s: radial speeds that they show, either way.
+        speed_m_s: largest radial speed shown, in either direction.
         duration_s: length of a clip.
         motion_hz: joints are sampled at this rate before the spline to the pulses: 240 is the true motion, 30 what
-            a camera leaves of it.
-        films: tells the films apart whose errors the motion has, see
+            remains of it at a camera's rate.
+        films: identifies the films whose errors are added to the motion, see
             :class:`~tensorsim.training.film_errors.FilmErrors`; none for true motion.
 
     Raises:
@@ -85,7 +85,7 @@ class MapSettings:
         """Read the settings of a store from its ``settings.json``.
 
         Raises:
-            TensorsimError: a file that is damaged, or of a store of another kind.
+            TensorsimError: the file is damaged, or belongs to another kind of store.
         """
         try:
             return cls(**json.loads(path.read_text(encoding="utf-8")))
@@ -101,7 +101,7 @@ class MapSettings:
 def one_person_many_ways(
     count: int, generator: torch.Generator, config: PeopleConfig | None = None
 ) -> People:
-    """One drawn body ``count`` times, each with its own heading, start, speed and variation of movements."""
+    """One drawn body ``count`` times, each time with another heading, start, speed and variation of movements."""
     drawn = draw_people(count, PeopleConfig() if config is None else config, generator)
     body = drawn.take(torch.zeros(count, dtype=torch.int64))
     return drawn._replace(
@@ -126,12 +126,12 @@ def from_bytes(level: Tensor) -> Tensor:
 
 
 class Moves(NamedTuple):
-    """Motion of one person that the radar observes.
+    """Motion of one person observed by the radar.
 
     Attributes:
         joints: (12, T, 14, 3) m, by activity.
-        valid: (12, T) bool, whether there.
-        noise: state of the generator of the receiver's noise.
+        valid: (12, T) bool, whether the person is present.
+        noise: state of the random generator for the receiver's noise.
     """
 
     joints: Tensor
@@ -143,8 +143,8 @@ class MotionMaker:
     """Generates the motion of the people of a store.
 
     Args:
-        settings: of the store.
-        errors: of films, if the settings name some.
+        settings: settings of the store.
+        errors: errors of films, if the settings name some.
 
     Raises:
         TensorsimError: errors of other films.
@@ -178,7 +178,7 @@ class MapMaker:
 
     Args:
         scene: a name in ``tensorsim.radar.presets.PRESETS``; a wall comes with its multipath.
-        settings: of the store.
+        settings: settings of the store.
     """
 
     def __init__(self, scene: str, settings: MapSettings) -> None:
@@ -192,7 +192,7 @@ class MapMaker:
         self.scatterers = JointScatterers()
         self.resampler = PoseResampler(self.radar.prf_hz)
         pulses = round(settings.duration_s * self.radar.prf_hz)
-        # One frame per column is enough, a pixel averages over those between; but windows leave no pulse out.
+        # About one frame per column is enough, unless windows would then leave out pulses.
         usual = DopplerFrames(self.radar)
         hop = max(usual.hop, (pulses - 1 - usual.length) // max(1, settings.size - 1))
         hop = min(hop, usual.length)
@@ -202,7 +202,7 @@ class MapMaker:
         self.first, self.last = int(shown[0]), int(shown[-1]) + 1
 
     def spectra(self, profiles: Tensor) -> Iterator[Tensor]:
-        """Profiles (M, R) to Doppler spectra (r, K, F), a few range bins at a time; only rows in the picture."""
+        """Profiles (M, R) to Doppler spectra (r, K, F), a few range bins at a time; only rows shown in the picture."""
         window = self.frames.shifting_window.float()
         for series in self.frames.series(self.mti(profiles))[0].split(8):
             cut = series.unfold(-1, self.frames.length, self.frames.hop) * window
@@ -235,7 +235,7 @@ class MapMaker:
     def echo_pictures(self, joints: Tensor, valid: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """The pictures A and B of a person, joints (T, 14, 3) and presence (T,), with noise of the same duration.
 
-        The mean power of the echo is 1 per IF sample.
+        The mean power of the echo per IF sample is 1.
         """
         rate_hz = self.settings.motion_hz
         pulses = self.resampler.pulses(len(joints), rate_hz)
@@ -260,7 +260,7 @@ class MapMaker:
     def pictures(self, moves: Moves) -> dict[str, Tensor]:
         """Pictures of one person as stored: bytes ``signal`` and ``cross`` (12, H, W) and ``noise`` (H, W).
 
-        ``gain_db`` (12,) is the noise's peak against the signal's at a ratio of 0 dB.
+        ``gain_db`` (12,) is the noise's peak relative to the signal's at a ratio of 0 dB.
         """
         count, frames = moves.valid.shape
         pulses = self.resampler.pulses(frames, self.settings.motion_hz)
@@ -296,10 +296,10 @@ def build_maps(
 ) -> None:
     """Fill a store: people ``first`` to ``first + people`` in each scene; existing files are kept.
 
-    ``errors`` are those of the films that the settings name.
+    ``errors`` are those of the films named by the settings.
 
     Raises:
-        TensorsimError: the folder holds a store of other settings, or the errors are of other films than these.
+        TensorsimError: the folder holds a store of other settings, or the errors are of other films.
     """
     from safetensors.torch import save_file
 
@@ -330,8 +330,8 @@ class MapStore:
         folder: made by :func:`build_maps`.
 
     Attributes:
-        settings: what it holds.
-        people: scene -> sorted indices of the people whose file is there.
+        settings: settings of the store.
+        people: scene -> sorted indices of the people whose file exists.
 
     Raises:
         TensorsimError: no store there.
@@ -351,7 +351,7 @@ class MapStore:
     def power(self, scene: str, person: int, activity: int, snr_db: float | None) -> Tensor:
         """Power picture (H, W) of one clip at this signal-to-noise ratio; None is free of noise.
 
-        The empty scene has noise alone, whatever the ratio.
+        The empty scene has only noise, whatever the ratio.
         """
         from safetensors import safe_open
 

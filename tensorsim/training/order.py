@@ -13,6 +13,6 @@ def _epoch_order(epoch: int, count: int, seed: int) -> Tensor:
 
 
 def shuffled(index: int, count: int, seed: int) -> int:
-    """Which of ``count`` samples is the ``index``-th of an endless stream, shuffled anew in every epoch."""
+    """Which of ``count`` samples is the ``index``-th of an endless stream, reshuffled in every epoch."""
     epoch, place = divmod(index, count)
     return int(_epoch_order(epoch, count, seed)[place])

@@ -1,8 +1,8 @@
-"""The recipe of the pose networks: HRNet or CPM on crops of labelled people and, if wanted, rendered ones.
+"""The recipe of the pose networks: HRNet or CPM on crops of labelled people and, optionally, rendered ones.
 
-From few pictures and without weights from elsewhere, plain mean squared error on heat maps leads to maps that are
-zero everywhere. Here the foreground counts more, and the maps are compared as distributions over places as well,
-whose gradient does not vanish where the answer is far off.
+With few pictures and no pretrained weights, plain mean squared error on heat maps leads to maps that are zero
+everywhere. Here the foreground has more weight, and the maps are also compared as distributions over places, whose
+gradient does not vanish where the peak is far off.
 """
 
 import math
@@ -40,15 +40,15 @@ from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
 
-#: Of the pictures of LSPE, never trained on, see :func:`tensorsim.training.shards.split`.
+#: Percentage of the LSPE pictures that is never trained on, see :func:`tensorsim.training.shards.split`.
 LSPET_HELD_OUT_PERCENT = 3
-#: Shares of the people of :class:`PosePeople`, in its order, and of rendered people in the stream of samples.
+#: Shares in the stream of samples: groups of :class:`PosePeople` in its order, then rendered people.
 SHARES = (0.5, 0.15, 0.3, 0.12)
-#: The same where most people of LSPE are confirmed by second labels, and so among the first.
+#: The same if most people of LSPE are confirmed by second labels, and so belong to the first group.
 SHARES_CONFIRMED = (0.75, 0.12, 0.05, 0.1)
-#: Distance from a label up to which a teacher's peak agrees with it, in heights of the map.
+#: Largest distance of a teacher's peak from a label that it agrees with, relative to the height of the map.
 AGREED = 0.0625
-#: Share of the labels of a person that must agree with the teacher, for it to be believed about other keypoints.
+#: Share of a person's labels that must agree with the teacher before it is trusted for other keypoints.
 CONFIRMED = 0.6
 
 
@@ -56,9 +56,9 @@ class PosePeople(NamedTuple):
     """People to train on.
 
     Attributes:
-        sided: people whose left and right labels hold.
+        sided: people with reliable left and right labels.
         films: people in frames of films, labelled by another network.
-        unsided: people whose left and right are sometimes confused.
+        unsided: people whose left and right labels are sometimes confused.
     """
 
     sided: Sequence[Person]
@@ -67,21 +67,21 @@ class PosePeople(NamedTuple):
 
 
 def read_people(data: Path, second_labels: Path | None = None) -> PosePeople:
-    """The people to train on of a folder of shards.
+    """The people to train on from a folder of shards.
 
     Args:
         data: the folder.
         second_labels: keypoints of the people of LSPE by another network (:mod:`tensorsim.training.second_labels`);
-            those whom it confirms join the people whose left and right labels hold.
+            people whom it confirms join those with reliable left and right labels.
 
     Raises:
-        TensorsimError: shards are missing; a file that does not hold keypoints, or those of nobody in the shards.
+        TensorsimError: shards are missing; the file does not hold keypoints, or none of people in the shards.
     """
     results = None if second_labels is None else read_results(second_labels)
     sided = people(read_coco_shards(data)[0])
     films = people(Shards(find_shards(data, "films_teacher")))
     for person in films:
-        # The teacher leaves out only what is beyond the edge of the picture.
+        # The labelling network omits only keypoints beyond the edge of the picture.
         body = person.keypoints[:17]
         body[body[:, 2] == 0, 2] = -1
     unsided = people(split(Shards(find_shards(data, "lspet")), LSPET_HELD_OUT_PERCENT)[0])
@@ -96,7 +96,7 @@ def read_people(data: Path, second_labels: Path | None = None) -> PosePeople:
 
 
 def held_out_people(data: Path) -> dict[str, list[Person]]:
-    """The people of a folder of shards who are never trained on, by the name of their group.
+    """The people from a folder of shards who are never trained on, by the name of their group.
 
     Raises:
         TensorsimError: shards are missing.
@@ -109,7 +109,7 @@ def held_out_people(data: Path) -> dict[str, list[Person]]:
 def gaussian_maps(points: Tensor, size: tuple[int, int], sigma: float) -> Tensor:
     """Heat maps (..., h, w) with a Gaussian of peak 1 and this sigma, in map pixels, at points (..., 2) of the maps.
 
-    The peak is where the point is, between the pixels (as DARK has it, :mod:`tensorsim.vision.pose2d.heatmaps`).
+    The peak is exactly at the point, not rounded to a pixel (as in DARK, :mod:`tensorsim.vision.pose2d.heatmaps`).
     """
     v = torch.arange(size[0], dtype=points.dtype, device=points.device)
     u = torch.arange(size[1], dtype=points.dtype, device=points.device)
@@ -126,7 +126,7 @@ def heatmap_loss(
     sharpness: float = 10.0,
     places: float = 0.1,
 ) -> Tensor:
-    """What heat maps (..., h, w) cost, per map (...); zero where they equal the targets.
+    """Loss of heat maps (..., h, w), per map (...); zero where they equal the targets.
 
     ``sum_x (1 + foreground e) (m - t)^2 / ((1 + foreground) max(sum_x t^2, 1))`` and, weighted with ``places``, the
     Kullback-Leibler divergence of ``softmax(sharpness m)`` from ``softmax(sharpness t)`` over places x. Both have their
@@ -153,13 +153,13 @@ def person_loss(
 ) -> Tensor:
     """Mean loss over the keypoints of each person that are known or gone (N,), zero where none is.
 
-    The map of a keypoint that is gone should be zero: where the picture ends within a person, low peaks then tell
-    which part of the body is out of sight. Where the same keypoint of somebody else is, zeros count as much as the
-    peak does.
+    The map of a keypoint that is gone should be zero: where a person is cut off by the picture, low peaks then show
+    which part of the body is out of sight. At the same keypoint of another person, zeros have as much weight as the
+    peak.
 
-    Where ``sided`` is false, left and right may have been confused by the annotators: then the loss against labels
-    with sides exchanged is taken instead if it is less than half as large, which a network reaches only once it
-    can distinguish the sides by itself.
+    Where ``sided`` is false, annotators may have confused left and right: the loss against labels with the sides
+    swapped is used instead if it is less than half as large, which happens only once the network itself can
+    distinguish the sides.
 
     Args:
         maps: (N, 17, h, w).
@@ -168,7 +168,7 @@ def person_loss(
         gone: (N, 17) bool, none of them known.
         rivals: (N, M, 17, 2) crop pixels, keypoints of M others; far outside where there are none.
         sided: (N,) bool.
-        sigma: of the targets, map pixels.
+        sigma: sigma of the targets, map pixels.
         stride: crop pixels per map pixel.
     """
     size = (maps.shape[-2], maps.shape[-1])
@@ -191,9 +191,9 @@ def person_loss(
 
 
 def sharpened(maps: Tensor, sigma: float, of_teacher: float = 2.0) -> Tensor:
-    """Heat maps (..., h, w) with their Gaussian peaks made as narrow as those of ``sigma`` map pixels, of equal height.
+    """Heat maps (..., h, w) with their Gaussian peaks narrowed to ``sigma`` map pixels, at the same height.
 
-    ``h (m / h)^((s / sigma)^2)``, where h is the height of the map m and s is ``of_teacher``, the sigma that it has: by
+    ``h (m / h)^((s / sigma)^2)``, where h is the height of the map m and s is ``of_teacher``, its present sigma: by
     default that of B. Xiao et al., "Simple baselines for human pose estimation and tracking", ECCV 2018.
     """
     maps = maps.clamp(0, 1)
@@ -202,11 +202,11 @@ def sharpened(maps: Tensor, sigma: float, of_teacher: float = 2.0) -> Tensor:
 
 
 def distillation_loss(maps: Tensor, taught: Tensor, points: Tensor, known: Tensor, gone: Tensor) -> Tensor:
-    """How far maps are from a teacher's, (N,): the mean of :func:`heatmap_loss` over what the teacher is right about.
+    """Distance of maps from a teacher's (N,): mean :func:`heatmap_loss` over the keypoints for which it is trusted.
 
-    That is a known keypoint whose label is within :data:`AGREED` of the peak of the teacher's map, which is as high as
-    the labels' then, and, of people of whom at least :data:`CONFIRMED` of the known keypoints are, those keypoints that
-    are neither known nor gone.
+    These are the known keypoints with a label within :data:`AGREED` of the peak of the teacher's map, which is then
+    scaled to a height of 1; and for people with at least :data:`CONFIRMED` of their known keypoints among these, also
+    the keypoints that are neither known nor gone.
 
     Args:
         maps: (N, 17, h, w).
@@ -227,10 +227,10 @@ def distillation_loss(maps: Tensor, taught: Tensor, points: Tensor, known: Tenso
 
 
 class TrainedCPM(CPM):
-    """CPM that gives the maps of every stage in training, (S, N, 17, h, w), as each of them is supervised."""
+    """CPM that returns the maps of all stages in training, (S, N, 17, h, w), because every stage is supervised."""
 
     def forward(self, crops: Tensor) -> Tensor:
-        """Maps of all stages in training, else those of the last one."""
+        """Maps of all stages in training, else those of the last stage."""
         stages = self.stages(crops)
         return torch.stack(stages) if self.training else stages[-1]
 
@@ -240,18 +240,18 @@ class PoseRecipe(Recipe):
 
     Args:
         net: the network, for crops of its ``input_size``.
-        persons: whom to train on.
-        validation: held-out people by name; the mean of their OKS is the score.
+        persons: people to train on.
+        validation: groups of held-out people by name; the mean of their OKS is the score.
         rendered: people with exact labels, face included; None leaves them out.
-        seed: of the stream of samples.
-        learning_rate: the highest.
-        sigma: of the targets, in heat-map pixels.
-        first_size: (H, W) of the crops of the first ``first_samples`` samples: smaller ones teach faster.
-        first_samples: how many; 0 trains at the network's size from the start.
-        shares: of ``sided``, ``films``, ``unsided`` and ``rendered`` in the stream, in relation to each other.
-        augmentation: of the crops.
-        teacher: a better network, crops to heat maps of the same size, whose answers HRNet learns besides the labels;
-            None: from labels alone.
+        seed: seed of the stream of samples.
+        learning_rate: peak learning rate.
+        sigma: sigma of the targets, in heat-map pixels.
+        first_size: (H, W) of the crops of the first ``first_samples`` samples: smaller ones train faster.
+        first_samples: number of these samples; 0 trains at the network's size from the start.
+        shares: relative shares of ``sided``, ``films``, ``unsided`` and ``rendered`` in the stream.
+        augmentation: augmentation of the crops.
+        teacher: a better network, crops to heat maps of the same size, whose outputs HRNet learns in addition to the
+            labels; None learns from labels only.
 
     Raises:
         TensorsimError: a source without people.
@@ -304,13 +304,13 @@ class PoseRecipe(Recipe):
         self.weights = [_weights(group) for group in self.groups]
 
     def sample(self, index: int) -> dict[str, Any]:
-        """A crop (3, h, w) uint8, its points and rivals, which are known and which gone, whether sides hold.
+        """A crop (3, h, w) uint8, its points and rivals, which are known and which gone, whether sides are reliable.
 
-        With a teacher, its maps (17, h/4, w/4) as well: found here, by the processes that prepare samples.
+        With a teacher, also its maps (17, h/4, w/4), computed here by the processes that prepare samples.
         """
         import cv2
 
-        cv2.setNumThreads(0)  # the processes of the loader are the parallel ones
+        cv2.setNumThreads(0)  # the loader's processes already run in parallel
         generator = np.random.default_rng((self.seed, index))
         size = self.first_size if index < self.first_samples else self.input_size
         source = int(generator.choice(len(self.shares), p=self.shares))
@@ -344,8 +344,8 @@ class PoseRecipe(Recipe):
         }
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Mean over the batch, and over the stages of CPM, of :func:`person_loss`; with a teacher of
-        :func:`distillation_loss` besides."""
+        """Mean of :func:`person_loss` over the batch and the stages of CPM; with a teacher, plus
+        :func:`distillation_loss`."""
         crops = batch["crops"].float() / 255
         maps = net(crops.contiguous(memory_format=torch.channels_last)).float()
         labels = {name: batch[name] for name in ("points", "known", "gone", "rivals", "sided")}
@@ -377,12 +377,12 @@ class PoseRecipe(Recipe):
 
 
 def by_group(figures: dict[str, dict[str, float]]) -> dict[str, float]:
-    """The figures of groups of people, in one table."""
+    """The scores of groups of people in one table."""
     return {f"{name}_{k}": v for name, figure in figures.items() for k, v in figure.items()}
 
 
 def _weights(persons: Sequence[Person]) -> npt.NDArray[np.float64]:
-    """How often each person is taken: those who stand more often, as in films, and those with others beside them."""
+    """Probability of drawing each person: higher for upright people, as in films, and for those next to others."""
     standing = np.array([abs(lean_deg(person.keypoints)) < 30 for person in persons], float)
     beside = np.array([(person.others[..., 2] > 0).any() for person in persons], float)
     weights = 1 + standing + beside
@@ -390,7 +390,7 @@ def _weights(persons: Sequence[Person]) -> npt.NDArray[np.float64]:
 
 
 def covered(image: Picture, generator: np.random.Generator) -> Picture:
-    """A crop (h, w, 3), at times with a rectangle of one colour over a part of it, in place."""
+    """A crop (h, w, 3), sometimes with a rectangle of one colour over a part of it, in place."""
     if generator.random() < 0.35:
         size = np.array(image.shape[:2])
         extent = (size * np.exp(generator.uniform(np.log(0.12), np.log(0.45), 2))).astype(int) + 1

@@ -1,7 +1,7 @@
-"""Crops of people to train a pose network on: labelled pictures and rendered people, turned, scaled and mirrored.
+"""Crops of people to train a pose network on: labelled pictures and rendered people, rotated, scaled and mirrored.
 
-Crops follow :mod:`tensorsim.vision.pose2d.crops`: pixel centres at integers, and without augmentation a crop is the one
-that :class:`~tensorsim.vision.pose2d.crops.BoxCrop` gives for the person's box.
+Crops follow :mod:`tensorsim.vision.pose2d.crops`: pixel centres are at integers, and without augmentation a crop is
+that of :class:`~tensorsim.vision.pose2d.crops.BoxCrop` for the person's box.
 """
 
 import math
@@ -21,10 +21,10 @@ from tensorsim.training.shards import Floats, Sample
 
 Doubles = npt.NDArray[np.float64]
 
-PADDING = 1.25  # of the boxes, as TopDownPose has it
+PADDING = 1.25  # of the boxes, as in TopDownPose
 _SHOULDERS, _HIPS = (5, 6), (11, 12)
 _UPPER, _LOWER, _LEGS = tuple(range(13)), tuple(range(11, 17)), tuple(range(13, 17))
-#: People beside somebody whose keypoints the network is to keep apart.
+#: Number of neighbours whose keypoints the network is to keep apart from those of a person.
 NEIGHBOURS = 2
 _FAR = -1e4
 
@@ -35,8 +35,8 @@ class Person(NamedTuple):
     Attributes:
         sample: the picture.
         box: (4,) ``xyxy`` pixels.
-        keypoints: (17 or 19, 3): x, y and v; a neck and the top of the head, where given, help to find the box of
-            a person who is turned.
+        keypoints: (17 or 19, 3): x, y and v; neck and top of the head, if given, help to find the box of a rotated
+            person.
         area: pixels that show the person.
         others: (NEIGHBOURS, 17, 3): keypoints of the people who overlap most; zero where there are none.
     """
@@ -49,13 +49,13 @@ class Person(NamedTuple):
 
 
 class Crop(NamedTuple):
-    """What the network is shown and what it should say.
+    """The input of the network and its targets.
 
     Attributes:
         image: (h, w, 3) uint8 RGB.
         points: (17, 2) float32, crop pixels.
-        known: (17,) bool, labelled and inside of the crop.
-        gone: (17,) bool, labelled but cut away: nothing of them is to be found in the crop.
+        known: (17,) bool, labelled and inside the crop.
+        gone: (17,) bool, labelled but cut off: they are not visible in the crop.
         rivals: (NEIGHBOURS, 17, 2) float32, crop pixels: the keypoints of others, far outside where not labelled.
     """
 
@@ -68,17 +68,17 @@ class Crop(NamedTuple):
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How far crops may be from upright, well centred ones.
+    """How far crops may deviate from upright, well-centred ones.
 
     Attributes:
-        scale: standard deviation of the log of the box's factor; held within a factor of 1.5.
-        turn_deg: standard deviation of the rotation; held within twice as much.
-        shift: of the centre, standard deviation in sizes of the box.
-        edge: of each edge of the box by itself, standard deviation in sizes of the box.
-        upright: probability that a person who lies or leans is stood upright before that turn.
+        scale: standard deviation of the log of the box's scale factor; limited to a factor of 1.5.
+        turn_deg: standard deviation of the rotation; limited to twice as much.
+        shift: standard deviation of the shift of the centre, relative to the size of the box.
+        edge: standard deviation of the independent shift of each edge of the box, relative to the size of the box.
+        upright: probability that a lying or leaning person is rotated upright before that rotation.
         lay: probability that a person is laid on a side after it.
         half: probability that only the upper or the lower body is cropped.
-        cut: probability that the picture ends within the person, mostly below.
+        cut: probability that the edge of the picture cuts the person, mostly from below.
         repeat: probability that the edges of the picture are repeated beyond it, instead of black.
     """
 
@@ -93,14 +93,14 @@ class Augmentation:
     repeat: float = 0.5
 
 
-#: Crops nearer to those that the network will see, for the end of a training.
+#: Crops closer to those in use, for the end of a training.
 MILD_AUGMENTATION = Augmentation(scale=0.1, turn_deg=8.0, shift=0.03, edge=0.03, lay=0.08, half=0.1, cut=0.2)
-#: Crops of pictures that mostly end within the people, padded as the pipeline pads them.
+#: Crops of people mostly cut by the edge of the picture, padded as in the pipeline.
 CUT_AUGMENTATION = replace(MILD_AUGMENTATION, cut=0.75, repeat=0.0)
 
 
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
-    """The people of pictures with at least this many labelled COCO keypoints and a longest side of at least this."""
+    """The people in pictures with at least this many labelled COCO keypoints and a box with at least this longer side."""
     found = []
     for sample in samples:
         for index, keypoints in enumerate(sample.keypoints):
@@ -112,7 +112,7 @@ def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) ->
 
 
 def _neighbours(sample: Sample, index: int) -> Floats:
-    """Keypoints (NEIGHBOURS, 17, 3) of the people whose boxes share most of that of one."""
+    """Keypoints (NEIGHBOURS, 17, 3) of the people whose boxes overlap that of this person most."""
     low = np.maximum(sample.boxes[:, :2], sample.boxes[index, :2])
     high = np.minimum(sample.boxes[:, 2:], sample.boxes[index, 2:])
     shared = np.maximum(high - low, 0).prod(1)
@@ -135,12 +135,12 @@ def cut_by_the_picture(image: Picture, box: Floats, keypoints: Floats) -> Floats
 
 
 def upright(persons: Sequence[Person], most_deg: float = 30.0) -> list[Person]:
-    """Those of the people whose trunk leans no further than that."""
+    """The people whose trunk leans less than this."""
     return [person for person in persons if abs(lean_deg(person.keypoints)) < most_deg]
 
 
 def large(persons: Sequence[Person], least: int = 8, share: float = 0.25) -> list[Person]:
-    """The people with at least this many labelled COCO keypoints and at least this share of their picture's height."""
+    """The people with at least this many labelled COCO keypoints and this share of their picture's height."""
     return [
         person
         for person in persons
@@ -150,7 +150,7 @@ def large(persons: Sequence[Person], least: int = 8, share: float = 0.25) -> lis
 
 
 def lean_deg(keypoints: Floats) -> float:
-    """How far the trunk is from upright: the turn, positive clockwise as seen, from upright to what it is.
+    """Angle of the trunk from upright in the picture, positive clockwise.
 
     NaN where shoulders or hips are not labelled.
     """
@@ -162,7 +162,7 @@ def lean_deg(keypoints: Floats) -> float:
 
 
 def rotation(angle_deg: float) -> Doubles:
-    """(2, 2) turn of image points, clockwise as seen (v points down)."""
+    """(2, 2) rotation of image points, clockwise as seen (v points down)."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.array([[c, -s], [s, c]])
 
@@ -181,10 +181,10 @@ def box_matrix(box: Doubles, size: tuple[int, int], mirrored: bool = False) -> D
 
 
 def turned_box(box: Floats, keypoints: Floats, turn: Doubles) -> Doubles:
-    """Box of a person in a turned picture: around the turned keypoints, as far from them as the box was."""
+    """Box of a person in a rotated picture: around the rotated keypoints, as far from them as the box was."""
     known = keypoints[keypoints[:, 2] > 0, :2].astype(np.float64)
     low, high = known.min(0), known.max(0)
-    # Flesh around the points, turned as an offset of the middle and half an extra size.
+    # Margin around the points, rotated as an offset of the middle and half an extra size.
     offset = turn @ ((box[:2] + box[2:]) / 2 - (low + high) / 2)
     flesh = np.abs(turn) @ ((box[2:] - box[:2]) - (high - low)) / 2
     low, high = (known @ turn.T).min(0), (known @ turn.T).max(0)
@@ -205,19 +205,19 @@ def crop_person(
     """Crop a person from a picture.
 
     Args:
-        image: (H, W, C) uint8; C is 3, or 4 with an alpha that the colours were multiplied with.
+        image: (H, W, C) uint8; C is 3, or 4 with premultiplied alpha.
         box: (4,) ``xyxy`` pixels.
         keypoints: (17 or 19, 3): x, y and v.
         size: (h, w) of the crop.
         augmentation: how it may be changed; None crops the box as it is.
-        generator: decides; needed with an augmentation.
-        others: (NEIGHBOURS, 17, 3) keypoints of other people in the picture; None knows of none.
+        generator: random generator; needed with an augmentation.
+        others: (NEIGHBOURS, 17, 3) keypoints of other people in the picture; None if there are none.
 
     Returns:
         The crop, with the C channels of the image.
 
     Raises:
-        TensorsimError: a person without a labelled point, an augmentation without a generator.
+        TensorsimError: a person without labelled points, or an augmentation without a generator.
     """
     import cv2
 
@@ -261,10 +261,10 @@ def crop_person(
 def cut_picture(
     image: Picture, box: Floats, keypoints: Floats, generator: np.random.Generator
 ) -> tuple[Picture, Floats, Floats]:
-    """Picture, box and keypoints of a person as if the edge of the picture went through them.
+    """Picture, box and keypoints of a person as if the edge of the picture cut through the person.
 
-    Half the time the lower edge does, else one of the others, a quarter to three quarters into the box; labelled
-    points beyond get v = -1. With fewer than four labelled points left, all stays as it is.
+    Half the time it is the lower edge, else one of the others, a quarter to three quarters into the box; labelled
+    points beyond get v = -1. If fewer than four labelled points would remain, nothing is changed.
     """
     axis = int(generator.random() < 0.6)  # 0 cuts at a u, 1 at a v
     keep_low = bool(generator.random() < (0.5 if axis == 0 else 0.85))
@@ -288,7 +288,7 @@ def cut_picture(
 def _vary(
     box: Floats, keypoints: Floats, augmentation: Augmentation, generator: np.random.Generator
 ) -> tuple[Doubles, Doubles]:
-    """A random turn (2, 2) of the picture, and the box to crop from the turned picture."""
+    """A random rotation (2, 2) of the picture, and the box to crop from the rotated picture."""
 
     def bounded_normal(deviation: float) -> float:
         return deviation * float(np.clip(generator.standard_normal(), -2, 2))
@@ -318,7 +318,7 @@ def _vary(
 
 
 class RenderedPeople:
-    """Cut-out people on pictures of places.
+    """Cut-out people in front of pictures of places.
 
     Args:
         cutouts: the people.
@@ -338,20 +338,20 @@ class RenderedPeople:
     def crop(
         self, index: int, size: tuple[int, int], augmentation: Augmentation, generator: np.random.Generator
     ) -> Crop:
-        """A crop (3 channels) of the person ``index``, on a place that ``generator`` draws."""
+        """A crop (3 channels) of the person ``index`` in front of a random place."""
         cutout = self.cutouts[index]
         height, width = cutout.rgba.shape[:2]
         box = np.array([0, 0, width - 1, height - 1], np.float32)
         rgba, keypoints = np.pad(cutout.rgba, ((2, 2), (2, 2), (0, 0))), cutout.keypoints.copy()
         keypoints[:, :2] += 2
-        # Multiplied with alpha, colours can be interpolated.
+        # With premultiplied alpha, colours can be interpolated.
         crop = crop_person(premultiplied(rgba), box + 2, keypoints, size, augmentation, generator)
         place = random_view(self.places[int(generator.integers(len(self.places)))].image(), size, generator)
         return crop._replace(image=over(place, crop.image))
 
 
 def random_view(image: Picture, size: tuple[int, int], generator: np.random.Generator) -> Picture:
-    """Part of a picture, of the aspect of (h, w), a third to all of what fits, maybe mirrored."""
+    """Part of a picture with the aspect ratio of (h, w), at a third to all of the largest size, possibly mirrored."""
     import cv2
 
     height, width = size

@@ -19,7 +19,7 @@ from tensorsim.vision.pose2d.topdown import TopDownPose
 _FACE = (0.026, 0.025, 0.025, 0.035, 0.035)
 _ARMS = (0.079, 0.079, 0.072, 0.072, 0.062, 0.062)
 _LEGS = (0.107, 0.107, 0.087, 0.087, 0.089, 0.089)
-#: Standard deviation of human annotators per COCO keypoint, in roots of the area.
+#: Standard deviation of human annotators per COCO keypoint, relative to the square root of the area.
 SIGMAS = (*_FACE, *_ARMS, *_LEGS)
 
 
@@ -58,10 +58,10 @@ def pck(found: Tensor, points: Tensor, known: Tensor, side: Tensor, share: float
 
 
 def pck_either_way(found: Tensor, points: Tensor, known: Tensor, side: Tensor, share: float = 0.1) -> Tensor:
-    """:func:`pck` of the pairs of left and right keypoints of the body, each pair the way round that fits better.
+    """:func:`pck` of the pairs of left and right keypoints of the body, each pair swapped if that fits better.
 
-    Sides that are confused in a frame are put right over time, by :class:`~tensorsim.vision.SteadySides`; two keypoints
-    on one leg are not. Pairs count of which both are labelled.
+    Sides confused in single frames are corrected over time by :class:`~tensorsim.vision.SteadySides`; two keypoints
+    on the same leg are not. Only pairs with both keypoints labelled count.
     """
     left, right = found[:, 5::2], found[:, 6::2]
     near = share * side[:, None]
@@ -75,20 +75,20 @@ def pck_either_way(found: Tensor, points: Tensor, known: Tensor, side: Tensor, s
 
 
 def evaluate_pose(network: nn.Module, persons: Sequence[Person], quiet: bool = True) -> dict[str, float]:
-    """Find the keypoints of people in their boxes, as the pipeline does, and compare with the labels.
+    """Find the keypoints of people in their boxes, as the pipeline does, and compare them with the labels.
 
     Args:
         network: a :class:`~tensorsim.vision.TopDownPose`, or crops to heat maps, as
             :class:`~tensorsim.vision.HRNet`; in evaluation mode.
-        persons: whom to look for.
+        persons: the people.
         quiet: no progress bar.
 
     Returns:
         ``oks``, the mean over people; ``pck``, PCK@0.1 over all keypoints; ``pck_body``, without the face;
-        ``pck_pairs``, that of :func:`pck_either_way`.
+        ``pck_pairs``, from :func:`pck_either_way`.
 
     Raises:
-        TensorsimError: nobody to look for.
+        TensorsimError: no people.
     """
     if not persons:
         raise TensorsimError("evaluate_pose: got no people, expected some with labelled keypoints")
@@ -112,13 +112,13 @@ def evaluate_pose(network: nn.Module, persons: Sequence[Person], quiet: bool = T
 def evaluate_cut(
     network: nn.Module, persons: Sequence[Person], threshold: float = 0.3, seed: int = 0, quiet: bool = True
 ) -> dict[str, float]:
-    """Let pictures end within the people, and see whether the scores tell what is out of sight.
+    """Cut pictures through the people and check whether the scores show which keypoints are out of sight.
 
     Args:
         network: as in :func:`evaluate_pose`.
-        persons: whom to cut (:func:`~tensorsim.training.pose_data.cut_picture`).
+        persons: people to cut (:func:`~tensorsim.training.pose_data.cut_picture`).
         threshold: score from which a keypoint counts as seen.
-        seed: of the cuts.
+        seed: seed of the cuts.
         quiet: no progress bar.
 
     Returns:
@@ -140,7 +140,7 @@ def evaluate_cut(
 
 
 def _stage(network: nn.Module) -> TopDownPose:
-    """The network as the pipeline has it, all of it on the device of its parameters."""
+    """The network as a stage of the pipeline, entirely on the device of its parameters."""
     device = next(iter(network.parameters()), torch.zeros(0)).device
     return (network if isinstance(network, TopDownPose) else TopDownPose(network)).to(device)
 

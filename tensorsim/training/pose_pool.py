@@ -16,12 +16,12 @@ from tensorsim.motion.people import PeopleConfig, draw_people
 from tensorsim.motion.pose_sampler import sample_poses
 from tensorsim.vision.lifting.pose_library import standardise_poses, turn
 
-#: Standard deviation of the lengths of segments in generated pools, as a share of them: skeletons that people
-#: and networks draw differ by more than bodies do.
+#: Relative standard deviation of segment lengths in generated pools: skeletons labelled by people and networks differ
+#: more than bodies do.
 LIMB_DEVIATION = 0.05
-#: Frames taken of a generated clip of 4 s.
+#: Frames taken from a generated clip of 4 s.
 _MOMENTS = 20
-#: What people do near the floor or far from upright, and what few clips of the activities show.
+#: Movements near the floor or far from upright, and others that are rare in clips of the activities.
 _EVERYDAY = (
     exercises.pick_up,
     exercises.bend,
@@ -39,7 +39,7 @@ _EVERYDAY = (
 def facing_away(poses: Tensor) -> Tensor:
     """Poses (L, 14, 3) turned about the vertical so that the right side of hips and shoulders points along +x.
 
-    A pose lying on its side, whose line from left to right has no direction seen from above, is kept as it is.
+    A pose lying on its side, whose left-to-right line has no horizontal direction, is kept as it is.
     """
 
     def across(joint: str) -> Tensor:
@@ -73,7 +73,7 @@ def everyday_poses(count: int, seed: int) -> Tensor:
 
 
 def generated_poses(count: int, seed: int) -> Tensor:
-    """Poses of tensorsim's own: a sixth of :func:`everyday_poses`, of the rest a third from the activities.
+    """Generated poses: a sixth from :func:`everyday_poses`, a third of the rest from the activities.
 
     The others are drawn by :func:`~tensorsim.motion.pose_sampler.sample_poses`.
 
@@ -103,9 +103,9 @@ def generated_poses(count: int, seed: int) -> Tensor:
 
 
 def recorded_poses(file: Path) -> Tensor:
-    """All poses of a motion capture file that :func:`tensorsim.data.motion_files.load_motion` reads.
+    """All poses of a motion capture file that :func:`tensorsim.data.motion_files.load_motion` can read.
 
-    Of an npz with several arrays of joints all are taken.
+    From an npz with several arrays of joints, all are used.
 
     Returns:
         (L, 14, 3) float64, standardised, facing +y.
@@ -117,7 +117,7 @@ def recorded_poses(file: Path) -> Tensor:
 
     poses = []
     for key in motion_keys(file):
-        motion = load_motion(file, key=key, fps=30.0)  # a pool of poses knows no time
+        motion = load_motion(file, key=key, fps=30.0)  # the frame rate does not matter for poses
         poses.append(motion.joints[motion.valid].double())
     if sum(len(p) for p in poses) == 0:
         raise TensorsimError(f"{file}: contains no people, expected poses")
@@ -132,15 +132,15 @@ def with_mirror_images(poses: Tensor) -> Tensor:
 def without_near_duplicates(
     poses: Tensor, tolerance: float, progress: Callable[[Iterable[Tensor]], Iterable[Tensor]] = iter
 ) -> Tensor:
-    """Poses no two of which are nearer than a tolerance; the first of every such group is kept.
+    """Poses without near-duplicates: no two are closer than a tolerance; the first of each group is kept.
 
     Args:
         poses: (L, 14, 3) body heights.
         tolerance: body heights, root mean square over the joints.
-        progress: wraps the blocks of 1024 poses that are worked off, to show how far it is.
+        progress: wraps the iteration over blocks of 1024 poses, to show progress.
 
     Returns:
-        (K, 14, 3), in the order of the poses. Every pose left out is within the tolerance of one that is kept.
+        (K, 14, 3), in the order of the poses. Every pose left out is within the tolerance of a kept one.
     """
     check_positive(tolerance, "tolerance")
     radius = tolerance * math.sqrt(len(JOINTS))

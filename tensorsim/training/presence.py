@@ -1,4 +1,4 @@
-"""The recipe of HRNet's head that tells which key points are in the picture, with the rest of the network as it is."""
+"""The recipe of HRNet's presence head, which predicts which key points are in the picture; the rest is frozen."""
 
 from dataclasses import replace
 
@@ -13,17 +13,17 @@ from tensorsim.training.pose_data import CUT_AUGMENTATION, Person
 from tensorsim.training.pose_metrics import evaluate_cut
 from tensorsim.vision.pose2d.hrnet import HRNet, PresenceHead
 
-#: Shares of people in pictures, in films, with confused sides and rendered: those whose hidden points are known best.
+#: Shares of people in pictures, in films, with confused sides, and rendered: most where hidden points are best known.
 SHARES_PRESENCE = (0.8, 0.2, 0.0, 0.0)
-#: Score of a key point that is in the picture or not with even odds. The mean with the mirror image lowers it to 0.3.
+#: Score at which a key point is in the picture with even odds; averaging with the mirror image lowers it to 0.3.
 EVEN_ODDS = 0.34
 
 
 def presence_loss(scores: Tensor, known: Tensor, gone: Tensor, sharpness: float = 4.0) -> Tensor:
-    """Cross-entropy of telling key points in the picture from those beyond its edge by scores.
+    """Cross-entropy of classifying key points by score as in the picture or beyond its edge.
 
     The probability of being in the picture is a logistic function of the logarithm of the score, one half at
-    :data:`EVEN_ODDS`; key points of which nothing is known do not count.
+    :data:`EVEN_ODDS`; key points that are neither known nor gone do not count.
 
     Args:
         scores: (N, 17) heights of the peaks.
@@ -38,7 +38,7 @@ def presence_loss(scores: Tensor, known: Tensor, gone: Tensor, sharpness: float 
 
 
 def with_presence_head(net: HRNet, hidden: int = 128) -> HRNet:
-    """The same network with an untrained presence head, which changes nothing yet, unless it has one already."""
+    """The same network with an untrained presence head, which has no effect yet, unless it already has one."""
     if isinstance(net.presence, PresenceHead):
         return net
     other = HRNet(replace(net.config, presence=hidden), net.input_size)
@@ -47,13 +47,13 @@ def with_presence_head(net: HRNet, hidden: int = 128) -> HRNet:
 
 
 class PresenceRecipe(PoseRecipe):
-    """Train the :class:`~tensorsim.vision.pose2d.hrnet.PresenceHead` of an HRNet, and nothing else of it.
+    """Train only the :class:`~tensorsim.vision.pose2d.hrnet.PresenceHead` of an HRNet.
 
     Args:
-        net: with such a head, and with trained weights.
-        persons, seed, learning_rate: as of :class:`~tensorsim.training.pose.PoseRecipe`.
-        validation: held-out people; the share of their key points in the picture that are seen, less that of those
-            beyond its edge, is the score.
+        net: trained network with such a head.
+        persons, seed, learning_rate: as for :class:`~tensorsim.training.pose.PoseRecipe`.
+        validation: held-out people; the score is the share of seen key points in the picture minus the share of seen
+            key points beyond its edge.
 
     Raises:
         TensorsimError: a network without such a head, a source without people.
@@ -87,12 +87,12 @@ class PresenceRecipe(PoseRecipe):
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """:func:`presence_loss` of the batch."""
-        net.eval()  # the rest of the network, its statistics included, stays as it is
+        net.eval()  # the rest of the network, including its statistics, is frozen
         maps = net(batch["crops"].float() / 255).float()
         return {"loss": presence_loss(maps.amax((-2, -1)), batch["known"], batch["gone"])}
 
     def optimiser(self) -> torch.optim.Optimizer:
-        """AdamW of the head."""
+        """AdamW for the head."""
         return torch.optim.AdamW(self.head.parameters(), lr=self.learning_rate, weight_decay=0.02)
 
     def validate(self, net: nn.Module) -> dict[str, float]:

@@ -1,8 +1,8 @@
 """Labels of people corrected by a second set of keypoints, found by another network.
 
-Leeds Sports Pose Extended was labelled by untrained annotators: left and right are exchanged at times, joints are off
-by the width of a hand, and faces have no points. A network that was trained on other pictures makes other mistakes.
-Where the two agree both are taken to be right, and their mean is better than either.
+Leeds Sports Pose Extended was labelled by untrained annotators: left and right are sometimes swapped, joints are off
+by a hand's width, and faces have no points. A network trained on other pictures makes different mistakes. Where the
+two agree, both are assumed to be right, and their mean is better than either.
 """
 
 import json
@@ -22,24 +22,24 @@ from tensorsim.training.shards import Floats
 #: Boxes and keypoints (n, 17, 3), x, y and score, by the key of the picture.
 Results = Mapping[str, tuple[Floats, Floats]]
 
-#: Distance from which two labels of a joint contradict each other, share of the longer side of the box.
+#: Distance above which two labels of a joint contradict each other, as a share of the longer side of the box.
 NEAR = 0.08
 #: Share of the joints that must agree.
 MOST = 0.6
-#: Score of a point of the face that is believed.
+#: Score above which a point of the face is trusted.
 FACE_SCORE = 0.35
 _BODY = slice(5, 17)
 
 
 def read_results(path: str | os.PathLike[str]) -> dict[str, tuple[Floats, Floats]]:
-    """Keypoints in COCO's format of results, with the box that each is of.
+    """Keypoints in COCO's results format, with their boxes.
 
     Args:
         path: json with a list of ``{"image_id": KEY, "bbox": [x, y, w, h], "keypoints": [x, y, score, ...]}``, of 17
             points each.
 
     Raises:
-        TensorsimError: no such file, or something else in it.
+        TensorsimError: no such file, or other content.
     """
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -61,15 +61,15 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, tuple[Floats, Floats
 
 
 def put_right(persons: Sequence[Person], results: Results) -> tuple[list[Person], list[Person]]:
-    """Divide people into those whom a second labelling confirms, with better keypoints, and the others as they were.
+    """Divide people into those confirmed by second labels, with improved keypoints, and the others, unchanged.
 
-    Where at least :data:`MOST` of the labelled joints of the body are within :data:`NEAR` of the second labels, each is
-    put at the mean of both, one that disagrees counts as not labelled, the face is taken from the second labels, and
-    left and right are theirs.
+    People are confirmed if at least :data:`MOST` of the labelled body joints are within :data:`NEAR` of the second
+    labels. Their joints are set to the mean of both, disagreeing ones count as not labelled, and the face and the
+    assignment of left and right are taken from the second labels.
 
     Args:
         persons: people whose left and right may have been confused.
-        results: of :func:`read_results`; people without are not confirmed.
+        results: from :func:`read_results`; people without results are not confirmed.
 
     Returns:
         The confirmed and the others.
@@ -86,7 +86,7 @@ def put_right(persons: Sequence[Person], results: Results) -> tuple[list[Person]
 
 
 def _second(person: Person, results: Results) -> Floats | None:
-    """The second keypoints (17, 3) of the box that is this person's."""
+    """The second keypoints (17, 3) of this person, found by the box."""
     boxes, points = results.get(person.sample.key, (None, None))
     if boxes is None or points is None:
         return None
@@ -96,7 +96,7 @@ def _second(person: Person, results: Results) -> Floats | None:
 
 
 def _mean(person: Person, second: Floats) -> Floats | None:
-    """Keypoints (19, 3) by both labellings; None where they contradict each other."""
+    """Keypoints (19, 3) from both labellings; None if they contradict each other."""
     near = NEAR * float((person.box[2:] - person.box[:2]).max())
     ways = [person.keypoints[:17], person.keypoints[list(MIRRORED)]]
     agree = [

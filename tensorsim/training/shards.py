@@ -27,7 +27,7 @@ Floats = npt.NDArray[np.float32]
 POINTS = (*COCO_KEYPOINTS, "neck", "head_top")
 #: Shards of COCO pictures with people.
 COCO_SHARDS = ("coco_small", "coco_more", "coco_extra")
-#: Pictures of these whose hash is below this are never used in training. coco_more and coco_extra have none below 15.
+#: Pictures in these with a hash below this are never used in training. coco_more and coco_extra have none below 15.
 COCO_HELD_OUT_PERCENT = 25
 #: Typical share of a box that its person covers.
 AREA_OF_BOX = 0.53
@@ -42,10 +42,10 @@ class Sample:
         boxes: (n, 4) float32 ``xyxy`` pixels.
         keypoints: (n, 19, 3) float32: x, y and v of :data:`POINTS`; all zero for a person without points.
         areas: (n,) float32, pixels covered by each person, as annotated or else :data:`AREA_OF_BOX` of the box.
-        all_labelled: no further person is in the picture.
+        all_labelled: whether there are no other people in the picture.
         path: the file with the picture: a jpg, or a tar.
-        offset: of the picture in the file, in bytes.
-        size: length in bytes; None is up to the end.
+        offset: position of the picture in the file, in bytes.
+        size: length in bytes; None is up to the end of the file.
         crowds: (m, 4) float32 ``xyxy`` pixels, regions in which people are not labelled one by one.
     """
 
@@ -77,10 +77,10 @@ class Sample:
 
 
 class Shards(Sequence[Sample]):
-    """The samples of tar shards, in the order of the files and of their names inside them.
+    """The samples of tar shards, in the order of the files and of the names inside them.
 
-    Each tar is scanned once for its labels; pictures are read on access, so shards may be larger than memory, and a
-    copy in another process opens the files itself.
+    Each tar is scanned once for its labels; pictures are read on access, so shards may be larger than memory, and
+    copies in other processes open the files themselves.
 
     Args:
         paths: tar files.
@@ -120,7 +120,7 @@ def split(samples: Sequence[Sample], percent: int) -> tuple[list[Sample], list[S
 
 
 def read_coco_shards(folder: str | os.PathLike[str]) -> tuple[list[Sample], list[Sample]]:
-    """Training and held-out COCO pictures of a folder of shards.
+    """Training and held-out COCO pictures from a folder of shards.
 
     Raises:
         TensorsimError: shards are missing.
@@ -170,7 +170,7 @@ def read_coco(annotations: str | os.PathLike[str], images: str | os.PathLike[str
 
 
 def read_coco_folder(folder: Path) -> list[Sample]:
-    """:func:`read_coco` of the one annotation file (``.json``) in a folder, with its pictures in ``images/``.
+    """:func:`read_coco` for the only annotation file (``.json``) in a folder, with its pictures in ``images/``.
 
     Raises:
         TensorsimError: no such file, several, or not a COCO annotation file.

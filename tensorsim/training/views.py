@@ -1,4 +1,4 @@
-"""Pictures as a camera that is turned would have taken them, and boxes of people in them that stay tight.
+"""Pictures as taken by a rotated camera, with boxes of people that stay tight.
 
 Pixel coordinates have (0, 0) at the outer corner of the first pixel.
 """
@@ -14,16 +14,16 @@ Doubles = npt.NDArray[np.float64]
 def turned_camera(
     height: float, width: float, down_deg: float = 0.0, right_deg: float = 0.0, roll_deg: float = 0.0
 ) -> Doubles:
-    """Homography (3, 3) from a picture to the picture of the same camera, turned about its centre.
+    """Homography (3, 3) from a picture to that of the same camera rotated about its centre.
 
     ``K R K^-1`` with the longer side of the picture as focal length (a field of view of 53 degrees).
 
     Args:
-        height: of the picture, pixels.
-        width: of the picture, pixels.
-        down_deg: how far the camera is tilted down; what it saw moves up.
-        right_deg: how far it is panned to the right.
-        roll_deg: how far the picture is then turned, clockwise as seen.
+        height: height of the picture, pixels.
+        width: width of the picture, pixels.
+        down_deg: downward tilt of the camera; the content of the picture moves up.
+        right_deg: pan of the camera to the right.
+        roll_deg: rotation of the picture after that, clockwise as seen.
 
     Reference:
         Hartley and Zisserman, "Multiple View Geometry in Computer Vision", section 8.4.2.
@@ -33,7 +33,7 @@ def turned_camera(
     (cx, sx), (cy, sy), (cz, sz) = (
         (math.cos(a), math.sin(a)) for a in np.radians([down_deg, right_deg, roll_deg])
     )
-    # Axes: x right, y down, z forward. What is straight ahead of a camera tilted down is above its centre.
+    # Axes: x right, y down, z forward. The previous view direction of a camera tilted down is above its centre.
     down = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     right = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
     roll = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
@@ -53,12 +53,12 @@ def warp_boxes(
 ) -> Doubles:
     """Boxes of people in a warped picture: around the ellipses inscribed in the old ones, and the keypoints.
 
-    The corners of a box seldom hold any of the person: a box around the warped corners would be too wide.
+    The corners of a box are usually empty: a box around the warped corners would be too large.
 
     Args:
         boxes: (n, 4) ``xyxy``.
-        keypoints: (n, K, 3) x, y and v; those with v > 0 are inside of the new boxes.
-        homography: (3, 3); the boxes must be in front of the turned camera.
+        keypoints: (n, K, 3) x, y and v; those with v > 0 are inside the new boxes.
+        homography: (3, 3); the boxes must be in front of the rotated camera.
 
     Returns:
         (n, 4) ``xyxy``.
@@ -85,9 +85,9 @@ def warp_boxes(
 
 
 def random_turn(size: tuple[int, int], rng: np.random.Generator) -> Doubles:
-    """Homography (3, 3) of a picture (height, width) by a camera that looks down or up, aside, or is held askew.
+    """Homography (3, 3) of a picture (height, width) for a camera that is tilted, panned or held askew.
 
-    Most turns are of some degrees; a fifth lay the picture on its side or put it at any angle, as if people lay.
+    Most rotations are of a few degrees; a fifth turn the picture on its side or to any angle, as if people lay.
     """
     roll = rng.normal(0, 6)
     kind = rng.random()
