@@ -1,1 +1,1 @@
-"""The subcommands of ``tensorsim``: one file each; what they run is imported when they run."""
+"""The subcommands of ``tensorsim``: one file each; the code that they run is imported only when they run."""

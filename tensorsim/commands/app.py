@@ -24,7 +24,7 @@ class App:
     """Longest duration of a film in seconds."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         if not 1 <= self.port < 65536:
             raise TensorsimError(f"--port: got {self.port}, expected a number from 1 to 65535")
         for name, value in (("largest-mb", self.largest_mb), ("longest-s", self.longest_s)):
@@ -39,13 +39,13 @@ class App:
             import uvicorn
 
             print(f"tensorsim: http://{self.host}:{self.port}/ (Ctrl-C ends)", file=sys.stderr)
-            # A page that is open keeps its connection; Uvicorn reports as an error with a traceback that it is cut.
+            # An open page keeps its connection; when it is closed, Uvicorn would log an error with a traceback.
             config = uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1)
             uvicorn.Server(config).run([bound])
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    """A socket at this address; Uvicorn, left to open it, would end the process."""
+    """A socket at this address; if Uvicorn opened it, a failure would end the process."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)

@@ -1,4 +1,4 @@
-"""How the command line describes options, and reads options that need not be given and options of several numbers."""
+"""How the command line describes options, and parses optional options and options with several numbers."""
 
 import ast
 import inspect
@@ -12,9 +12,9 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 _T = TypeVar("_T")
-#: An option that is None unless it is given: the help shows the default that its description names, not "None".
+#: An option that is None unless given: the help shows the default stated in its description, not "None".
 Option = Annotated[_T | None, tyro.conf.DisallowNone, tyro.conf.arg(help_behavior_hint="")]
-#: An option of any number of values, none unless it is given: the help shows no "(default: )".
+#: An option with any number of values, empty unless given: the help shows no "(default: )".
 Several = Annotated[tuple[_T, ...], tyro.conf.arg(help_behavior_hint="")]
 
 
@@ -29,7 +29,7 @@ def help_texts(command: type) -> dict[str, str]:
     for base in reversed(command.__mro__[:-1]):
         try:
             source = inspect.getsource(base)
-        except OSError:  # only compiled files are there
+        except OSError:  # only compiled files exist
             continue
         body = ast.parse(textwrap.dedent(source)).body[0]
         assert isinstance(body, ast.ClassDef)
@@ -41,7 +41,7 @@ def help_texts(command: type) -> dict[str, str]:
 
 
 def describe_options(command: type) -> None:
-    """Give tyro the :func:`help_texts` of a command, which itself would keep the line breaks of the source."""
+    """Give tyro the :func:`help_texts` of a command; tyro itself would keep the line breaks of the source."""
     texts = help_texts(command)
     for field in fields(command):
         if field.name in texts:
@@ -49,10 +49,10 @@ def describe_options(command: type) -> None:
 
 
 def numbers(metavar: str, kind: type[float] = float) -> PrimitiveConstructorSpec[Any]:
-    """How the command line reads an option that is None by default.
+    """Specifies how the command line parses an option that is None by default.
 
     Args:
-        metavar: what the help calls the numbers, one word each, such as ``"X Y Z"``.
+        metavar: names of the numbers in the help, one word each, such as ``"X Y Z"``.
         kind: ``float`` or ``int``.
     """
 

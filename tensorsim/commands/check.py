@@ -10,7 +10,7 @@ class Check:
     """Check the installation: libraries, shipped files, and a moving target through the radar chain."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.selfcheck import run_checks
 
         if not run_checks():

@@ -1,4 +1,4 @@
-"""Options of commands that simulate a whole clip: those that look ahead, and what is written of it."""
+"""Options of commands that simulate a whole clip: those that look ahead, and those of the output."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ class ClipOptions(RadarOptions):
         return config.replace(smoothing=smoothing)
 
     def described(self) -> dict[str, Any]:
-        """The options that were given, as ``summary.json`` has them."""
+        """The options given, as recorded in ``summary.json``."""
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         return {
             name: str(value) if isinstance(value, Path) else value
@@ -84,10 +84,10 @@ class ClipOptions(RadarOptions):
         """How the maps of this run are drawn.
 
         Args:
-            stage: made them.
-            label: activity, where there is a classifier.
-            film: what the people come from.
-            somebody: whether a person is in the scene; the maps of an empty one refer to the echo of a person.
+            stage: the stage that made the maps.
+            label: the activity, if there is a classifier.
+            film: the source of the people.
+            somebody: whether a person is in the scene; maps of an empty scene are scaled by the echo of a person.
         """
         from tensorsim import plot
         from tensorsim.results import Pictures
@@ -104,12 +104,12 @@ class ClipOptions(RadarOptions):
         """Label the maps of a run and write them, the poses, their pictures and the sound.
 
         Args:
-            folder: where to.
-            run: what was simulated.
-            truth: maps of the true motion, where it is known; drawn beside the others.
+            folder: output folder.
+            run: the simulated run.
+            truth: maps of the true motion, if known; drawn next to the others.
 
         Returns:
-            What ``summary.json`` says of the label.
+            The entries on the label for ``summary.json``.
         """
         from tensorsim import results
         from tensorsim.summary import label_of

@@ -41,7 +41,7 @@ class DatasetBuild:
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         check_count(self.workers, "--workers")
         if self.address is not None and self.engine != "ray":
             raise TensorsimError("--address needs --engine ray")
@@ -75,7 +75,7 @@ class DatasetExample:
     """Print one for training instead: the 12 activities of 100 people, seen by three radars, 1200 samples."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.data.sets.example import EXAMPLE, LARGE_EXAMPLE
 
         print(LARGE_EXAMPLE if self.large else EXAMPLE, end="")
@@ -93,7 +93,7 @@ class DatasetSample:
     """Folder for its arrays, as ID.RADAR.OUTPUT.npy."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.data.sets.again import sample_again
         from tensorsim.data.sets.shards import npy_bytes
         from tensorsim.files import write_bytes
@@ -113,7 +113,7 @@ class DatasetVerify:
     """The data set."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.data.sets.verify import wrong_files
 
         count, wrong = wrong_files(self.folder)

@@ -1,4 +1,4 @@
-"""``tensorsim demo``: a person whose motion is known is filmed, and the film's maps are compared with the true ones."""
+"""``tensorsim demo``: a person with known motion is filmed, and the film's maps are compared with the true ones."""
 
 import sys
 from collections.abc import Sequence
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 FILM_FPS = 30.0
 #: Longest film in seconds.
 LONGEST_S = 60.0
-#: The true motion is worked out this many times per frame of the film.
+#: The true motion is evaluated this many times per frame of the film.
 MOMENTS_PER_FRAME = 8
 HEIGHT, WIDTH = 360, 640
 #: Distances at which a whole body fits into the picture of an ordinary lens.
 NEAR_M, FAR_M = 3.0, 6.0
-#: At half the height of a body the camera sees all of it without much of a tilt, as someone filming would hold it.
+#: At about half the height of a body, where the camera sees all of it without much tilt, as in a handheld film.
 CAMERA_M = (0.0, 0.0, 1.0)
 
 
@@ -55,8 +55,8 @@ class Demo(NetworkOptions, ClipOptions):
     """Length of the film in seconds."""
 
     def run(self) -> None:
-        """Do it."""
-        # Long, for it is the list of the steps; each is a call.
+        """Run the command."""
+        # Long because it lists all the steps; each is a call.
         from tensorsim.motion.activities import activity_index
 
         self.check(self.out)
@@ -88,14 +88,14 @@ class Demo(NetworkOptions, ClipOptions):
             networks = load_networks(detector, pose_network, config.pose.flip_test, self.engine)
             maps_stage = PoseToDoppler.from_config(config).to(device)
             check_drawable(maps_stage)
-            # The true motion is known at many moments: it needs no smoothing.
+            # The true motion is exact and densely sampled: it needs no smoothing.
             true_stage = PoseToDoppler.from_config(config.replace(smoothing=SmoothingConfig())).to(device)
             frames = round(self.duration * FILM_FPS)
             if not self.quiet:
                 print(f"rendering {frames} frames of {ACTIVITIES[activity]} ...", file=sys.stderr)
             truth, film, camera, height_m = film_person(activity, frames, config.seed)
             start_m = float(mid_hips(truth.joints)[0, 0, 1])
-            # All of the camera is known, whatever a configuration says of that of another film.
+            # The camera is fully known, whatever a given configuration states for another film.
             config = config.replace(
                 pose__person_height_m=(height_m,),
                 pose__camera=camera,
@@ -163,7 +163,7 @@ class Filmed(NamedTuple):
 
 
 def film_person(activity: int, frames: int, seed: int) -> Filmed:
-    """Render a person that does an activity, in this many frames."""
+    """Render a person who does an activity, in this many frames."""
     import torch
 
     from tensorsim.geometry.framing import camera_on
@@ -183,7 +183,7 @@ def film_person(activity: int, frames: int, seed: int) -> Filmed:
 
 
 def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor", formats: Sequence[str]) -> None:
-    """Write ``pose_truth`` in these formats: what is true in each frame; ``valid`` (P, T) at the rate of the motion."""
+    """Write ``pose_truth``, the truth for each frame, in these formats; ``valid`` (P, T) is at the rate of the motion."""
     arrays: dict[str, Any] = {
         "joints_m": film.joints.numpy(),
         "keypoints_px": film.keypoints.numpy(),
@@ -196,7 +196,7 @@ def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor", forma
 
 
 def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":
-    """Known joints (P, T, 14, 3) and who is there (P, T) as a Pose of one clip; nobody has seen it in a picture."""
+    """Known joints (P, T, 14, 3) and presence (P, T) as a Pose of one clip, with blank image data."""
     from tensorsim.types import Pose
 
     people, frames = valid.shape
@@ -205,7 +205,7 @@ def true_pose(joints: "Tensor", valid: "Tensor") -> "Pose":
 
 
 def likeness_to_truth(maps: "RadarMaps", truth: "RadarMaps") -> tuple[dict[str, Any], dict[str, Any]]:
-    """How like maps are to the true ones, and how like empty maps are.
+    """Similarity of maps, and of empty maps, to the true ones.
 
     See :func:`tensorsim.evaluation.scores.similarity`.
     """
@@ -219,7 +219,7 @@ def likeness_to_truth(maps: "RadarMaps", truth: "RadarMaps") -> tuple[dict[str, 
 
 
 def described_likeness(likeness: dict[str, Any], empty: dict[str, Any]) -> str:
-    """The figures of the Doppler-time map in one line."""
+    """The scores of the Doppler-time map in one line."""
     figures = likeness["doppler_time"]
     if figures["psnr_linear_db"] is None:
         return "the Doppler-time map from the film is that of the true motion"
@@ -231,7 +231,7 @@ def described_likeness(likeness: dict[str, Any], empty: dict[str, Any]) -> str:
 
 
 def joint_errors(pose: "Pose", film: "RenderedVideo") -> dict[str, Any]:
-    """How far the joints that were found are from the true ones, for the person found longest; None without."""
+    """Errors of the estimated joints for the person found longest; None if nobody was found."""
     import torch
 
     from tensorsim.body.skeleton import mid_hips

@@ -1,4 +1,4 @@
-"""Every person of a run alone in the scene: maps, label and picture, from the same poses."""
+"""Each person of a run alone in the scene: maps, label and picture, from the same poses."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,15 +24,15 @@ class Alone(NamedTuple):
 
 
 def write_each_person(folder: Path, run: "Run", options: "ClipOptions") -> list[Alone]:
-    """Simulate and label each person of a run as if nobody else were there, if there are several.
+    """If there are several people, simulate and label each as if nobody else were present.
 
     Writes ``maps_person_N`` and a picture of the Doppler-time map for person N. Noise is relative to the person's own
-    echo. One person's maps are in memory at a time; poses are not estimated again.
+    echo. Only one person's maps are in memory at a time; poses are not estimated again.
 
     Args:
-        folder: of the results.
-        run: what was simulated.
-        options: how it is drawn and stored.
+        folder: folder of the results.
+        run: the simulated run.
+        options: how the maps are drawn and stored.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""``tensorsim evaluate camera``: how well the camera is told from people who walk."""
+"""``tensorsim evaluate camera``: how well the camera is estimated from people who walk."""
 
 from dataclasses import dataclass
 from statistics import median
@@ -9,7 +9,7 @@ from tensorsim.exceptions import TensorsimError, check_count, check_seed
 if TYPE_CHECKING:
     from tensorsim.evaluation.camera import CameraErrors
 
-#: Standard deviation of an estimated field of view, in degrees, by which walks are told apart.
+#: Standard deviation of an estimated field of view, in degrees, that separates well-determined walks from others.
 FOV_SD_DEG = 4.0
 
 
@@ -40,7 +40,7 @@ class EvaluateCamera:
     """Random seed of people and paths."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         check_seed(self.seed, "--seed")
         if not (self.tilts and self.heights and self.fovs):
             raise TensorsimError(

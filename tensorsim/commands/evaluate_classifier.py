@@ -42,7 +42,7 @@ class EvaluateClassifier:
     """No progress bar."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         if self.maps is None and self.films is None and self.poses is None:
             raise TensorsimError(
                 "evaluate classifier: got nothing to classify, expected --maps, --films or --poses"
@@ -68,7 +68,7 @@ class EvaluateClassifier:
             self._on_films(labelled_poses(self.poses))
 
     def _recognizer(self) -> "ActivityRecognizer":
-        """The network with what its file states of its pictures, which must be those of the maps."""
+        """The network with the picture settings stated in its file, which must match those of the maps."""
         from tensorsim.config import ACTIVITIES, RadarConfig
         from tensorsim.recognition import ActivityRecognizer
         from tensorsim.training.classifier import RANGE_DB

@@ -1,4 +1,4 @@
-"""``tensorsim evaluate denoiser``: what a denoiser gains on maps of people it has not seen, beside its rivals."""
+"""``tensorsim evaluate denoiser``: the gain of a denoiser on maps of unseen people, compared with other methods."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ class EvaluateDenoiser:
     """No progress bar."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.enhance.dncnn import MapDenoiser
         from tensorsim.enhance.ksvd import KSVD
         from tensorsim.enhance.perona_malik import PeronaMalik

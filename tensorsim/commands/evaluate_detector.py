@@ -1,4 +1,4 @@
-"""``tensorsim evaluate detector``: how well a person detector finds people it has not seen."""
+"""``tensorsim evaluate detector``: how well a person detector finds people that it was not trained on."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ class EvaluateDetector:
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         import torch
         from tqdm import tqdm
 

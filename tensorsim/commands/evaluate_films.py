@@ -1,4 +1,4 @@
-"""``tensorsim evaluate films``: real films of known activity, labelled."""
+"""``tensorsim evaluate films``: label real films of known activity."""
 
 import csv
 import json
@@ -54,7 +54,7 @@ class EvaluateFilms(NetworkOptions):
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         check_seed(self.seed, "--seed")
         check_folder(self.out)
         check_count(self.stride, "--stride")
@@ -113,7 +113,7 @@ class EvaluateFilms(NetworkOptions):
     def _row(
         self, film: Any, reader: Any, scenes: dict[str, Any], device: Any, sheet: Path
     ) -> dict[str, Any]:
-        """Everything of one film; writes its contact sheet."""
+        """All results for one film; writes its contact sheet."""
         from tensorsim import plot, results
         from tensorsim.evaluation.film_sheet import contact_sheet
         from tensorsim.evaluation.film_variants import variants
@@ -147,7 +147,7 @@ class EvaluateFilms(NetworkOptions):
 
 
 def _sheet_name(file: str) -> str:
-    """The name of a film, with that of its folder, and without its suffix."""
+    """The name of a film with its folder and without its suffix."""
     return str(Path(file).with_suffix("")).replace("/", "_")
 
 

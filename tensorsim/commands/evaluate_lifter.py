@@ -1,4 +1,4 @@
-"""``tensorsim evaluate lifter``: how well the lifters lift people whom none of them has seen."""
+"""``tensorsim evaluate lifter``: how well the lifters lift people whom none of them was trained on."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ class EvaluateLifter:
     """No progress bar."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         check_seed(self.seed, "--seed")
         if self.motions < 100:
             raise TensorsimError(f"--motions: got {self.motions}, expected at least 100")

@@ -1,4 +1,4 @@
-"""``tensorsim evaluate measured``: networks that saw simulated radar only, on measured radar."""
+"""``tensorsim evaluate measured``: networks trained only on simulated radar, tested on measured radar."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +42,7 @@ class EvaluateMeasured:
     """No progress bar."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         check_seed(self.seed, "--seed")
         for name, count in (("--clips", self.clips), ("--steps", self.steps), ("--repeats", self.repeats)):
             check_count(count, name)

@@ -1,4 +1,4 @@
-"""``tensorsim evaluate pose``: how well a pose network finds the keypoints of people it has not seen."""
+"""``tensorsim evaluate pose``: how well a pose network finds the keypoints of people that it was not trained on."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ class EvaluatePose:
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from torch import nn
 
         from tensorsim.pipeline import pretrained_pose

@@ -1,4 +1,4 @@
-"""``tensorsim evaluate truth``: how right the maps are."""
+"""``tensorsim evaluate truth``: how close the maps are to the true ones."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +48,7 @@ class EvaluateTruth:
     """No progress bar."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         check_folder(self.out)
         check_seed(self.seed, "--seed")
         if self.motion_fps is not None and not self.motion:

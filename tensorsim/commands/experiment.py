@@ -1,4 +1,4 @@
-"""``tensorsim experiment``: the tables and figures of the paper, made again."""
+"""``tensorsim experiment``: the tables and figures of the paper, reproduced."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +78,7 @@ class RunExperiment:
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.experiments.catalogue import (
             EXPERIMENTS,
             configuration,

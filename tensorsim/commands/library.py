@@ -9,7 +9,7 @@ import tyro
 from tensorsim.commands.arguments import Option, Several
 from tensorsim.exceptions import TensorsimError, check_count, check_seed
 
-#: What motion files are called.
+#: Suffixes of motion files.
 SUFFIXES = (".bvh", ".npz")
 
 
@@ -37,7 +37,7 @@ class BuildLibrary:
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         files = _files(self.sources)
         if not files and self.generate == 0:
             raise TensorsimError("library build: got nothing to build from, expected SOURCES or --generate N")

@@ -1,4 +1,4 @@
-"""``tensorsim live``: what a radar would see of the people before a camera, as it happens."""
+"""``tensorsim live``: what a radar would see of the people in front of a camera, in real time."""
 
 import sys
 from contextlib import ExitStack, suppress
@@ -47,9 +47,9 @@ class Live(NetworkOptions, RadarOptions):
     """Record the page to this film, whose name ends in .webm or .mp4."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         self._check()
-        # The summary of a run says to estimate the camera, for which live does not have the film.
+        # A run's summary may ask to estimate the camera, which needs the whole film.
         config = self.configuration().replace(pose__calibrate=False)
         if self.person_height is not None:
             config = config.replace(pose__person_height_m=self.person_height)
@@ -110,7 +110,7 @@ class Live(NetworkOptions, RadarOptions):
                     if page is not None:
                         page.show(picture)
                     if film is not None:
-                        for _ in range(1 + missing):  # the film of the page lasts as long as what was filmed
+                        for _ in range(1 + missing):  # repeated for missing frames, to keep the length
                             film.add(picture)
                     self._say(new, camera)
                     if self.seconds is not None and new.time_s >= self.seconds:
@@ -118,7 +118,7 @@ class Live(NetworkOptions, RadarOptions):
             except (KeyboardInterrupt, SystemExit, TensorsimError) as error:  # SIGTERM is a SystemExit
                 if film is None or film.count == 0:
                     raise
-                stopped = error  # raised once the film is complete
+                stopped = error  # re-raised once the film is complete
         if stopped is not None:
             raise stopped
 

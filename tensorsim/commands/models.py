@@ -13,7 +13,7 @@ class ListModels:
     """List the weights that are known by name: shipped ones, and those downloaded from their authors on demand."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim import registry
 
         for entry in registry.entries():
@@ -33,7 +33,7 @@ class FetchModels:
     """No progress bar."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim import registry
 
         if not self.names:
@@ -48,7 +48,7 @@ class VerifyModels:
     """Check shipped and fetched weights against their SHA-256."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim import registry
 
         wrong = []

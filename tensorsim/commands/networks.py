@@ -1,4 +1,4 @@
-"""What several commands ask for: the detector and the pose network, by path or name."""
+"""The detector and the pose network by path or name, as used by several commands."""
 
 import os
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path
     ``TENSORSIM_DETECTOR`` or ``TENSORSIM_POSE``, else the shipped one.
 
     Raises:
-        TensorsimError: none of these is there.
+        TensorsimError: none of these exists.
     """
     return _located("detector", detector, "RTMDet", "AcfDetector"), _located("pose", pose, "HRNet", "CPM")
 
@@ -55,10 +55,10 @@ def _located(role: str, source: str | None, *networks: str) -> Path:
 
 
 def load_networks(detector: Path, pose: Path, flip_test: bool, engine: str = "torch") -> tuple[Any, Any]:
-    """The two modules of these files, run by this engine; see :func:`tensorsim.pipeline.pretrained_pose`.
+    """The two modules from these files, run by this engine; see :func:`tensorsim.pipeline.pretrained_pose`.
 
     Raises:
-        TensorsimError: files that are damaged, unsafe or of another network.
+        TensorsimError: files are damaged, unsafe or of another network.
     """
     from tensorsim.pipeline.networks import pretrained_detector, pretrained_pose
     from tensorsim.vision.engines import run_by

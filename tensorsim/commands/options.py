@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tensorsim.pipeline import PoseToDoppler
     from tensorsim.recognition import ActivityRecognizer
 
-#: Columns per second of the range-time maps that are written, unless every pulse is asked for.
+#: Columns per second of the written range-time maps, unless every pulse is requested.
 DISPLAY_RATE_HZ = 256.0
 
 #: The field of the configuration that an option sets.
@@ -56,7 +56,7 @@ def _has_converters(scene: "SceneConfig") -> bool:
     return scene.receiver.adc_bits is not None
 
 
-#: What an option changes: its name, and whether a scene has it. Without it the option would do nothing.
+#: The thing that an option changes: its name, and whether a scene has it. Without it the option has no effect.
 _NEEDED: dict[str, tuple[str, Callable[["SceneConfig"], bool]]] = {
     "multipath": ("a wall", _has_wall),
     "wall_echo": ("a wall", _has_wall),
@@ -129,10 +129,10 @@ class RadarOptions(PanelOptions, ReceiverOptions):
         check_folder(out)
 
     def configuration(self) -> "SimulationConfig":
-        """The configuration of the run: that of ``--config``, with the other options in place of its fields.
+        """The configuration of the run: that of ``--config``, with fields overridden by the other options.
 
         Raises:
-            TensorsimError: a file that cannot be read, values out of range, or an option that would do nothing.
+            TensorsimError: a file that cannot be read, values out of range, or an option without effect.
         """
         config = self.with_receiver(self._begun())
         own = {field.name for field in dataclasses.fields(self)}
@@ -175,7 +175,7 @@ class RadarOptions(PanelOptions, ReceiverOptions):
 
 
 def check_drawable(stage: "PoseToDoppler") -> None:
-    """Refuse range-time maps of one row, before anybody is looked for."""
+    """Refuse range-time maps of one row, before people are detected."""
     if stage.simulator.range_profile.range_m.shape[0] < 2:
         raise TensorsimError("range_gate_m: got a gate that holds one range bin, expected two or more")
 
@@ -186,14 +186,14 @@ def number_of_people(count: int) -> str:
 
 
 def described_label(label: dict[str, Any]) -> str:
-    """``S8 Walking (0.98)``: the label and its probability, of what :func:`tensorsim.summary.label_of` says."""
+    """``S8 Walking (0.98)``: the label and its probability, from :func:`tensorsim.summary.label_of`."""
     name = label["label"]
     probabilities = label["probabilities"] or {}
     return f"{name} ({probabilities[name]:.2f})" if name in probabilities else name or "no label"
 
 
 def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "SimulationConfig":
-    """The configuration with range-time maps of a display rate, or of every pulse."""
+    """The configuration with range-time maps at a display rate, or of every pulse."""
     if full_rate:
         return config.replace(processing__display_rate_hz=None)
     if config.processing.display_rate_hz is None and config.scene.radar.prf_hz > DISPLAY_RATE_HZ:
@@ -201,23 +201,23 @@ def at_display_rate(config: "SimulationConfig", full_rate: bool = False) -> "Sim
     return config
 
 
-#: Speeds that the radars of the classifiers' training resolve (the through-wall preset: 0.6 m/s), with a margin.
+#: Coarsest speed resolution of the radars in the classifiers' training (through-wall preset: 0.6 m/s), with a margin.
 COARSEST_M_S = 0.8
-#: A radar of one channel that separates ranges less mixes up approaching and receding people in a room.
+#: A single-channel radar with a coarser range resolution confuses approaching and receding people in a room.
 COARSEST_M = 1.5
-#: Scenes that are not much shorter than the shortest clips of the classifiers' training (2.4 s).
+#: Shortest scene for a reliable label: not much shorter than the classifiers' shortest training clips (2.4 s).
 SHORTEST_S = 2.0
 
 
 def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
-    """The classifier of the maps of this radar; None if no label is wanted or the radar is unlike those of training.
+    """The classifier for this radar's maps; None if no label is wanted or the radar is unlike those of training.
 
-    The pictures of the shipped networks show speeds up to 3.8 m/s, resolved to 0.6 m/s or better. A radar for which
-    faster motion folds, or which resolves speeds less, gets no label but a warning. Maps that they were not trained on
-    for other reasons (interference, both signs of Doppler mixed up) get a label and a warning.
+    The pictures of the shipped networks show speeds up to 3.8 m/s, resolved to 0.6 m/s or better. A radar that folds
+    motion within these speeds, or has a coarser speed resolution, gets a warning instead of a label. Maps unlike those
+    of training for other reasons (interference, both signs of Doppler mixed up) get a label and a warning.
 
     Raises:
-        TensorsimError: weights that are not there, of another network, or without names of their classes.
+        TensorsimError: weights are missing, of another network, or without the names of their classes.
     """
     from tensorsim.recognition import ActivityRecognizer
 
@@ -248,7 +248,7 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
 
 
 def _unlike_training(config: "SimulationConfig", recognizer: "ActivityRecognizer") -> list[str]:
-    """In what the maps are unlike those of the classifier's training."""
+    """How the maps differ from those of the classifier's training."""
     from tensorsim.recognition import SPNet
 
     unlike = []

@@ -1,4 +1,4 @@
-"""The receiver and what else it hears as options: imperfections, the furniture of a room, another radar."""
+"""Options of the receiver and of what else it receives: imperfections, the furniture of a room, another radar."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""``tensorsim simulate``: a video, or motion that is known, to what a radar would have seen of it."""
+"""``tensorsim simulate``: from a video, or known motion, to what a radar would have seen."""
 
 import math
 from dataclasses import dataclass, fields
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tensorsim.config import SimulationConfig
     from tensorsim.sources import Source
 
-#: Options that say something of some kinds of source only.
+#: Options that apply only to some kinds of source.
 _MEANT_FOR = {
     "detector": ("video",),
     "min_detection_size": ("video",),
@@ -108,7 +108,7 @@ class Simulate(NetworkOptions, ClipOptions):
     """Rotation of motion capture about the vertical axis, in degrees (counter-clockwise seen from above)."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         self.check(self.out)
 
         import torch
@@ -135,7 +135,7 @@ class Simulate(NetworkOptions, ClipOptions):
             config = at_display_rate(config, self.full_rate)
             stage = PoseToDoppler.from_config(config).to(device)
             check_drawable(stage)
-            if source.frame_count is not None:  # files announce a frame or two too few
+            if source.frame_count is not None:  # files may state a frame or two too few
                 results.check_length(source.frame_count, source.fps, stage, uncertain=2)
             with complete_or_nothing(self.out, self.source) as folder:
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)
@@ -160,15 +160,15 @@ class Simulate(NetworkOptions, ClipOptions):
         print(f"{self.out}: {people} in {pose.valid.shape[2]} frames, {described_label(label)}")
 
     def configuration(self) -> "SimulationConfig":
-        """The configuration with the options that say how people are found."""
+        """The configuration with the options on how people are found."""
         from tensorsim.config.people import PANEL_DISTANCES_M
 
         config = super().configuration()
         camera_fov = None if self.camera_fov is None else math.radians(self.camera_fov)
         if (self.position or config.pose.position) == "camera":
-            # Nobody measured the panel's distances, from which the paper's positions start.
+            # The panel's distances, from which the paper's positions start, were not measured in this film.
             starts = config.pose.position == "paper" and config.pose.initial_distance_m == PANEL_DISTANCES_M
-            if camera_fov is not None or starts:  # known distances would calibrate the focal length
+            if camera_fov is not None or starts:  # initial distances would calibrate the focal length
                 config = config.replace(pose__initial_distance_m=None)
         if camera_fov is not None:
             config = config.replace(pose__camera__focal_px=None, pose__camera__horizontal_fov_rad=camera_fov)

@@ -1,4 +1,4 @@
-"""``tensorsim train acf``: train the ACF person detector, a rival of RTMDet."""
+"""``tensorsim train acf``: train the ACF person detector, an alternative to RTMDet."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ class TrainAcf:
     """No progress bars."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.training.acf import AcfSettings, AcfTrainer
         from tensorsim.weights import save_weights
 

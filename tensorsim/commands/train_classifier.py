@@ -8,7 +8,7 @@ from tensorsim.commands.arguments import Option, Several
 from tensorsim.commands.training import TrainOptions, check_size
 from tensorsim.exceptions import TensorsimError, check_positive, check_seed
 
-#: Options that count for ``maps`` only.
+#: Options that apply only to ``maps``.
 _OF_MAPS = ("scenes", "people", "snr", "films", "film_maps", "film_people", "maps_seed", "film_seed")
 
 
@@ -60,7 +60,7 @@ class TrainClassifier(TrainOptions):
     """Random seed of people, motion and noise of --film-maps."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         if (self.maps is None) == (self.data is None):
             raise TensorsimError("--maps, --data: got both or none, expected one of them")
         if self.maps is not None:
@@ -79,7 +79,7 @@ class TrainClassifier(TrainOptions):
         from tensorsim.device import rank_and_processes
         from tensorsim.training.map_classifier import MapRecipe, write_outcome
 
-        self.loop(steps=1, batch=self.batch)  # refuses what cannot work before the data are read
+        self.loop(steps=1, batch=self.batch)  # refuses invalid options before the data are read
         recipe = MapRecipe(
             data,
             self.network,
@@ -138,7 +138,7 @@ class TrainClassifier(TrainOptions):
         self.train(recipe, loop)
 
     def _check_recipe(self) -> None:
-        """Refuse what the recipe would, before maps are made, which takes hours."""
+        """Refuse what the recipe would refuse, before hours of making maps."""
         from tensorsim.training.classifier import check_drawn
         from tensorsim.training.maps import MapSettings
 

@@ -25,7 +25,7 @@ class TrainDenoiser(TrainOptions):
     """Random seed of people, motion and noise of the maps."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.training.denoiser import DenoiserRecipe, build_pairs, untrained
 
         check_seed(self.maps_seed, "--maps-seed")

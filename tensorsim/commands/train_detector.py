@@ -33,7 +33,7 @@ class TrainDetector(PeopleOptions):
     """Steps between validations on the held-out pictures."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         import torch
 
         from tensorsim.device import rank_and_processes

@@ -36,7 +36,7 @@ class TrainEveryday(TrainOptions):
     """Weight of the trained parameters when averaged with --init, from 0 (only --init) to 1 (only trained)."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from tensorsim.device import rank_and_processes
         from tensorsim.training.everyday_classifier import EverydayRecipe, load_between, save_calibrated
         from tensorsim.training.everyday_maps import EverydaySettings, EverydayStore, build_everyday
@@ -53,7 +53,7 @@ class TrainEveryday(TrainOptions):
         settings = EverydaySettings(seed=self.maps_seed)
         check_size(self.size, settings.size)
         check_positive(self.learning_rate, "--learning-rate")
-        self.loop(steps=self.epochs, batch=self.batch)  # refuses what cannot work before maps are made
+        self.loop(steps=self.epochs, batch=self.batch)  # refuses invalid options before maps are made
         build_everyday(self.maps, self.groups, settings, quiet=self.quiet)
         recipe = EverydayRecipe(
             self.network,

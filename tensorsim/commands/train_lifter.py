@@ -1,4 +1,4 @@
-"""``tensorsim train lifter``: train a lifter on motion before random cameras."""
+"""``tensorsim train lifter``: train a lifter on motion seen by random cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ class TrainLifter(TrainOptions):
     """Random seed of the motions."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         import torch
 
         from tensorsim.training.lifter import LifterRecipe, VideoPoseRecipe

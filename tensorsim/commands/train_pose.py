@@ -52,7 +52,7 @@ class TrainPose(PeopleOptions):
     and without rendered people."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         import torch
 
         from tensorsim.training.pose import (
@@ -143,5 +143,5 @@ class TrainPose(PeopleOptions):
 
 
 def some(persons: "list[Person]", most: int = 240) -> "list[Person]":
-    """At most this many of the people, evenly spread: shards of unlike pictures follow each other."""
+    """At most this many of the people, evenly spread, because shards differ in their pictures."""
     return persons[:: math.ceil(len(persons) / most)]

@@ -34,7 +34,7 @@ class TrainOptions:
     """No progress bar."""
 
     def loop(self, **settings: Any) -> "LoopConfig":
-        """The loop with these options; refuses what cannot work before anything is read or made."""
+        """The loop with these options; refuses invalid ones before anything is read or made."""
         from tensorsim.device import multiplies_bfloat16, usable_device
         from tensorsim.training.loop import LoopConfig
 
@@ -53,7 +53,7 @@ class TrainOptions:
         )
 
     def epochs_loop(self, epochs: int, samples: int, batch: int, ema_decay: float) -> "LoopConfig":
-        """The loop of this many epochs of ``samples`` training samples, measured after each."""
+        """The loop for this many epochs of ``samples`` training samples, validated after each."""
         epoch = max(1, samples // max(1, batch))
         return self.loop(
             steps=epochs * epoch,
@@ -71,7 +71,7 @@ class TrainOptions:
             load_strict(net, load_state_dict(self.init), self.init)
 
     def train(self, recipe: "Recipe", loop: "LoopConfig") -> Path:
-        """Train, or go on; the first process prints the figures of the best weights. Returns their file."""
+        """Train or resume; the first process prints the scores of the best weights. Returns their file."""
         from tensorsim.device import rank_and_processes
         from tensorsim.training.loop import fit
 
@@ -84,7 +84,7 @@ class TrainOptions:
 
 
 def digest(weights: Path | None) -> str | None:
-    """Of the content of a weight file: another file of the same path is another start."""
+    """Digest of the content of a weight file: another file at the same path is another start."""
     from tensorsim.files import sha256_of
     from tensorsim.registry import locate
 
@@ -109,14 +109,14 @@ class PeopleOptions(TrainOptions):
     """Random seed of their poses, looks and cameras."""
 
     def loop(self, **settings: Any) -> "LoopConfig":
-        """As of all training commands."""
+        """As for all training commands, after checks of the options for rendered people."""
         check_seed(self.rendered_seed, "--rendered-seed")
         if self.rendered < 0:
             raise TensorsimError(f"--rendered: got {self.rendered}, expected at least 0")
         return super().loop(**settings)
 
     def rendered_people(self) -> "Cutouts | None":
-        """Rendered people, rendered first where they are missing; None if none are wanted."""
+        """Rendered people, rendered first if missing; None if none are wanted."""
         from tensorsim.training.cutouts import Cutouts, render_cutouts
 
         if self.rendered == 0:

@@ -152,7 +152,7 @@ def render_cutouts(count: int, seed: int, out: str | os.PathLike[str], quiet: bo
     """
     from tqdm import tqdm
 
-    near_floor = max(min(count // 2, count - FAMILIES), 0)  # if there are few people, each family is drawn once
+    near_floor = max(min(count // 2, count - FAMILIES), 0)  # with few people, each family is drawn once
     poses = sample_poses(count - near_floor, seed)
     if near_floor:
         poses = torch.cat([poses, everyday_poses(near_floor, seed)])

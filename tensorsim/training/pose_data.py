@@ -100,7 +100,7 @@ CUT_AUGMENTATION = replace(MILD_AUGMENTATION, cut=0.75, repeat=0.0)
 
 
 def people(samples: Sequence[Sample], least: int = 6, least_px: float = 48.0) -> list[Person]:
-    """The people in pictures with at least this many labelled COCO keypoints and a box with at least this longer side."""
+    """The people in pictures with at least this many labelled COCO keypoints and this longer side of the box."""
     found = []
     for sample in samples:
         for index, keypoints in enumerate(sample.keypoints):
