@@ -45,13 +45,13 @@ def film(range_m: Tensor, x_m: Tensor) -> Tensor:
 
 
 def walker(frames: int, fps: float, start_m: float, speed_m_s: float, x_m: float) -> tuple[Tensor, Tensor]:
-    """Range and x (1, T) of somebody who walks away at ``speed_m_s``."""
+    """Range and x (1, T) of a person who walks away at ``speed_m_s``."""
     t = torch.arange(frames) / fps
     return (start_m + speed_m_s * t).unsqueeze(0), torch.full((1, frames), x_m)
 
 
 def panned(frames: Tensor, px_per_frame: int) -> Tensor:
-    """The film (T, 3, H, W) before a blue pattern that goes to the left, as before a camera that turns to the right."""
+    """The film (T, 3, H, W) in front of a blue pattern that moves to the left, as for a camera that pans right."""
     count, _, height, width = frames.shape
     size = (width + count * px_per_frame, height)
     coarse = np.random.default_rng(0).integers(0, 110, (12, size[0] // 20), np.uint8)

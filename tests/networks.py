@@ -41,7 +41,7 @@ def terms_of_training(recipe: Recipe, batch: Batch, steps: int, term: str = "los
 
 
 def keypoints_to_lift(frames: int) -> tuple[Any, ...]:
-    """Arguments of a temporal lifter: somebody 4 m in front of a level camera who raises the arms."""
+    """Arguments of a temporal lifter: a person 4 m in front of a level camera who raises the arms."""
     pose = BodyPose.standing((frames,), torch.float32)
     raised = torch.linspace(0.0, 2.0, frames)[:, None, None] * torch.tensor([1.0, 0.0, 0.0])
     joints = forward_kinematics(pose._replace(shoulder=raised.expand(-1, 2, -1)), 1.75)

@@ -49,7 +49,7 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A losslessly written film of somebody who walks away."""
+    """A losslessly written film of a person who walks away."""
     path = tmp_path_factory.mktemp("film") / "walk.avi"
     frames = film(*walker(25, FPS, 4.0, 1.2, 0.3)).permute(0, 2, 3, 1).numpy()
     writer = cv2.VideoWriter(

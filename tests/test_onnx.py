@@ -72,7 +72,7 @@ def tracks(clips: int) -> tuple[Tensor, ...]:
 
 
 def pictures(count: int) -> tuple[Tensor]:
-    """Somebody who walks, in so many pictures."""
+    """A person who walks, in this many pictures."""
     walk = ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=0.1 * count, rate_hz=10.0)
     return (ts.data.PersonRenderer(height=120, width=160)(walk.joints[:1], seed=2).frames,)
 

@@ -266,7 +266,7 @@ def test_brief_gaps_of_a_joint_are_predicted_and_longer_ones_are_not() -> None:
     [(0.5, "expected", True), (0.5, "dark", True), (6.0, "dark", False), (8.0, "expected", False)],
 )
 def test_nobody_runs_while_hidden(speed_m_s: float, decode: str, there: bool) -> None:
-    """Somebody is hidden for half a second and stands elsewhere then."""
+    """A person is hidden for half a second and then stands elsewhere."""
     stage = pipeline().video_to_pose
     stage.pose = TopDownPose(StandingPose(), decode, flip_test=True, stand_up=True)
     gone = slice(8, 13)
@@ -289,7 +289,7 @@ def test_nobody_runs_while_hidden(speed_m_s: float, decode: str, there: bool) ->
     ("good", "is_person"), [(slice(0, 11), True), (slice(0, 10), False), (slice(0, 60, 4), True)]
 )
 def test_a_person_is_seen_for_a_second_or_often(good: slice, is_person: bool) -> None:
-    """Of six seconds: somebody who falls and lies, furniture, somebody in the dark."""
+    """Tracks of six seconds: a person who falls and lies, furniture, a person in the dark."""
     scores = torch.full((1, 1, 60, 17), 0.4)
     scores[:, :, good] = 0.8
     stage = pipeline().video_to_pose
@@ -335,7 +335,7 @@ def test_ranges_of_people_are_those_from_the_antennas() -> None:
 
 
 class AsManyAsThereAre(nn.Module):
-    """Finds as many boxes in all images of a call, from none on, as the brightest pixel says."""
+    """Finds in all images of a call as many boxes, possibly none, as the value of the brightest pixel."""
 
     def forward(self, images: Tensor) -> ts.types.Detections:
         count, most = images.shape[0], int(images.max())

@@ -1,4 +1,4 @@
-"""What README says, works as it is written."""
+"""What the README states works as written."""
 
 import importlib.util
 import json

@@ -127,7 +127,7 @@ def test_digest_of_the_blind_denoiser_is_that_of_the_copy_at_hand(shared_data: P
 
 
 def test_offline_says_what_to_do(entry: ModelEntry) -> None:
-    # Port 9 of this machine answers nobody.
+    # Port 9 of this machine does not answer.
     offline = dataclasses.replace(entry, url="http://127.0.0.1:9/test-net.pth")
     with pytest.raises(
         TensorsimError, match=r"could not fetch http://127.0.0.1:9.*save it as .*test-net.pth"
@@ -148,7 +148,7 @@ def test_a_cache_that_cannot_be_made_and_an_error_without_words_are_said(
 
 
 def test_names_and_paths_are_told_apart(tmp_path: Path) -> None:
-    # A path is taken as it is, also where nothing is: the loader then says so.
+    # A path is used as it is, even if nothing is there: the loader then reports that.
     assert registry.locate(tmp_path / "weights.pth", "HRNet") == tmp_path / "weights.pth"
     assert registry.locate("weights.pth", "HRNet") == Path("weights.pth")
     with pytest.raises(

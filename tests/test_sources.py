@@ -26,7 +26,7 @@ FPS = 30.0
 
 @pytest.fixture(scope="module")
 def walk() -> np.ndarray:
-    """(45, 14, 3) metres of somebody who walks."""
+    """(45, 14, 3) metres of a person who walks."""
     return ts.motion.ActivityGenerator().generate("walking", seed=3, rate_hz=FPS).joints[0, :45].numpy()
 
 
@@ -283,7 +283,7 @@ def test_somebody_far_from_everybody_before_is_somebody_new(tmp_path: Path) -> N
 
 
 def test_hidden_key_points_make_nobody_new(tmp_path: Path) -> None:
-    """Of somebody who walks only the ankles are seen for a while, then only the head, then nothing."""
+    """Of a walking person only the ankles are seen for a while, then only the head, then nothing."""
     body = np.random.default_rng(0).uniform(0, 100, (17, 2))
     body[15:] = [[40.0, 90.0], [42.0, 91.0]]
     keypoints = np.stack([body + np.array([8.0 * t, 0.0]) for t in range(20)])[None]
@@ -329,7 +329,7 @@ def test_shares_of_the_picture_are_no_pixels(
 
 
 def test_names_of_pictures_and_files_go_by_their_numbers(tmp_path: Path) -> None:
-    """Results of AlphaPose have the names of pictures as image ids, without those in which nobody is."""
+    """Results of AlphaPose have the names of pictures as image ids, and lack pictures without people."""
     numbers = [0, 1, 2, 3, 8, 9, 10, 11]
     results = [
         {"image_id": f"{n}.jpg", "keypoints": [float(n), 2.0, 0.9] * 16 + [50.0, 50.0, 0.9]}

@@ -183,7 +183,7 @@ def film_person(activity: int, frames: int, seed: int) -> Filmed:
 
 
 def write_pose_truth(folder: Path, film: "RenderedVideo", valid: "Tensor", formats: Sequence[str]) -> None:
-    """Write ``pose_truth``, the truth for each frame, in these formats; ``valid`` (P, T) is at the rate of the motion."""
+    """Write ``pose_truth``, the truth for each frame, in these formats; ``valid`` (P, T) at the rate of the motion."""
     arrays: dict[str, Any] = {
         "joints_m": film.joints.numpy(),
         "keypoints_px": film.keypoints.numpy(),

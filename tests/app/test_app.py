@@ -307,7 +307,7 @@ def test_only_films_that_were_uploaded_are_read(
     answer = next(line for line in events if b"process_completed" in line)
     assert json.loads(answer.removeprefix(b"data:"))["success"] is False
     assert list(tmp_path.rglob("film.mp4")) == []
-    # Whoever leads another name to this machine, as a page of the network can, is not answered.
+    # Requests under other host names, as in DNS rebinding, are not answered.
     elsewhere = urllib.request.Request(server, headers={"Host": "elsewhere.example"})
     with pytest.raises(urllib.error.HTTPError, match="400"):
         urllib.request.urlopen(elsewhere, timeout=10)

@@ -26,7 +26,7 @@ QUICK = ((1, 4.0, 1), (1, 1.0, 200), (16, 4.0, 1), (16, 1.0, 8))
 
 
 def scipy_map(stft: ShortTimeFFT, clip: np.ndarray, frames: int) -> np.ndarray:
-    """The map (F, K) of one clip (R, M); SciPy centres frame 0 at sample 0 unless it is told otherwise."""
+    """The map (F, K) of one clip (R, M); SciPy centres frame 0 at sample 0 by default."""
     spectrum = stft.stft(clip, p0=0, p1=frames, k_offset=stft.m_num_mid)
     return np.sqrt((spectrum.real**2 + spectrum.imag**2).sum(0))
 

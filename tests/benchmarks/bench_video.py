@@ -133,7 +133,7 @@ def peer(film: Path) -> float:
 
 
 def rendered(path: Path, people: int) -> None:
-    """A film of somebody who walks, or of that and somebody else in the right half who punches."""
+    """A film of a person who walks, optionally with a second person in the right half who punches."""
     films = [film_person(activity, 300, seed).film.frames for activity, seed in ((7, 0), (1, 3))[:people]]
     if people == 2:
         quarter = films[0].shape[-1] // 4

@@ -50,7 +50,7 @@ def mocap_clips() -> dict[str, Tensor]:
 
 
 def generated_clips(seed: int) -> dict[str, Tensor]:
-    """A clip of each activity that shows somebody; nobody in them is in the shipped library."""
+    """A clip of each activity with a person; none of these people is in the shipped library."""
     actors = ActivityGenerator()
     names = range(1, 12)
     return {f"activity {i + 1}": actors.generate(i, 1, seed + i).joints[0].float() for i in names}

@@ -1,4 +1,4 @@
-"""How well a film tells where people are and how fast they move along the line of sight.
+"""How well positions and radial speeds of people are estimated from a film.
 
 python -m tests.benchmarks.eval_range [SEED]
 

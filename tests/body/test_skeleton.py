@@ -63,7 +63,7 @@ def test_scores_keep_their_names_and_shoulders_and_wrists_their_places() -> None
 
 
 def standing() -> Tensor:
-    """Joints (14, 3) of somebody whose arms and legs hang straight down."""
+    """Joints (14, 3) of a person whose arms and legs hang straight down."""
     heights = {"head": 1.6, "neck": 1.4, "shoulder": 1.4, "elbow": 1.1, "wrist": 0.8, "hip": 0.9, "knee": 0.5}
     rows = []
     for name in JOINTS:

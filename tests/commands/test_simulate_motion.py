@@ -58,7 +58,7 @@ def test_bvh_gives_what_a_video_gives(walk: np.ndarray, tmp_path: Path) -> None:
 
 
 def test_that_nobody_moves_is_said(tmp_path: Path) -> None:
-    """Not that nobody was found; the empty scene may be as short as it likes."""
+    """It does not claim that nobody was found; the empty scene may be of any length."""
     np.savez(
         tmp_path / "still.npz", joints=np.random.default_rng(0).random((1, 14, 3)).repeat(30, 0), fps=FPS
     )
@@ -140,7 +140,7 @@ def test_keypoints_give_what_a_video_gives(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["source"] == {"kind": "keypoints", "image_size": [720, 720]}
     assert summary["camera"] is None
-    # Where nothing tells the camera, it is estimated as for a film.
+    # Where nothing states the camera, it is estimated as for a film.
     cli.main([*arguments, "--person-height", height, *QUICK])
     summary = json.loads((out / "summary.json").read_text())
     assert summary["config"]["pose"]["calibrate"] is True

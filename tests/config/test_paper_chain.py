@@ -51,7 +51,7 @@ def test_the_paper_switch_is_the_papers_chain(wall: ts.WallConfig | None) -> Non
     expected = doppler_time(joints, wall)
     valid = torch.ones(1, 1, FRAMES, dtype=torch.bool)
     maps = stage(torch.from_numpy(joints)[None, None], valid, FPS)
-    # Frames that the filter's window at the last frame of the film reaches are left out: the stage goes on after it.
+    # Frames within the filter's window at the last frame of the film are left out: the stage continues after it.
     columns = expected.shape[1] - round(0.25 * RADAR.prf_hz)
     found = maps.doppler_time[0, :, :columns].numpy()
     np.testing.assert_allclose(found, expected[:, :columns], atol=1e-6 * expected.max())

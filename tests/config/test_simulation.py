@@ -157,7 +157,7 @@ def test_an_option_that_would_do_nothing_is_refused(
     with pytest.raises(TensorsimError, match=f"--{option.replace('_', '-')} has no effect without"):
         RadarOptions(**{option: value}).configuration()  # type: ignore[arg-type]
     config = RadarOptions(**{option: value}, **beside).configuration()  # type: ignore[arg-type]
-    # What a configuration says without effect is no option.
+    # Settings of a configuration that have no effect are no options.
     config = config.replace(scene__wall=None, scene__leakage=False, scene__receiver__adc_bits=None)
     config.to_yaml(tmp_path / "run.yaml")
     assert RadarOptions(config=tmp_path / "run.yaml").configuration() == config
@@ -204,7 +204,7 @@ def test_a_graph_made_by_hand_equals_that_of_the_configuration() -> None:
         ),
     )
     assert all(isinstance(graph.video_to_pose.pose.network, FlipTest) for graph in graphs)
-    # The drawn person is found by a detector of rectangles; the shipped pose network says something of it.
+    # The drawn person is found by a detector of rectangles; the shipped pose network gives some result for it.
     video = film(*walker(12, 10.0, 4.0, 1.0, 0.0))[None]
     with torch.no_grad():
         for graph in graphs:

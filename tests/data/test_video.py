@@ -123,7 +123,7 @@ def test_range_and_stride(clip: Path, arguments: dict[str, float], indices: rang
 
 
 def test_rotation_flag_of_a_telephone(tmp_path: Path) -> None:
-    """A film stored lying, with the matrix that says: turn by 90 degrees clockwise."""
+    """A film stored sideways, with a display matrix that rotates it by 90 degrees clockwise."""
     path = write_clip(tmp_path / "clip.mp4")
     data = bytearray(path.read_bytes())
     matrix = data.index(b"tkhd") + 4 + 40
@@ -279,7 +279,7 @@ def test_refuses_what_is_no_film(tmp_path: Path) -> None:
 
 
 def test_says_it_on_one_line_and_leaves_no_trace_of_ffmpeg(tmp_path: Path) -> None:
-    """In a process of its own: FFmpeg is told to be quiet before it starts."""
+    """In a separate process: FFmpeg is silenced before it starts."""
     (tmp_path / "text.mp4").write_bytes(b"to whom it may concern\n" * 50)
     cut = write_clip(tmp_path / "cut.mp4")
     cut.write_bytes(cut.read_bytes()[:-600])

@@ -51,7 +51,7 @@ class CountingDetector(RectangleDetector):
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """Two seconds of somebody who walks away, and two of an empty room."""
+    """Two seconds of a person who walks away, and two of an empty room."""
     folder = tmp_path / "films"
     folder.mkdir()
     away = film(*walker(20, FPS, 4.0, 1.2, 0.3))
@@ -165,7 +165,7 @@ def test_variants_of_films_are_labelled_without_the_networks(
 
 @pytest.mark.filterwarnings("ignore:.* its frames are up to")
 def test_times_of_frames_are_kept_with_what_the_networks_found(tmp_path: Path) -> None:
-    """Somebody walks away for 2 s; the film pauses 1 s after 1 s, and its last frames come late."""
+    """A person walks away for 2 s; the film pauses for 1 s after 1 s, and its last frames come late."""
     image = pytest.importorskip("PIL.Image")
     pictures = [
         image.fromarray(frame) for frame in film(*walker(20, FPS, 4.0, 1.2, 0.3)).permute(0, 2, 3, 1).numpy()

@@ -322,7 +322,7 @@ def test_tables_say_what_the_cells_say(
 
 
 def test_tables_count_what_is_left_out_and_leave_empty_scenes_out_for_everybody(tmp_path: Path) -> None:
-    """Somebody found in an empty room does not raise the mean of a setting above that of one that is right there."""
+    """A person found in an empty room does not raise the mean of a setting above that of a correct one."""
 
     def cell(row: str, clip: str, setting: str, psnr: float | None, people: float) -> dict[str, object]:
         figures = dict.fromkeys(FIGURES, 1.0) | {"psnr": psnr}

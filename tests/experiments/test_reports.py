@@ -280,7 +280,7 @@ def test_groups_of_maps_are_as_small_as_asked_for(tmp_path: Path) -> None:
     training = real_films.EverydayTraining(tmp_path, 1, 32, 1, EverydaySettings(filmed=0, true=1), quiet=True)
     activity = training.store.activity
     assert torch.bincount(activity)[1:].tolist() == [1] * (len(ACTIVITIES) - 1)
-    # What the folder says of itself counts.
+    # What the folder states about itself counts.
     other = real_films.EverydayTraining(tmp_path, 1, 32, 1, EverydaySettings(filmed=5), quiet=True)
     assert bool((other.store.activity == activity).all())
 
@@ -392,7 +392,7 @@ def test_real_labels_films(tmp_path: Path, shared_data: Path) -> None:
 
 @pytest.mark.slow
 def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chain that knows the truth has the best figures; one that finds nobody those of an empty map."""
+    """A chain that knows the truth has the best scores; one that finds nobody has those of an empty map."""
 
     class Watcher:
         missing: dict[str, str] = {"TCN": "no weights"}  # noqa: RUF012
@@ -426,7 +426,7 @@ def test_films_are_compared_chain_by_chain(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_an_empty_scene_is_in_the_mean_of_no_chain(tmp_path: Path) -> None:
-    """Somebody found in it would raise the mean of a chain above that of one that is right there."""
+    """A person found in it would raise the mean of a chain above that of a correct one."""
 
     class Watcher:
         missing: dict[str, str] = {}  # noqa: RUF012

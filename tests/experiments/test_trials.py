@@ -20,7 +20,7 @@ SMALL = Trial("ccln", "through-wall", clips=5, test_clips=1, size=32, epochs=2, 
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Pictures whose class is the row of a bright line, in place of simulated ones; says which were made."""
+    """Pictures whose class is the row of a bright line, instead of simulated ones; records which were made."""
     made: list[str] = []
 
     def prepare(self: PictureSet, people: int, inputs: str) -> None:

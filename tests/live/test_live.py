@@ -67,7 +67,7 @@ def simulator(**options: Any) -> LiveSimulator:
 
 @pytest.fixture(scope="module")
 def walk() -> Tensor:
-    """Frames (T, 3, H, W) of somebody who walks away."""
+    """Frames (T, 3, H, W) of a person who walks away."""
     return film(*walker(FRAMES, FPS, 3.0, 0.6, 0.3))
 
 
@@ -120,7 +120,7 @@ def test_weak_detections_make_nobody() -> None:
 
 @pytest.mark.parametrize(("left_px", "off"), [(0.0, (0.0, 0.03)), (5.0, (0.05, 1.0))])
 def test_sizes_of_who_is_cut_off_by_the_edge_count_little(left_px: float, off: tuple[float, float]) -> None:
-    """Somebody looks larger by half while the edge cuts him off, and is two frames later where he is."""
+    """A person looks larger by half while cut off by the edge, and is at the right place two frames later."""
     stage = simulator().poses[0]
     scores = torch.full((1, 17), 0.9)
 
@@ -139,7 +139,7 @@ def test_sizes_of_who_is_cut_off_by_the_edge_count_little(left_px: float, off: t
 
 
 def test_who_leaves_by_the_edge_is_followed_while_enough_is_seen() -> None:
-    """What is beyond the edge goes along with the hips; a few joints, or a strip of a box, are nobody."""
+    """Joints beyond the edge move with the hips; a few joints, or a strip of a box, are not a person."""
     stage = simulator().poses[0]
     state = stage.begin(1)
     swing = torch.zeros(17, 2)
@@ -183,7 +183,7 @@ def test_who_was_hidden_is_placed_anew() -> None:
 
 
 def test_nobody_is_lifted_in_a_frame_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes longer than a frame lasts; the state is that of lifting key points that nobody believes."""
+    """Lifting takes longer than a frame lasts; the state is the same as after lifting key points of score 0."""
     stage = simulator().poses[0]
     states = [stage.begin(2)]
     for t in range(12):
@@ -631,7 +631,7 @@ def test_command(
 def test_the_summary_of_a_run_is_taken(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It says that the camera was estimated, which live cannot do."""
+    """It states that the camera was estimated, which live cannot do."""
     weights, summary = tmp_path / "w.onnx", tmp_path / "summary.json"
     weights.write_text("")
     summary.write_text(json.dumps({"config": CONFIG.replace(pose__calibrate=True).to_document()}))

@@ -1,4 +1,4 @@
-"""What stands in frames in which somebody is absent does not matter, and nothing is heard of the change."""
+"""Values in frames in which a person is absent do not matter, and the change leaves no echo."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ FPS, FRAMES = 30.0, 60
 
 
 def approaching() -> tuple[Tensor, Tensor]:
-    """Somebody (1, 1, T, 14, 3) who glides towards the radar at 0.5 m/s, and is there in frames 10 to 34 (1, 1, T)."""
+    """A person (1, 1, T, 14, 3) who glides towards the radar at 0.5 m/s, present in frames 10 to 34 (1, 1, T)."""
     body = (
         ts.motion.ActivityGenerator().generate("rotating", seed=0, duration_s=0.1, rate_hz=FPS).joints[0, 0]
     )

@@ -92,7 +92,7 @@ def test_accelerations_are_those_of_a_body() -> None:
 
 
 def test_feet_do_not_slide() -> None:
-    """Where a script holds a foot, its ankle stands still, and somebody on his feet has one there."""
+    """Where a script holds a foot, its ankle is still, and a person on their feet has an ankle there."""
     people = crowd().people
     time = torch.arange(1000, dtype=torch.float64) / RATE
     for i, name in enumerate(ACTIVITIES):
@@ -305,7 +305,7 @@ def test_any_rate_samples_the_same_motion() -> None:
     assert slow.joints.shape == (12, 120, 14, 3)
     assert fast.joints.shape == (12, 3960, 14, 3)
     torch.testing.assert_close(fast.joints[:, ::33], slow.joints, rtol=0, atol=1e-9)
-    # And the knots behind it are dense enough: between them lies what the script says.
+    # And its knots are dense enough: between them, the motion follows the script.
     time = torch.arange(4000, dtype=torch.float64)[None].expand(12, -1) / 1000.3 + 0.0007
     people = nominal_people(12)._replace(heading_rad=torch.zeros(12, dtype=torch.float64))
     motion = make(classes, people=people, rate_hz=1000.3, duration_s=4.0)
@@ -392,7 +392,7 @@ def test_paths_stay_in_sight() -> None:
     assert float(hips[..., 1].max()) <= 7.0 + 0.2
     middle = (hips[..., 0].amin(dim=-1) + hips[..., 0].amax(dim=-1)) / 2
     assert float(middle.abs().max()) < 0.32
-    # Whoever fits starts where he was drawn.
+    # People who fit in start where they were drawn.
     standing = ActivityGenerator().generate("punching", batch=20, seed=9)
     start = at(standing.joints, "pelvis")[:, 0, 1]
     torch.testing.assert_close(start, standing.people.start_m[:, 1], rtol=0, atol=0.01)

@@ -185,7 +185,7 @@ def test_limbs_are_bright_broadside() -> None:
 
 
 def test_people_shadow_each_other() -> None:
-    """Behind somebody at the same height a torso loses 20 dB each way; whoever stands beside loses nothing."""
+    """Behind a person of the same height a torso loses 20 dB each way; a person to the side loses nothing."""
     model = BodyScatterers((0.0, 0.0, 1.2), (0.0, 0.0, 1.2), 77e9)
     front, behind, beside = (
         standing(0.0, d) + torch.tensor([x, 0.0, 0.0]) for d, x in ((3, 0), (5, 0), (4, 2))

@@ -1,4 +1,4 @@
-"""Everyday variants: bones keep their length, nobody is too fast, who falls lies, blows reach out and come back."""
+"""Everyday variants: bones keep their length, nobody is too fast, people who fall end up lying, blows return."""
 
 import pytest
 import torch

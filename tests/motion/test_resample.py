@@ -61,7 +61,7 @@ def test_spline_equals_scipy(frames: int, fps: float, prf: float) -> None:
     inside = pulse_time <= time[-1]
     spline = CubicSpline(time, joints.numpy(), axis=-3, bc_type="natural")
     np.testing.assert_allclose(actual[:, inside], spline(pulse_time[inside]), rtol=0, atol=1e-11)
-    # Beyond the last frame: the body goes on as it moved there.
+    # Beyond the last frame, the body continues as it moved there.
     after = (pulse_time[~inside] - time[-1])[:, None, None]
     onwards = joints.numpy()[:, -1:] + spline(time[-1], 1)[:, None] * after
     np.testing.assert_allclose(actual[:, ~inside], onwards, rtol=0, atol=1e-11)

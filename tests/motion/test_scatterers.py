@@ -104,7 +104,7 @@ def test_gradient_of_the_learnable_table() -> None:
 
 
 def test_a_table_is_found_from_its_echo() -> None:
-    """Three joints at distances that a small radar tells apart; from equal cross sections to the true ones."""
+    """Three joints at distances that a small radar resolves; from equal cross sections to the true ones."""
     radar = RadarConfig(carrier_hz=2e9, bandwidth_hz=0.6e9, sample_rate_hz=0.6e6, prf_hz=256.0)
     echo = EchoSynthesizer(radar)
     time = torch.arange(16, dtype=torch.float64).reshape(1, 16, 1) / 16

@@ -361,7 +361,7 @@ def test_following_gate_follows():
 
 
 def test_pulses_without_anybody_are_not_gated():
-    """The gate is closed where somebody is; before that, and after, all bins stay."""
+    """The gate is limited while a person is there; before and after, all bins are kept."""
     gate = FollowingGate(SMALL, 0.375 * torch.arange(12), 0.8)
     profiles = torch.ones(3, 12, dtype=torch.complex64)
     positions = torch.tensor([0.0, 2.0, 1.5]).expand(3, 2, 3)

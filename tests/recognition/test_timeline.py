@@ -118,7 +118,7 @@ def test_the_temperature_is_stored_with_the_weights(tmp_path) -> None:
 
 
 def test_the_other_way_round_counts_as_much() -> None:
-    """A mirror image has the mean of both logits, so what tells the ways apart is gone, and the file says so."""
+    """Logits are the mean over a map and its mirror image, so the directions look alike, as the file states."""
     scene = maps(64, 20)
     plain = recognizer()(scene)
     both = ts.recognition.ActivityRecognizer(

@@ -1,4 +1,4 @@
-"""The report: what the page is told equals the run, it stays small, and a real browser plays it without a network."""
+"""The report: its data equal the run, it stays small, and a real browser plays it without a network."""
 
 import base64
 import json
@@ -26,7 +26,7 @@ FPS, FRAMES = 20.0, 40
 
 @pytest.fixture(scope="module")
 def run() -> tuple[Pose, RadarMaps, Axes, dict[str, Any]]:
-    """Somebody who walks, seen through a wall, and nobody as a second person."""
+    """A person who walks, seen through a wall, and a second person who is never present."""
     motion = ts.motion.ActivityGenerator().generate(
         "walking", batch=1, seed=1, duration_s=FRAMES / FPS, rate_hz=FPS
     )

@@ -51,7 +51,7 @@ def test_shards_are_repeatable_and_go_on(tmp_path: Path, monkeypatch: pytest.Mon
         render_cutouts(26, 4, tmp_path, quiet=True)
     with pytest.raises(TensorsimError, match=r"'people': 26.*, expected .*'people': 27"):
         render_cutouts(27, 3, tmp_path, quiet=True)
-    # Shards of which nothing is told are taken as they are.
+    # Shards without a description are used as they are.
     (tmp_path / "cutouts.json").unlink()
     assert render_cutouts(26, 4, tmp_path, quiet=True) == paths
     assert [p.read_bytes() for p in paths] == data

@@ -1,4 +1,4 @@
-"""The recipe of the detector: it learns, goes on where it stopped, and is measured as COCO measures."""
+"""The recipe of the detector: it learns, resumes where it stopped, and is evaluated as by COCO."""
 
 import copy
 import itertools
@@ -60,7 +60,7 @@ def test_a_teacher_is_learnt_from_and_stays_as_it_is(recipe: DetectorRecipe) -> 
     """Without labels, scores and boxes come near to those of the teacher."""
     torch.manual_seed(1)
     teacher = RTMDet("test").eval()
-    for module in teacher.modules():  # a fresh network says the same of every cell
+    for module in teacher.modules():  # a fresh network has the same output in every cell
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight)
     before = copy.deepcopy(teacher.state_dict())
@@ -282,7 +282,7 @@ def test_figures_of_a_detector_that_is_told_the_answer(
     figures = measure(Told(), samples)  # type: ignore[arg-type]
     assert len(decoded) == len(samples), "a picture is decoded once"
     assert figures["recall"] == figures["recall_large"] == 1
-    assert figures["false_per_picture"] == 1.5  # one, and two where nobody is; 0.4 does not count
+    assert figures["false_per_picture"] == 1.5  # one, and two in the empty picture; 0.4 does not count
     assert figures["people"] == 1
     with pytest.raises(TensorsimError, match="without people"):
         measure(Told(), samples[1:])  # type: ignore[arg-type]

@@ -154,7 +154,7 @@ def test_quality_focal_loss_by_hand() -> None:
 
 
 def test_distillation_loss_by_hand() -> None:
-    # Two cells: the teacher is sure of the first, 0.8, and has a box there; of the second it says 0.2, too little.
+    # Two cells: the teacher is confident of the first, 0.8, and has a box there; the second has 0.2, too little.
     taught = torch.tensor([[0.8, 0.2]]).logit()
     boxes = torch.tensor([[[1.0, 0.0, 3.0, 2.0], [0.0, 0.0, 9.0, 9.0]]])
     taught_boxes = torch.tensor([[[0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 1.0, 1.0]]])

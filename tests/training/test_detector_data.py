@@ -79,7 +79,7 @@ def test_people_around_whom_all_has_their_colour_are_not_cut_out(tmp_path: Path)
 
 
 def shard(path: Path, people: bool, everyone: bool = True) -> list[Sample]:
-    """One picture 120 x 160, with a red person of 30 x 60 at (40, 20) or with nobody."""
+    """One picture 120 x 160, with a red person of 30 x 60 at (40, 20) or empty."""
     image = np.full((120, 160, 3), 90, np.uint8)
     persons = []
     if people:

@@ -59,7 +59,7 @@ def way_and_turns(hips, step):
 
 
 def walkers(walk: Callable[[Tensor, People, Draw], Tensor], count: int, seconds: int) -> Tensor:
-    """Joints (N, K, 14, 3) of people who go one of the ways of everyday walks."""
+    """Joints (N, K, 14, 3) of people who walk in one of the everyday ways."""
     generator = torch.Generator().manual_seed(0)
     people = draw_people(count, everyday.PEOPLE, generator)
     time = torch.arange(seconds * 120, dtype=torch.float64).expand(count, -1) / KNOT_HZ
@@ -136,7 +136,7 @@ def test_refuses_the_empty_scene():
 
 @pytest.fixture(scope="module")
 def standing() -> Tensor:
-    """Joints (80, 14, 3) of somebody who rotates, at 20 frames a second."""
+    """Joints (80, 14, 3) of a rotating person at 20 frames per second."""
     return at_rate(motion(6, 1)[0][0], 80, 20.0)
 
 
@@ -189,7 +189,7 @@ def test_those_who_walk_round_corners_walk_straight_between_them():
 def test_those_who_walk_round_a_room_come_round_one_way_mostly_along_its_walls():
     hips = walkers(everyday._round_and_round, 60, 12)[:, :, (8, 11), :2].mean(2)
     way, turned = way_and_turns(hips, 60)
-    # Who turns left goes on turning left, by more than half a turn in 12 s; hips sway a little the other way.
+    # People who turn left keep turning left, by more than half a turn in 12 s; hips sway a little the other way.
     one_way = turned.sum(1).abs()
     assert float(one_way.min()) > math.pi
     assert float((one_way / turned.abs().sum(1)).min()) > 0.5

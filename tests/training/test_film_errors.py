@@ -14,7 +14,7 @@ KICK, WALK = ActivityClip("S3 Kicking", "0", 2), ActivityClip("S8 Walking", "0",
 
 
 def seen(clip: ActivityClip, error_px: float = 0.0, joint: int = 9, lost: int = 0) -> Observed:
-    """The true key points, one of them beside its place; lost in the first frames; and a track of nobody."""
+    """The true key points, one of them misplaced; lost in the first frames; and a track without a person."""
     pixels, inside, _ = project(clip.joints(FPS))
     keypoints = pixels.clone()
     keypoints[:, joint, 0] += error_px

@@ -59,7 +59,7 @@ def test_joints_are_those_of_the_truth_loop() -> None:
 
 
 def test_films_are_lifted_and_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody where the true key points put him, and nobody in an empty scene."""
+    """A person at the place of the true key points, and nobody in an empty scene."""
     for row, folder in (("S1 Empty", "S1_Empty"), ("S8 Walking", "S8_Walking")):
         clip = ActivityClip(row, "1", 12 if row == "S1 Empty" else 19)
         seen = true_keypoints(clip)

@@ -161,13 +161,13 @@ def test_free_space_pictures_are_those_of_the_simulator(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def errors() -> FilmErrors:
-    """Of networks that see somebody walk as it is."""
+    """Errors of networks that see a walking person as it is."""
     clip = ActivityClip("S8 Walking", "0", 7, 1.0)
     return FilmErrors({"film": Watched.of(clip, true_keypoints(clip))})
 
 
 def test_motion_that_a_camera_saw(errors: FilmErrors) -> None:
-    """Empty stays empty; somebody walking is found in the same place within the store's span of speeds."""
+    """Empty stays empty; a walking person is at the same place within the store's span of speeds."""
     settings = replace(MapSettings.of_films(0, errors), size=28, duration_s=1.0)
     assert settings.motion_hz == 30.0
     maker = MapMaker("through-wall", settings)
@@ -184,7 +184,7 @@ def test_motion_that_a_camera_saw(errors: FilmErrors) -> None:
 
 
 def test_nobody_adds_nothing() -> None:
-    """Somebody who is there for half of the time has an echo then only."""
+    """A person present for half of the time has an echo only then."""
     maker = MapMaker("through-wall", replace(SMALL, motion_hz=30.0))
     noise = maker.noise(128, torch.Generator().manual_seed(0))
     walk = ActivityClip("S8 Walking", "0", 7, 1.0).joints(30.0)

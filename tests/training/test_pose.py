@@ -1,4 +1,4 @@
-"""The pose recipe: targets, losses, masks, metrics, a tiny network that learns, and a run that goes on."""
+"""The pose recipe: targets, losses, masks, metrics, a tiny network that learns, and a run that resumes."""
 
 from pathlib import Path
 
@@ -60,7 +60,7 @@ def test_loss_is_the_formula_and_zero_at_the_target_alone() -> None:
     assert heatmap_loss(targets, targets).abs().max() < 1e-12
 
 
-#: Nobody else beside three people.
+#: No neighbours of three people.
 NONE = torch.zeros(3, 0, 17, 2)
 
 

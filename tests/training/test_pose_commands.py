@@ -56,7 +56,7 @@ def test_train_then_evaluate(network: str, data: Path, capsys: pytest.CaptureFix
     for row, other in zip(rows[1:], capsys.readouterr().out.splitlines()[1:], strict=True):
         figures = ([float(figure) for figure in line.split()[-6:]] for line in (row, other))
         assert next(figures) == pytest.approx(next(figures), abs=0.0011)
-    # Training goes on from those weights.
+    # Training continues from those weights.
     more = TrainPose(
         data,
         out=data / "more",

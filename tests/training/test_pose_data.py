@@ -33,7 +33,7 @@ LEFT_WRIST, RIGHT_WRIST, NOSE = 9, 10, 0
 
 
 def standing(shift: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    """A person who stands and faces us, (19, 3): the left side is on the right of the picture."""
+    """A standing person facing the camera, (19, 3): the left side is on the right of the picture."""
     points = {
         0: (100, 50),
         5: (120, 80),

@@ -17,7 +17,7 @@ LEFT_WRIST, RIGHT_WRIST, NOSE, LEFT_EYE, LEFT_ELBOW = 9, 10, 0, 1, 7
 
 
 def person(keypoints: np.ndarray, key: str = "a") -> Person:
-    """Somebody in the picture of that name."""
+    """A person in the picture of that name."""
     label = np.array([[0, 0, 200, 280]], np.float32)
     return Person(
         Sample(key, label, keypoints[None], np.ones(1, np.float32), False, Path(key)), BOX, keypoints, 1.0

@@ -1,4 +1,4 @@
-"""What the pose network does not see as a person is nobody; what no body can do does not come out."""
+"""What the pose network does not see as a person is not one; impossible motion is not output."""
 
 import torch
 from torch import nn
@@ -41,7 +41,7 @@ def test_furniture_is_nobody() -> None:
     scores[:8] = 0.1
     _, valid = lifted(scores, still)
     assert not bool(valid.any())
-    scores[8:] = 0.7  # somebody whose upper half is hidden
+    scores[8:] = 0.7  # a person whose upper half is hidden
     joints, valid = lifted(scores, still)
     assert bool(valid.all())
     assert bool(joints.isfinite().all())

@@ -192,7 +192,7 @@ def test_charades(tmp_path: Path) -> None:
 
 
 def smpl(joints: np.ndarray) -> np.ndarray:
-    """Joints (T, 14, 3) as the 52 of SMPL-H, as far as they are known."""
+    """Joints (T, 14, 3) as the 52 of SMPL-H, where known."""
     found = np.repeat(joints[:, 1:2], 52, axis=1)
     names = {"head": "head", "neck": "neck"} | {
         f"{side}_{part}": f"{side}_{part}"

@@ -262,7 +262,7 @@ def test_samples_that_failed_are_tried_again_when_asked(captured: DatasetRecipe,
     assert build_dataset(captured, out, quiet=True) == (4, 1, 0)
     with pytest.raises(KeyboardInterrupt):
         build_dataset(captured, out, Interrupted(1), quiet=True, retry=True)
-    # Nothing says that it is finished: one of the samples in the old manifest may be another now.
+    # It is not marked as finished: one of the samples in the old manifest may have changed.
     assert not {"dataset.json", "manifest.parquet", "manifest.csv"} & {path.name for path in out.iterdir()}
     assert build_dataset(captured, out, quiet=True, retry=True) == (6, 0, 1)
     build_dataset(captured, tmp_path / "whole", quiet=True)

@@ -59,7 +59,7 @@ def test_networks_find_the_people_once_and_the_bytes_stay(
     assert build_dataset(recipe, tmp_path / "set", quiet=True) == (2, 0, 2)
     source: Any = Plan(recipe, str(tmp_path / "set" / ".people")).sources[0]
     with monkeypatch.context() as patch:
-        patch.setattr(PeopleFinder, "networks", None)  # whoever asks for them now fails
+        patch.setattr(PeopleFinder, "networks", None)  # any further request for them fails
         found, film = source._motion(source.clip(0)), source._filmed(source.clip(0))
     assert found.valid.all()
     errors = (found.joints - mid_hips(found.joints)[..., None, :]) - (

@@ -1,4 +1,4 @@
-"""The camera is told from people who walk, stays as assumed where nothing tells, and knows how well it is told."""
+"""The camera is estimated from people who walk, stays as assumed without evidence, and states its uncertainty."""
 
 import math
 from typing import Any, ClassVar
@@ -99,7 +99,7 @@ def test_somebody_who_walks_tells_the_camera(tilt: float, height: float, fov: fl
 
 
 def test_a_long_film_tells_no_less_than_the_walk_in_it() -> None:
-    """Frames without anybody do not count; of somebody who walks for minutes, windows are looked at."""
+    """Frames without people do not count; of a person who walks for minutes, only windows are used."""
     camera = known_camera(24.0, 3.0, 60.0)
     walk = walk_before(camera, 5)
     stage = CameraCalibrator((walk.height_m,), 0.02)
@@ -157,7 +157,7 @@ def test_key_points_of_low_scores_do_not_tell_the_camera(seed: int, far_share: f
         found = module(keypoints[None], scores[None], walk.scores.any(dim=-1)[None], HEIGHT, WIDTH, FPS)
         errors = errors_of(found, camera, walk)
         tilts.append(abs(errors.pitch_deg))
-        # Frames that do not count make it less sure, not wrong: whoever walks up to a gap has not stopped.
+        # Frames that do not count make it less certain, not wrong: a person who walks up to a gap has not stopped.
         assert abs(errors.range) < 0.12
     assert tilts[0] < 0.5
     assert tilts[1] > 0.55
@@ -194,7 +194,7 @@ def test_who_fights_in_place_does_not_walk() -> None:
 
 @pytest.mark.parametrize("hertz", [0.7, 0.93, 1.2])
 def test_cadence_is_that_of_the_ankles(hertz: float) -> None:
-    """Of somebody who turns in the middle, so that left and right change sides; nobody who does not walk has one."""
+    """Of a person who turns in the middle, so that left and right change sides; people who do not walk have none."""
     time = torch.arange(180, dtype=torch.float64) / FPS
     swing = 25 * (2 * math.pi * hertz * time).sin() * torch.where(time < 3.0, 1.0, -1.0)
     body = standing(400.0, 200.0).expand(180, 17, 2).clone()
@@ -353,7 +353,7 @@ def test_pictures_taken_upright_are_as_wide_along_their_longer_side() -> None:
 
 
 def seen(spots: list[tuple[float, float]], height_m: float, fov: float) -> Bodies:
-    """Somebody of ankles at 0.1 m and shoulders at 1.4 m on these spots before a level camera."""
+    """A person with ankles at 0.1 m and shoulders at 1.4 m on these spots in front of a level camera."""
     x, y = torch.tensor(spots, dtype=torch.float64).T
     z = torch.tensor([0.1, 1.4], dtype=torch.float64).expand(len(spots), 2)
     image = torch.stack([(x / y)[:, None].expand(-1, 2), (height_m - z) / y[:, None]], dim=-1)
@@ -398,7 +398,7 @@ def test_who_stands_has_no_speed_and_who_is_not_seen_no_residual() -> None:
 
 
 def test_shoulders_of_who_walks_lean_ahead() -> None:
-    """Somebody who walks to the right: shoulders 0.1 m ahead of where they would be above the ankles."""
+    """A person who walks to the right: shoulders 0.1 m ahead of where they would be above the ankles."""
     bodies = seen([(0.1 * t - 1.0, 4.0) for t in range(12)], 1.5, 1.0)
     image = bodies.image.clone()
     image[..., 1, 0] += 0.1 / 4.0 / math.tan(0.5)
@@ -501,7 +501,7 @@ def test_bodies_that_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     size = float((ankles - shoulders).norm()) / (WIDTH / 2)
     assert float(bodies.noise[0, 10]) == pytest.approx(math.hypot(0.02 * size, 2 / (WIDTH / 2)), rel=1e-3)
-    # One cycle a second, within a tenth after two seconds, tells the speed better than none.
+    # One cycle per second, within a tenth after two seconds, determines the speed better than none.
     assert mean[[4, 6]].tolist() == pytest.approx([0.0, 0.035 * 1.6])
     assert float(mean[5]) == pytest.approx(math.log(0.9 * 1.6), abs=0.2)
     assert deviation[4:].tolist() == pytest.approx([0.08 / 1.6, 0.08, 0.02 * 1.6])

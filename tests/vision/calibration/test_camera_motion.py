@@ -1,4 +1,4 @@
-"""A camera that pans is told from one that stands, whoever walks through its picture."""
+"""A panning camera is distinguished from a static one, even when people walk through its picture."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def seen(matrix: np.ndarray, picture: np.ndarray) -> np.ndarray:
 
 
 def film(speed_px_s: float, zoom_per_s: float = 1.0, seconds: float = 2.0, walker: bool = True) -> Tensor:
-    """Frames (T, 3, H, W) of a camera that pans and zooms; somebody textured crosses the picture."""
+    """Frames (T, 3, H, W) of a camera that pans and zooms; a textured person crosses the picture."""
     picture, person = room(), room(1)[:160, :70]
     frames = []
     for k in range(round(seconds * FPS)):

@@ -1,4 +1,4 @@
-"""People before a camera that turns and zooms are found where they are before one that stands still."""
+"""People in front of a camera that pans and zooms are found at the same places as with a static camera."""
 
 import math
 

@@ -42,7 +42,7 @@ FPS = 30.0
 
 
 def moving(frames: int, seed: int = 5) -> tuple[Tensor, float]:
-    """Somebody who walks, (frames, 14, 3), and their height."""
+    """A person who walks, (frames, 14, 3), and their height."""
     motion = ActivityGenerator().generate("walking", seed=seed, duration_s=frames / FPS, rate_hz=FPS)
     return motion.joints[0], float(motion.people.height_m[0])
 
@@ -175,7 +175,7 @@ def test_minimum_is_that_of_scipy(frames: int, calibrated: bool) -> None:
             parts += [weight * low / np.sqrt(1 + low**2), seen[:, FREE] * np.minimum(over, 0) / 0.005]
         return np.concatenate([p.ravel() for p in parts])
 
-    # There are several minima: the lower one of those that SciPy finds from what is given and from our own.
+    # There are several minima: the lower one of those found by SciPy from the given start and from our result.
     found = np.linalg.norm(fitted.numpy() - np.array(CAMERA), axis=-1)[:, FREE]
     best = min(
         (

@@ -26,7 +26,7 @@ CAMERA = CameraConfig(position_m=(0.0, 0.0, 1.8), pitch_rad=-math.radians(10))
 
 
 def squat(frames: int = 90) -> Tensor:
-    """World joints (T, 14, 3) of somebody who stands for a second, then goes into a squat, feet in place."""
+    """World joints (T, 14, 3) of a person who stands for a second and then squats, feet in place."""
     e = ((torch.arange(frames, dtype=torch.float64) - 30) / 30).clamp(0, 1)
     pose = BodyPose.standing((frames,))._replace(
         hip=torch.stack([e[:, None].expand(-1, 2) * 1.9, torch.zeros(frames, 2).double()], dim=-1),
@@ -79,7 +79,7 @@ def test_size_counts_while_upright_and_floor_and_last_stand_otherwise() -> None:
 
 
 def test_range_does_not_jump_as_the_floor_moves_away() -> None:
-    """With a limit on the distance from the last stand, somebody who lay was moved by 1.6 m at once."""
+    """With a limit on the distance from the last stand, a lying person was moved by 1.6 m at once."""
     floor = torch.linspace(2.0, 9.0, 701, dtype=torch.float64)
     one = torch.ones_like(floor)
     y = fused_range(4.2 * one, 0.0 * one, floor, 3.7 * one, 4.4 * one, 1.75 * one)[0]
@@ -288,7 +288,7 @@ def test_floor_is_a_low_quantile_of_the_lower_ankle() -> None:
     """Ankles at 0.1 m but for a jump of 1.4 s, in a window of 3 s: the floor stays; what is lower for long counts."""
     joints = torch.ones(120, 14, 3, dtype=torch.float64)
     joints[:, (10, 13), 2] = 0.1
-    joints[:, 13, 2] += 0.3  # the lower one tells
+    joints[:, 13, 2] += 0.3  # the lower one counts
     joints[40:82, (10, 13), 2] += 0.5
     there = torch.ones(120, dtype=torch.bool)
     torch.testing.assert_close(floor_under(joints, there, 30.0, 3.0), torch.full((120,), 0.1).double())
@@ -309,7 +309,7 @@ def at_once() -> tuple[Tensor, Tensor]:
 
 
 def on_floor(world: Tensor, by_size: Tensor) -> tuple[Tensor, ...]:
-    """Ranges of the hips, which frames tell, who stands and precisions, of a level camera 1.8 m above the floor."""
+    """Ranges of the hips, usable frames, who stands, and precisions, for a level camera 1.8 m above the floor."""
     camera = CameraConfig(position_m=(0.0, 0.0, 1.8), focal_px=900.0, center_px=(640.0, 360.0))
     image, lifted = film(world, camera)
     module = MetricPose(camera, (TALL,))

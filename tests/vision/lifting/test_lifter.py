@@ -193,7 +193,7 @@ def test_one_frame_and_no_temporal_weight_are_the_same() -> None:
 
 
 def test_temporal_weight_keeps_depths_from_flipping() -> None:
-    """A straight leg seen from the front swings forward or backward: the picture hardly says which."""
+    """A straight leg seen from the front swings forward or backward: the picture hardly shows which."""
     swing = 0.5 * torch.sin(torch.linspace(0, 6, 60, dtype=torch.float64))
     hip = torch.zeros(60, 2, 2, dtype=torch.float64)
     hip[:, 0, 0] = swing
@@ -213,7 +213,7 @@ def test_temporal_weight_keeps_depths_from_flipping() -> None:
 
 
 def test_a_body_half_out_of_the_picture_keeps_the_pose_of_its_better_frames() -> None:
-    """From a head and two shoulders alone, anything could hang: somebody lying would fit as well."""
+    """From a head and two shoulders alone, the rest is unknown: a lying person would fit as well."""
     pose = sample_poses(2000)[1].float().expand(5, 14, 3)
     keypoints, weights = projected(pose), torch.ones(5, 14)
     weights[2, 3:] = 0.0

@@ -429,7 +429,7 @@ def test_a_part_taken_for_a_small_body_says_nothing() -> None:
     assert seen[:85].all()
     assert not seen[85:].any()
     torch.testing.assert_close(joints[85:], joints[84:85].expand(5, -1, -1))
-    # Whoever is small while the whole body shows is far away.
+    # A person who looks small while the whole body is visible is far away.
     far = misread(image, lifted, slice(85, 90), list(range(14)), 0.4)
     joints, seen = place_seen(MetricPose(person_height_m=(TALL,)), image, torch.ones_like(scores), far)
     assert seen.all()

@@ -215,7 +215,7 @@ def test_selection_of_scores_and_pairs() -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 def test_rounding_of_coarse_scores_is_within_its_bound() -> None:
-    """Scores of a block are as near to cosines in float64 as the bound says, and the bound is that of the rounding."""
+    """Scores of a block are as close to cosines in float64 as the bound states, and the bound is that of rounding."""
     search = PoseSearch(standardise_poses(sample_poses(500, seed=4)).float(), 4, 3, 2**20)
     keypoints, weights = pictures(200, 5).float(), torch.full((200, 14), 1 / 14)
     k = (keypoints - keypoints.mean(dim=1, keepdim=True)).double()

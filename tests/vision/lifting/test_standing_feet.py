@@ -28,7 +28,7 @@ def waving() -> Tensor:
 def found(
     hips_range: Tensor, pixels: Tensor | None = None, depth: Tensor | None = None, seen: Tensor | None = None
 ) -> Tensor:
-    """Ranges of somebody whose feet stand, or move through the picture (T, 2, 2), or about the hips (T, 2).
+    """Ranges of a person whose feet are still, or move through the picture (T, 2, 2), or about the hips (T, 2).
 
     The arms move all the time.
     """
@@ -56,7 +56,7 @@ def test_a_steady_drift_of_who_stands_becomes_less() -> None:
 
 
 def test_the_hips_move_about_the_feet_as_the_pose_tells() -> None:
-    """Somebody bends, the hips 0.3 m further back."""
+    """A person bends, with the hips 0.3 m further back."""
     back = 0.3 / (1 + torch.exp(-6 * (TIME - 2.5)))
     there = found(4.0 + back + WRONG_M, depth=-back[:, None].expand(-1, 2))
     before = 4.0 + back + WRONG_M

@@ -273,7 +273,7 @@ def test_tracks_cost_time_only_around_the_frames_in_which_they_are() -> None:
 
 
 def test_before_an_estimated_camera_bones_have_their_lengths() -> None:
-    """Somebody who keeps still: the same picture, from where all bones together are 2.39 standing heights long."""
+    """A person who keeps still: the same picture, from where all bones together are 2.39 standing heights long."""
     _, keypoints, scores, boxes, valid = filmed(60)
     keypoints, boxes = (x[:, :1].expand_as(x) for x in (keypoints, boxes))
     lifter = TemporalLifter(network(), CAMERA, (1.7,)).double()

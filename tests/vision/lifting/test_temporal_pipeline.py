@@ -99,7 +99,7 @@ def test_the_shipped_lifter_raises_arms_where_they_are() -> None:
 
 
 def test_legs_below_the_picture_step() -> None:
-    """Somebody walks across in front of the camera, which sees no knee: the ankles swing as those of the truth do."""
+    """A person walks across in front of the camera, which sees no knee: the ankles swing like the true ones."""
     walk = ActivityGenerator().generate("walking", seed=1, duration_s=1.6, rate_hz=30.0).joints[0]
     walk = walk @ rotation(2, torch.tensor(-math.pi / 2, dtype=torch.float64)).mT
     walk = walk - mid_hips(walk)[24] + walk.new_tensor([0.0, 2.0, 0.9])

@@ -115,7 +115,7 @@ def test_no_channels() -> None:
 
 
 class Told(VideoPose3D):
-    """Says the pose that it was told, metres about the pelvis in camera axes, whatever it sees."""
+    """Returns a given pose, metres about the pelvis in camera axes, whatever it sees."""
 
     def __init__(self, pose: Tensor) -> None:
         super().__init__((1,), channels=4)
@@ -159,7 +159,7 @@ def test_nobody_is_lifted() -> None:
 
 
 def test_joints_of_human36m_by_name() -> None:
-    """Each joint is where its name says, and the way back gives the same body."""
+    """Each joint is where its name says, and the inverse gives the same body."""
     body = sample_poses(13, seed=4).float()
     there = dict(zip(H36M_JOINTS, body_to_h36m(body).unbind(-2), strict=True))
     here = dict(zip(JOINTS, body.unbind(-2), strict=True))

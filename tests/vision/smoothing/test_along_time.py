@@ -74,7 +74,7 @@ def test_only_gaps_have_a_ridge() -> None:
 
 
 def test_a_line_does_not_go_on_through_a_long_gap() -> None:
-    """Somebody comes nearer for a second, then nothing is known of the range for two."""
+    """A person approaches for a second, then the range is unknown for two."""
     t = torch.arange(90, dtype=torch.float64) / 30
     coming = 5.0 - 1.5 * t.clamp(max=1.0)
     noise = 0.02 * torch.randn(90, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -94,7 +94,7 @@ def test_outliers_do_not_bend_it() -> None:
 
 
 def test_imprecise_values_count_little() -> None:
-    """A quarter of the frames are wrong alike, which no robust weight finds; their precision tells."""
+    """A quarter of the frames have the same error, which no robust weight detects; their precision reveals it."""
     line = 4.0 + 0.05 * torch.arange(60, dtype=torch.float64)
     bad = (torch.arange(60) >= 22) & (torch.arange(60) < 37)
     noisy = (

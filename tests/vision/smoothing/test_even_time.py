@@ -97,7 +97,7 @@ def test_bad_times_are_refused(times: Tensor, message: str) -> None:
 
 
 def test_a_film_at_uneven_times_gives_the_motion_of_one_at_even_times() -> None:
-    """Somebody walks away at 1.2 m/s; the film pauses, and its frames jitter."""
+    """A person walks away at 1.2 m/s; the film pauses, and its frames jitter."""
     lifter = ts.vision.NearestPoseLifter(load_pose_library()[::40])  # fewer poses, for time
     stage = ts.VideoToPose(
         RectangleDetector(), StandingPose(), person_height_m=(1.75,), detection_interval=1, lifter=lifter

@@ -12,7 +12,7 @@ FPS = 30.0
 
 @pytest.fixture
 def scene() -> Pose:
-    """Somebody who sits at 2 m, somebody who walks at 4 m, somebody who punches at 3 m, a glimpse at 1 m."""
+    """A person who sits at 2 m, one who walks at 4 m, one who punches at 3 m, and a glimpse of one at 1 m."""
     body = torch.rand(14, 3, generator=torch.Generator().manual_seed(0))
     joints = body.expand(1, 4, 60, 14, 3).clone()
     time = torch.arange(60) / FPS

@@ -149,7 +149,7 @@ def test_coasting_ends_after_the_misses_of_the_panel() -> None:
     tracks = GNNTracker()(film([hidden(person, slice(30, 53))]))
     assert tracks.boxes.shape[1] == 2
     assert tracks.valid[0].sum(-1).tolist() == [30, 37]
-    # Frames in which nobody looked are no misses.
+    # Frames without detection are no misses.
     observed = torch.ones(90, dtype=torch.bool)
     observed[30:53] = False
     tracks = GNNTracker()(film([person]), observed)
@@ -263,7 +263,7 @@ def test_a_detection_of_just_the_faint_score_continues_a_track() -> None:
 
 @pytest.mark.parametrize(("gone", "people"), [(4, 1), (5, 2)])
 def test_a_faint_detection_does_not_continue_a_track_that_was_lost(gone: int, people: int) -> None:
-    """Somebody leaves, a mark on the wall is taken for a person once, and later somebody else stands there."""
+    """A person leaves, a mark on the wall is once taken for a person, and later another person stands there."""
     person, mark = walker(300, 300, 60), walker(300, 300, 60, height=380)
     seen = film([hidden(person, slice(20, 60))])
     faint = film([hidden(hidden(mark, slice(0, 20 + gone)), slice(21 + gone, 60))], score=0.2)
@@ -506,7 +506,7 @@ def test_two_people_who_hug_keep_their_ids(shared_data: Path) -> None:
     tracks = GNNTracker()(detections, observed)
     assert tracks.valid.shape == (1, 2, 72)
     assert tracks.valid.all()
-    # Grey shirt stays left, black jacket stays right; nobody jumps, however tight they hold each other.
+    # Grey shirt stays left, black jacket stays right; nobody jumps, however closely they hold each other.
     center = xyxy_to_center(tracks.boxes[0])[..., 0]
     assert (center[0] < center[1]).all()
     assert center.diff(dim=-1).abs().max() < 40.0
