@@ -137,7 +137,7 @@ class Evil:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Files that are not what their names say."""
+    """Files that are not what their names suggest."""
     (tmp_path / "text.mp4").write_text("this is no video")
     (tmp_path / "empty.mp4").write_bytes(b"")
     (tmp_path / "text.onnx").write_text("this is no network")

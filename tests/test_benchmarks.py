@@ -1,4 +1,4 @@
-"""The benchmark of the command times every stage that it names."""
+"""The command's benchmark times every stage that it names."""
 
 from pathlib import Path
 

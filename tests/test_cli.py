@@ -217,7 +217,7 @@ def test_the_distances_of_the_panel_calibrate_no_camera() -> None:
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A film of one person who walks away and one who comes."""
+    """A film of one person who walks away and one who approaches."""
     path = tmp_path_factory.mktemp("film") / "two.avi"
     away, comes = walker(25, FPS, 3.0, 1.0, -0.7), walker(25, FPS, 6.0, -0.8, 0.9)
     frames = film(*(torch.cat(both) for both in zip(away, comes, strict=True))).permute(0, 2, 3, 1).numpy()
@@ -286,7 +286,7 @@ def test_the_camera_is_in_summary_and_overlay(walk: Path, tmp_path: Path, stand_
 def test_a_camera_that_moves_is_said_and_its_turns_are_taken_out_where_it_is_estimated(
     tmp_path: Path, stand_ins: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A walker before a blue pattern that passes at 60 pixels per second."""
+    """A walker in front of a blue pattern that moves at 60 pixels per second."""
     frames = panned(film(*walker(25, FPS, 4.0, 1.2, 0.3)), 6)
     write_video(tmp_path / "pan.avi", frames.permute(0, 2, 3, 1).numpy(), FPS)
     cli.main(["simulate", str(tmp_path / "pan.avi"), "--out", str(tmp_path / "out"), *stand_ins])
@@ -416,7 +416,7 @@ def test_nobody_in_the_film_is_said(
 
 @pytest.mark.parametrize("command", ["simulate", "demo", "experiment", "train pose"])
 def test_help_says_none_of_no_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Options that need not be given are described with the value that they then have."""
+    """Optional options are described with their default values."""
     with pytest.raises(SystemExit):
         cli.main([*command.split(), "--help"])
     assert "None" not in capsys.readouterr().out

@@ -99,7 +99,7 @@ def test_ready_parts_alone_are_taken() -> None:
 
 
 def test_camera_of_the_composition_reaches_the_lifter() -> None:
-    """A tilted camera is that of the lifter as well as of the place in the world, as from a configuration."""
+    """A tilted camera applies to the lifter as well as to positions in the world, as from a configuration."""
     camera = CameraConfig(pitch_rad=-0.3)
     composed = VideoToPose(RectangleDetector(), StandingPose(), camera=camera)
     config = ts.SimulationConfig().replace(pose__camera=camera)

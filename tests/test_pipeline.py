@@ -1,4 +1,4 @@
-"""The whole graph on a film whose truth is known, and scripted in a process that has no tensorsim."""
+"""The whole graph on a film with known truth, and scripted in a process without tensorsim."""
 
 import math
 import subprocess
@@ -234,7 +234,7 @@ def test_a_foot_alone_at_the_end_of_a_track_does_not_fold_the_body() -> None:
 
 
 class MeasuredFrames(nn.Module):
-    """A smoother that keeps which frames of which joints it was given as measured."""
+    """A smoother that records which frames of which joints were passed as measured."""
 
     def __init__(self, smoother: nn.Module) -> None:
         super().__init__()
@@ -455,7 +455,7 @@ def test_gradients_flow_from_maps_to_joints() -> None:
 
 
 def test_gradients_flow_from_maps_to_frames() -> None:
-    """Through crops, heat maps and key points; who is where is found without gradients."""
+    """Through crops, heat maps and key points; people are detected and tracked without gradients."""
     motion = ts.motion.ActivityGenerator().generate("walking", batch=1, seed=1, duration_s=0.4, rate_hz=20.0)
     frames = ts.data.PersonRenderer(height=180, width=240)(motion.joints[:1], seed=1).frames
     frames = (frames.reshape(1, -1, 3, 180, 240) / (255 if frames.dtype == torch.uint8 else 1)).float()
@@ -469,7 +469,7 @@ def test_gradients_flow_from_maps_to_frames() -> None:
 
 @pytest.mark.parametrize(("fps", "interval"), [(5.0, 2), (30.0, 2), (44.0, 2), (60.0, 4), (120.0, 8)])
 def test_detections_per_second_do_not_grow_with_the_frame_rate(fps: float, interval: int) -> None:
-    """The tracker ends a person after so many of them without anybody."""
+    """The tracker ends a person after a number of observed frames without a detection."""
     stage = VideoToPose(RectangleDetector(), StandingPose())
     observed = stage.observed_frames(torch.ones(1, 20, dtype=torch.bool), fps)[0]
     assert observed.nonzero()[:, 0].tolist() == sorted({*range(0, 20, interval), 19})

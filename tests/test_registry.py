@@ -95,7 +95,7 @@ def test_an_interrupted_download_goes_on(entry: ModelEntry, server: Server) -> N
         registry.fetch(entry, quiet=True)
     assert not entry.path.exists()
     assert registry.fetch(entry, quiet=True).read_bytes() == CONTENT
-    # It went on where it had stopped.
+    # It resumed where it had stopped.
     assert server.ranges[0] is None
     assert server.ranges[-1] is not None
     assert int(server.ranges[-1].removeprefix("bytes=").rstrip("-")) > 0

@@ -1,4 +1,4 @@
-"""What each shipped network puts out for a fixed picture: a slip in a layer, an axis or a file shows here."""
+"""The output of each shipped network for a fixed picture: a slip in a layer, an axis or a file shows here."""
 
 import hashlib
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def tree_sums(network: ts.vision.AcfDetector) -> Tensor:
     return network.pass_cascade(channels, corners)[1]
 
 
-#: The numbers of each class that are looked at.
+#: The numbers of each class that are compared.
 LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "SPGNet": lambda network: network(wave(1, 1, 32, 32)),
     "SPNet": lambda network: network(wave(1, 1, 64, 64)),

@@ -271,7 +271,7 @@ def test_somebody_of_whom_one_key_point_is_seen_keeps_the_place(tmp_path: Path) 
 
 
 def test_somebody_far_from_everybody_before_is_somebody_new(tmp_path: Path) -> None:
-    """One leaves and another comes elsewhere; then the first one, who was gone for a while, is back nearby."""
+    """One leaves and another appears elsewhere; then the first one, absent for a while, is back nearby."""
     body = np.random.default_rng(0).uniform(0, 100, (17, 2))
     keypoints = np.stack([np.stack([body + 250.0 * p + [3.0 * t, 0.0] for t in range(60)]) for p in range(2)])
     scores = np.full((2, 60, 17), 0.9)

@@ -17,7 +17,7 @@ BONES = (
     ("left_shoulder", "left_elbow", 0.14), ("left_elbow", "left_wrist", 0.14),
     ("right_shoulder", "right_elbow", 0.14), ("right_elbow", "right_wrist", 0.14),
 )  # fmt: skip
-#: Distances around the bones in these thicknesses: surely body, probably body, and the limit beyond which nothing is.
+#: Factors on these thicknesses: surely body, probably body, and the limit of the body.
 SURELY, LIKELY, AT_MOST = 0.35, 1.0, 2.6
 #: The outline failed if less than the first share of the probable body is inside, or more than the second around it.
 LEAST_INSIDE, MOST_AROUND = 0.7, 0.4

@@ -195,7 +195,7 @@ def test_a_run_that_waits_can_be_cancelled(tmp_path: Path) -> None:
 
 
 def test_no_run_outlives_the_app(tmp_path: Path) -> None:
-    """A thread that still computes when Python ends aborts the process."""
+    """A thread still computing when Python exits aborts the process."""
     runs = Runs(tmp_path)
     started = [runs.start(lambda folder: Work(folder, steps=10_000)) for _ in range(2)]
     while not any(run.done for run in started):
@@ -259,7 +259,7 @@ def test_an_address_that_cannot_be_used_is_said_before_anything_is_loaded(
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[str]:
-    """The address of ``tensorsim app`` in a process of its own, with its temporary folders in ``tmp_path``."""
+    """The address of ``tensorsim app`` in a separate process, with its temporary folders in ``tmp_path``."""
     pytest.importorskip("gradio")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

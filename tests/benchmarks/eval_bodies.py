@@ -1,4 +1,4 @@
-"""How much of a walker's echo is how fast: ``python -m tests.benchmarks.eval_bodies [--walks N]``.
+"""How a walker's echo is distributed over speed: ``python -m tests.benchmarks.eval_bodies [--walks N]``.
 
 Measured walks (``../shared/data``: 24 GHz continuous wave, a recording and short bursts; 77 GHz in three directions)
 beside generated ones, seen by the same radar and processed alike, for each model of the body:

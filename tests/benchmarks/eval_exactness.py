@@ -31,7 +31,7 @@ CORRELATION_S = 0.5
 
 
 def smooth_noise(frames: int, joints: int, generator: torch.Generator) -> Tensor:
-    """(T, J) of deviation 1 that forgets itself within ``CORRELATION_S``."""
+    """Noise (T, J) of deviation 1 with a correlation time of ``CORRELATION_S``."""
     reach = round(2 * CORRELATION_S * FPS)
     kernel = torch.exp(-((torch.arange(-reach, reach + 1) / (CORRELATION_S * FPS)) ** 2)).double()
     white = torch.randn(joints, 1, frames + 2 * reach, generator=generator, dtype=torch.float64)

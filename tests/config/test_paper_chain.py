@@ -1,4 +1,4 @@
-"""The literal paper, from joints to Doppler-time map, against its formulas written out in NumPy and SciPy."""
+"""The paper's literal chain, from joints to Doppler-time map, against its formulas in NumPy and SciPy."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ RADAR = ts.RadarConfig.through_wall(sample_rate_hz=2e6)
 
 
 def walker() -> np.ndarray:
-    """Joints (T, 14, 3) that walk away behind the wall, each with a swing of its own."""
+    """Joints (T, 14, 3) that move away behind the wall, each with its own swing."""
     generator = np.random.default_rng(0)
     time_s = np.arange(FRAMES)[:, None, None] / FPS
     body = np.array([0.2, 3.0, 1.0]) + generator.normal(0, 0.25, (1, 14, 3))

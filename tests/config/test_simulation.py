@@ -194,7 +194,7 @@ def test_a_summary_repeats_its_run_to_the_bit(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_graph_made_by_hand_equals_that_of_the_configuration() -> None:
-    """The composition of the README, ``from_config`` and ``from_pretrained`` ask about the mirror image alike."""
+    """The README's composition, ``from_config`` and ``from_pretrained`` use the mirror image in the same way."""
     detector, network = ts.vision.RTMDet.from_pretrained(), ts.vision.HRNet.from_pretrained()
     graphs = (
         ts.VideoToDoppler(detector=detector, pose=network, radar=ts.RadarConfig.through_wall(), snr_db=None),

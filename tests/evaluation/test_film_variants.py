@@ -13,7 +13,7 @@ FPS, FRAMES, SIZE = 20.0, 40, (120, 200)
 
 @pytest.fixture
 def seen() -> Observed:
-    """Two people, of whom the second is there in the first half only."""
+    """Two people, the second present in the first half only."""
     generator = torch.Generator().manual_seed(0)
     valid = torch.ones(1, 2, FRAMES, dtype=torch.bool)
     valid[:, 1, FRAMES // 2 :] = False

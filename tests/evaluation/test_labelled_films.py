@@ -287,7 +287,7 @@ def test_bad_labels_are_refused(data: Path, rows: list[dict[str, Any]], why: str
 
 
 class Always(nn.Module):
-    """Takes every map for one activity."""
+    """Recognises every map as the same activity."""
 
     def __init__(self, index: int) -> None:
         super().__init__()

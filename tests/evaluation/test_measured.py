@@ -142,7 +142,7 @@ def test_ablation_table_by_hand(folders, tmp_path):
 
 @pytest.mark.parametrize("measured", SETS, ids=lambda s: s.name)
 def test_every_effect_changes_the_pictures(measured):
-    """No switch of an ablation is dead: without the effect some clip comes out otherwise."""
+    """No switch of an ablation is dead: without the effect, some clip changes."""
     whole, _ = measured.simulate(2, 0, quiet=True)
     for name in measured.effect_names:
         assert not torch.equal(whole, measured.simulate(2, 0, quiet=True, without=name)[0]), name

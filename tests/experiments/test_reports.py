@@ -1,4 +1,4 @@
-"""Reports from results that are known: order, figures, what they say."""
+"""Reports from known results: order, figures, statements."""
 
 import json
 from dataclasses import asdict, replace
@@ -166,7 +166,7 @@ def test_real_says_what_is_missing(tmp_path: Path) -> None:
 def test_folders_are_looked_at_before_anything_is_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Measured sets that are good do not hide films or maps that are not there."""
+    """Valid measured sets do not hide missing films or maps."""
     monkeypatch.setattr(MeasuredSet, "load", lambda *_: (torch.zeros(1), torch.zeros(1)))
     monkeypatch.setattr(real, "_on_measured", None)
     others = {name: replace(entry, run=None) for name, entry in EXPERIMENTS.items() if name != "real"}
@@ -303,7 +303,7 @@ def test_the_first_films_of_a_folder_are_taken(tmp_path: Path, monkeypatch: pyte
     assert len(real_films.film_pictures(tmp_path, 32, work, 2)) == 2
     assert len(real_films.film_pictures(tmp_path, 32, work)) == 3
 
-    # Other weights of the shipped networks see the films anew.
+    # With other weights of the shipped networks, the films are processed again.
     before = set((tmp_path / "work" / "results").iterdir())
     entries = [replace(entry, sha256="0" * 64) for entry in shipped()]
     monkeypatch.setattr("tensorsim.registry.shipped", lambda: tuple(entries))
@@ -333,7 +333,7 @@ def test_networks_learn_everyday_maps_and_label_films(
     assert found["free-space clips"] == found["through-wall clips"] == 1.0
     assert found["free-space films"] == 1.0
     assert found["through-wall films"] == 0.0
-    # The network that was asked is the one that is kept.
+    # The network that was tested is the one that is kept.
     (kept,) = (tmp_path / "work" / "trials").rglob("best.safetensors")
     net = find_classifier("ccln").build(12, 1, 32)
     load_strict(net, load_state_dict(kept), kept)

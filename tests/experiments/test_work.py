@@ -146,7 +146,7 @@ def test_report_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
     assert configuration("own", False, out / "own.yaml", {}) == EchoConfig(clips=3)
     assert "# Title\n\nNote.\n\n## One" in (out / "own.md").read_text()
 
-    # Another run has no second table and no figure; other files stay.
+    # The other run has no second table and no figure; other files stay.
     others = [out / name for name in ("own-notes.txt", "owner-more.csv", "more.csv")]
     for path in others:
         path.write_text("kept")

@@ -147,7 +147,7 @@ def test_intersection_and_centres_by_hand() -> None:
 
 
 def greedy(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, threshold: float) -> list[int]:
-    """Greedy suppression as the textbook has it, one box at a time."""
+    """Textbook greedy suppression, one box at a time."""
     x1, y1, x2, y2 = boxes.T
     area = (x2 - x1) * (y2 - y1)
     order = list(np.argsort(-scores, kind="stable"))

@@ -1,4 +1,4 @@
-"""The camera that has everybody in its picture, against OpenCV's projection."""
+"""The camera that has all people in its picture, against OpenCV's projection."""
 
 import math
 

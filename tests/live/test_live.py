@@ -277,7 +277,7 @@ def test_spline_is_that_of_scipy() -> None:
     [(20.0, 512.0, "two-pulse"), (120.0, 128.0, "two-pulse"), (60.0, 128.0, "n-pulse")],
 )
 def test_maps_are_those_of_the_whole_motion(fps: float, prf_hz: float, mti: str) -> None:
-    """Also where a frame has fewer pulses than the moving target indicator begins with."""
+    """Also where a frame has fewer pulses than the moving target indicator needs to start."""
     motion = ts.motion.ActivityGenerator().generate("walking", seed=1, duration_s=2.0, rate_hz=fps)
     joints = motion.joints[0].double()
     joints = (joints[:1] + joints) / 2  # slow enough for a PRF of 128 Hz
@@ -365,7 +365,7 @@ def test_missed_frames_are_bridged_and_counted(walk: Tensor) -> None:
 
 
 def test_people_are_looked_for_whichever_frames_are_missed(walk: Tensor) -> None:
-    """Those that come have odd numbers, every other one of which would be looked at."""
+    """Frames that arrive have odd numbers; detection must not depend on the parity of the number."""
     live = simulator()
     for index, frame in enumerate(walk):
         new = live.push(frame) if index % 2 else live.miss()
@@ -412,7 +412,7 @@ def test_what_needs_the_whole_film_is_refused(walk: Tensor) -> None:
 
 
 def test_nearest_matching_lifts_whatever_the_configuration_says() -> None:
-    """The temporal lifter needs the frames to come."""
+    """The temporal lifter needs future frames."""
     config = CONFIG.replace(pose__library=None, pose__lifter="temporal")
     assert LiveSimulator(config, FPS, *networks()).config.pose.lifter == "nearest"
 
@@ -484,7 +484,7 @@ def test_time_starts_with_the_first_frame_of_a_camera(monkeypatch: pytest.Monkey
 
 
 class SteadyCapture:
-    """A camera that gives so many frames per second, with jitter, for eight seconds of a clock of its own."""
+    """A camera with this many frames per second, with jitter, for eight seconds of a simulated clock."""
 
     def __init__(self, fps: float) -> None:
         self.fps, self.count, self.now, self.jitter = fps, 0, 0.0, np.random.default_rng(0)
@@ -616,7 +616,7 @@ def test_command(
     film = VideoReader(tmp_path / "live.webm")
     assert (film.width, film.height) == (640, 480 + 240 + 26)
     assert sum(chunk.shape[0] for chunk in film.chunks(16)) == 53
-    # Columns, labels and pictures of frames that are missing are not left out.
+    # Columns, labels and pictures of missing frames are not omitted.
     monkeypatch.setattr(Camera, "frames", _every_third)
     cli.main([*arguments, "--record", str(tmp_path / "third.webm")])
     said = capsys.readouterr()

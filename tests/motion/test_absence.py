@@ -75,7 +75,7 @@ def test_wrong_validity_is_refused() -> None:
 
 
 def test_maps_do_not_depend_on_absent_frames() -> None:
-    """Zeros there, as files have them, were heard as a flash over all Doppler bins while the person leaves."""
+    """Zeros there, as in files, gave a flash over all Doppler bins while the person leaves."""
     joints, valid = approaching()
     chain = ts.PoseToDoppler.from_config(
         ts.SimulationConfig().replace(scene__snr_db=None, scene__radar__prf_hz=2048.0)

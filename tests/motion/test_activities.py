@@ -1,4 +1,4 @@
-"""The twelve activities: bodies stay bodies, feet stand, speeds are those of people, seeds repeat."""
+"""The twelve activities: bodies stay plausible, feet stand, speeds are human, seeds are reproducible."""
 
 import math
 from functools import cache
@@ -126,7 +126,7 @@ def test_feet_on_their_way_are_in_the_air() -> None:
 
 
 def test_a_foot_stays_on_its_place_for_a_third_of_the_cycle() -> None:
-    """Seen from outside: while walking, each ankle rests within a centimetre for that long, step after step."""
+    """Measured on the joints: while walking, each ankle rests within a centimetre for that long, step by step."""
     ankle = at(nominal(7).joints, "right_ankle")[0]
     slow = velocity(ankle[None])[0].norm(dim=-1) < 0.1
     starts = torch.nonzero(slow[1:] & ~slow[:-1])[:, 0] + 1

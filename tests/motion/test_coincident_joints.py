@@ -1,4 +1,4 @@
-"""Joints that coincide, as of a skeleton that was not found, give finite values and gradients in every stage."""
+"""Coinciding joints, as of a skeleton that was not found, give finite values and gradients in every stage."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The same seed gives the same movements and echoes, release after release: slips in their many numbers show.
+"""The same seed gives the same movements and echoes in every release, so that slips in their many numbers show.
 
 After a change that is meant, ``python -m tests.motion.test_same_motion`` prints the new numbers.
 """

@@ -149,7 +149,7 @@ def test_bad_input_is_refused() -> None:
 
 
 class Fixed(nn.Module):
-    """Says the same of every picture."""
+    """Gives the same result for every picture."""
 
     num_classes = 3
     in_channels = 1

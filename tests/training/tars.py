@@ -1,4 +1,4 @@
-"""Shards to train on, made up."""
+"""Made-up shards to train on."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""Which cells answer for whom, and the losses, against NumPy written from the paper and values by hand."""
+"""Assignment of cells to objects, and the losses, against NumPy written from the paper and values by hand."""
 
 import numpy as np
 import numpy.typing as npt

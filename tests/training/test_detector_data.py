@@ -1,4 +1,4 @@
-"""Pictures to train a detector on: boxes stay on the people, and what is not known is marked."""
+"""Pictures to train a detector on: boxes stay on the people, and unknown areas are marked."""
 
 import json
 from pathlib import Path

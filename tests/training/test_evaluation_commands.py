@@ -69,7 +69,7 @@ def test_classifier_on_maps(weights: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def small_store(folder: Path, size: int, people: int = 1) -> None:
-    """Pictures in which everybody comes: their upper half, of positive speeds, is bright."""
+    """Pictures in which everybody approaches: the upper half, of positive speeds, is bright."""
     folder.mkdir()
     (folder / "settings.json").write_text(json.dumps(asdict(MapSettings(seed=1, size=size))))
     signal = torch.zeros(12, size, size, dtype=torch.uint8)

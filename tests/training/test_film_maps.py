@@ -14,7 +14,7 @@ CLIP = ActivityClip("S8 Walking", "0", 7, 2.0)
 
 
 def errors(clip: ActivityClip = CLIP, found: bool = True) -> FilmErrors:
-    """Of networks that see a film as it is, or nothing in it."""
+    """Errors of networks that see a film as it is, or nothing in it."""
     seen = true_keypoints(clip)
     film = Watched.of(clip, seen._replace(valid=seen.valid & found))
     return FilmErrors({"film": film})

@@ -175,7 +175,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
 
 
 def test_a_score_that_is_not_a_number_stops_the_run(tmp_path: Path) -> None:
-    """No weights would be the best, and those of an earlier run be taken for them."""
+    """Otherwise no weights would be the best, and those of an earlier run would be taken for them."""
 
     class Unjudged(Line):
         def validate(self, net: nn.Module) -> dict[str, float]:

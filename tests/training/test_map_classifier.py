@@ -1,4 +1,4 @@
-"""Training on a data set of one's own: classes, starting weights, and what is left beside the weights."""
+"""Training on your own data set: classes, starting weights, and the files written next to the weights."""
 
 from pathlib import Path
 

@@ -49,7 +49,7 @@ from tests.data.sets.recipes import small_recipe
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Everything in the folder of a data set but for what only one run has."""
+    """Everything in the folder of a data set except what is specific to one run."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -205,7 +205,7 @@ def test_pictures_in_folders_of_classes(tmp_path: Path) -> None:
 
 
 class Interrupted:
-    """An engine that does jobs in another order and is interrupted after some."""
+    """An engine that does jobs in a different order and is interrupted after some."""
 
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs

@@ -40,7 +40,7 @@ def write_film(path: Path, frames: np.ndarray) -> None:
 
 
 def damage(folder: Path, good: Path, name: str = "") -> list[Path]:
-    """Write ten films that cannot be used, each for another reason."""
+    """Write ten films that cannot be used, each for a different reason."""
     whole = good.read_bytes()
     contents = {
         "empty.avi": b"",
@@ -65,7 +65,7 @@ def good_film(speed: float) -> np.ndarray:
 
 @pytest.fixture
 def films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A good film of each of two classes and ten that are damaged, each in another way."""
+    """A good film of each of two classes and ten damaged ones, each damaged in a different way."""
     folder = tmp_path / "films"
     for label, speed in (("leave", 1.2), ("come", -1.0)):
         write_film(folder / label / "good.avi", good_film(speed))
@@ -209,7 +209,7 @@ def test_frame_rates_of_a_source_serve_motion_that_tells_none(tmp_path: Path, st
 
 @pytest.mark.slow
 def test_of_two_hundred_films_all_good_ones_arrive_and_all_bad_ones_are_listed(tmp_path: Path) -> None:
-    """Very short films, so that the shipped networks, reader and files are those of every day."""
+    """Very short films, so that the shipped networks, reader and files can be used."""
     folder = tmp_path / "films"
     generator = ActivityGenerator(PeopleConfig(start_range_m=(2.5, 2.5)))
     for number, label in enumerate(("walking", "sitting down")):

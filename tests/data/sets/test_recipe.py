@@ -1,4 +1,4 @@
-"""Recipes: what a file may say, what follows from it, and what is refused."""
+"""Recipes: what a file may contain, what follows from it, and what is refused."""
 
 from collections import Counter
 from dataclasses import replace
@@ -265,7 +265,7 @@ def test_a_short_motion_ends_with_nobody_and_a_long_one_is_cut() -> None:
 
 
 def test_whoever_leaves_or_comes_keeps_the_speed_until_then() -> None:
-    """Absent frames, at the origin in placed motion, must not bend the curve beside them."""
+    """Absent frames, at the origin in placed motion, must not bend the curve next to them."""
     recipe = small_recipe(outputs=OutputConfig(dtype="float16", rate_hz=None))
     drawn = replace(draw(recipe.variations, 1), snr_db=None, speed=1.0, distance_m=3.0, height_m=None)
     recipe = replace(recipe, scene=SceneConfig(snr_db=None))
