@@ -25,20 +25,20 @@ class VideoToDoppler(nn.Module):
 
     Args:
         detector, pose: the two networks, see :class:`VideoToPose`.
-        radar: a radar, or the name of a preset (``tensorsim.radar.PRESETS``), whose wall and floor come with it;
+        radar: a radar, or the name of a preset (``tensorsim.radar.PRESETS``), which brings its own wall and floor;
             default the panel's free-space radar.
         wall: a wall between the radar and the people, or behind them; see :class:`tensorsim.radar.EchoSynthesizer`.
-        multipath, leakage, wall_echo: paths beyond the direct one; all off by default, also for the preset
+        multipath, leakage, wall_echo: paths beyond the direct one; all off by default, even for the preset
             ``"through-wall"`` (:meth:`from_config` and the command turn multipath on where there is a wall).
-        snr_db: signal-to-noise ratio in dB per IF sample of the people's echo; None is free of noise. The noise is
+        snr_db: signal-to-noise ratio in dB per IF sample of the people's echo; None means no noise. The noise is
             drawn from torch's global generator (``torch.manual_seed``).
         person_height_m, initial_distance_m, camera, detection_interval: see :class:`VideoToPose`.
         denoiser: see :class:`PoseToDoppler`.
         video_to_pose, pose_to_doppler: prebuilt stages, instead of building them from the arguments above.
 
     Raises:
-        TensorsimError: a prebuilt stage together with arguments from which it would be built; no detector or pose
-            network and no prebuilt stage; parts that are not such stages.
+        TensorsimError: a prebuilt stage together with arguments that it would be built from; no detector or pose
+            network and no prebuilt stage; parts that are not suitable stages.
 
     Example:
         >>> sim = ts.VideoToDoppler(detector, pose, radar=ts.RadarConfig.free_space())
@@ -105,18 +105,18 @@ class VideoToDoppler(nn.Module):
     def from_config(
         cls, config: SimulationConfig, detector: nn.Module | None = None, pose: nn.Module | None = None
     ) -> "VideoToDoppler":
-        """The graph that a configuration describes, in evaluation mode, its networks frozen.
+        """The graph described by a configuration, in evaluation mode, its networks frozen.
 
         Args:
             config: the configuration.
-            detector, pose: networks in place of those that it names.
+            detector, pose: networks to use instead of those that it names.
 
         Raises:
-            TensorsimError: weights that are not there or of another network.
+            TensorsimError: weights that do not exist or belong to another network.
 
         Warns:
-            TensorsimWarning: ``pose.calibrate``, which takes a whole film: the graph has the camera ``pose.camera``.
-                :func:`tensorsim.streaming.people_of_film` estimates it, as ``tensorsim simulate`` does.
+            TensorsimWarning: ``pose.calibrate`` is set: it needs a whole video, so the graph uses ``pose.camera``.
+                :func:`tensorsim.streaming.people_of_film` estimates the camera, as ``tensorsim simulate`` does.
 
         Example:
             >>> sim = ts.VideoToDoppler.from_config(ts.SimulationConfig.through_wall())
@@ -149,7 +149,7 @@ class VideoToDoppler(nn.Module):
             **options: further arguments of the constructor.
 
         Raises:
-            TensorsimError: weights that are not there or of another network.
+            TensorsimError: weights that do not exist or belong to another network.
         """
         whole = cls(pretrained_detector(detector), pretrained_pose(pose, flip_test), **options).eval()
         whole.video_to_pose.requires_grad_(False)
@@ -158,14 +158,14 @@ class VideoToDoppler(nn.Module):
     def forward(
         self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
     ) -> Simulation:
-        """Simulate what the radar sees of clips.
+        """Simulate what the radar sees in clips.
 
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
-            lengths: (B,) frames of each clip when the shorter ones are padded. The level of the noise follows the mean
-                power of the echo over all T frames: that of a clip that is half padding is 3 dB lower.
-            times_s: (B, T) seconds of frames that are not evenly spaced.
+            lengths: (B,) frames of each clip when shorter ones are padded. The noise level follows the mean power of
+                the echo over all T frames: for a clip that is half padding it is 3 dB lower.
+            times_s: (B, T) times in seconds of frames that are not evenly spaced.
 
         Raises:
             TensorsimError: see :class:`VideoToPose` and :class:`PoseToDoppler`.
@@ -192,14 +192,14 @@ class VideoToDoppler(nn.Module):
 class VideoToActivity(nn.Module):
     """Video -> maps -> activity, as one graph: :class:`VideoToDoppler` and a recognizer of its maps.
 
-    A clip shows one activity of about four seconds, as the recognizer was trained on; its people are one scene.
+    A clip should show one activity of about four seconds, as in the recognizer's training; its people form one scene.
 
     Args:
         video_to_doppler: frames to maps.
         recognizer: :class:`RadarMaps` -> logits (B, classes); see :class:`tensorsim.recognition.ActivityRecognizer`.
 
     Raises:
-        TensorsimError: a recognizer made for another radar, or parts that are not such stages.
+        TensorsimError: a recognizer made for another radar, or parts that are not suitable stages.
 
     Example:
         >>> sim = ts.VideoToActivity.from_pretrained()
@@ -233,7 +233,7 @@ class VideoToActivity(nn.Module):
             radar, **options: further arguments of :class:`VideoToDoppler`.
 
         Raises:
-            TensorsimError: weights that are not there or of another network.
+            TensorsimError: weights that do not exist or belong to another network.
         """
         whole = VideoToDoppler.from_pretrained(detector, pose, radar=radar, **options)
         radar = whole.pose_to_doppler.simulator.radar
@@ -242,10 +242,10 @@ class VideoToActivity(nn.Module):
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "VideoToActivity":
-        """The graph that a configuration describes, in evaluation mode, its networks frozen.
+        """The graph described by a configuration, in evaluation mode, its networks frozen.
 
         Raises:
-            TensorsimError: weights that are not there or of another network, or ``classifier="none"``.
+            TensorsimError: weights that do not exist or belong to another network, or ``classifier="none"``.
         """
         if config.classifier == "none":
             raise TensorsimError("VideoToActivity: got the classifier 'none', expected weights")
@@ -255,7 +255,7 @@ class VideoToActivity(nn.Module):
     def forward(
         self, video: Tensor, fps: float, lengths: Tensor | None = None, times_s: Tensor | None = None
     ) -> Recognition:
-        """Clips (B, T, 3, H, W) to people, maps and logits; arguments and errors of :class:`VideoToDoppler`."""
+        """Clips (B, T, 3, H, W) to people, maps and logits; arguments and errors as in :class:`VideoToDoppler`."""
         found = self.video_to_doppler(video, fps, lengths, times_s)
         logits = self.recognizer(
             RadarMaps(
@@ -296,7 +296,7 @@ def as_scene(radar: RadarConfig | str | None, wall: WallConfig | None) -> SceneC
 
 
 def warn_of_empty_clips(valid: Tensor) -> None:
-    """Warn of clips without a person (``valid`` (B, P, T)); ``valid`` of the output says which."""
+    """Warn if any clip has no person (``valid`` (B, P, T)); ``valid`` of the output shows which."""
     if not bool(valid.flatten(1).any(dim=1).all()):
         warnings.warn(
             "no person found in a clip: its maps show the empty scene",

@@ -1,4 +1,4 @@
-"""Joints at video rate -> maps of the radar."""
+"""Joints at video rate -> radar maps."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -26,26 +26,26 @@ from tensorsim.types import RadarMaps
 
 
 class PoseToDoppler(nn.Module):
-    """Joints at video rate -> maps of the radar: resample to the pulse rate, place scatterers, simulate.
+    """Joints at video rate -> radar maps: resample to the pulse rate, place scatterers, simulate.
 
-    Several people of a clip are one scene: their scatterers are summed in one echo. Echoes of people far beyond the
+    The people of a clip form one scene: their scatterers add up in one echo. Echoes of people far beyond the
     range axis are filtered out (:meth:`heard`).
 
     Args:
         simulator: scatterers -> maps.
         resampler: video rate -> pulse rate; default the C2 spline at the PRF of the simulator's radar.
-        pulse_smoother: optional filter along the pulses; the paper's is linear resampling and Savitzky-Golay.
+        pulse_smoother: optional filter along the pulses; the paper uses Savitzky-Golay after linear resampling.
         scatterers: joints -> scatterers; default one point per joint with the panel's RCS.
         denoiser: optional module on magnitude maps (..., H, W), e.g. ``tensorsim.enhance.MapDenoiser``. It cleans
-            the shown maps; the Doppler-time map is computed from data that was not denoised.
-        rcs_scale: factor on the cross sections by person; the last one applies to all further people.
-        small_motions: motions of the body that no camera resolves, added at the pulse rate, e.g.
+            the finished maps; the Doppler-time map is computed from data that was not denoised.
+        rcs_scale: factor on each person's cross sections; the last one applies to all further people.
+        small_motions: body motions too small for a camera to resolve, added at the pulse rate, e.g.
             :class:`tensorsim.motion.PosturalSway` and :class:`tensorsim.motion.VitalSigns`: modules
             (joints (B, P, M, 14, 3), first pulse) -> joints.
 
     Raises:
-        TensorsimError: a resampler or small motions of another rate than the PRF of the simulator's radar, factors that
-            are not positive, parts that are not such stages.
+        TensorsimError: a resampler or small motions with a rate other than the PRF of the simulator's radar, factors
+            that are not positive, parts that are not suitable stages.
     """
 
     rcs_scale: Tensor
@@ -73,7 +73,7 @@ class PoseToDoppler(nn.Module):
                 raise TensorsimError(
                     f"{name}: got a rate of {rate_hz:g} Hz, expected the radar's PRF of {prf_hz:g} Hz"
                 )
-        # Pulses beside a piece of motion that the filter needs to give the same values as on the whole.
+        # Pulses on each side of a piece of motion that the filter needs to give the same values as on the whole.
         self.halo = 0 if pulse_smoother is None else pulse_smoother.window
         self.pulse_smoother = pulse_smoother if pulse_smoother is not None else nn.Identity()
         self.scatterers = check_part(JointScatterers() if scatterers is None else scatterers, "scatterers")
@@ -86,14 +86,14 @@ class PoseToDoppler(nn.Module):
             "radar_m", torch.tensor(simulator.radar.middle_m, dtype=torch.float64), persistent=False
         )
         self.reach_m = simulator.radar.reach_m
-        self.unheard_m = 1.9 * self.reach_m  # from here on the receiver hears nobody
+        self.unheard_m = 1.9 * self.reach_m  # from here on the receiver picks up nobody
 
     @classmethod
     def from_config(cls, config: SimulationConfig) -> "PoseToDoppler":
-        """The stage of ``scene``, ``processing`` and ``smoothing`` of a configuration, in evaluation mode, frozen.
+        """The stage described by a configuration, in evaluation mode, frozen.
 
         Raises:
-            TensorsimError: weights of the denoiser that are not there or of another network.
+            TensorsimError: denoiser weights that do not exist or belong to another network.
         """
         scene, processing, smoothing = config.scene, config.processing, config.smoothing
         prf_hz = scene.radar.prf_hz
@@ -142,7 +142,7 @@ class PoseToDoppler(nn.Module):
 
     @torch.jit.export
     def doppler_time(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
-        """Only the Doppler-time map (B, F, K) of :meth:`forward`, for data sets; with one seed the same."""
+        """Only the Doppler-time map (B, F, K) of :meth:`forward`, for data sets; identical for the same seed."""
         coefficients = self.curve(joints, valid, fps)
         points, rcs = self.scene(coefficients, valid, fps, 0, self.resampler.pulses(joints.shape[2], fps))
         doppler_time = self.simulator.doppler_time(points, rcs)
@@ -150,7 +150,7 @@ class PoseToDoppler(nn.Module):
 
     @torch.jit.export
     def curve(self, joints: Tensor, valid: Tensor, fps: float) -> Tensor:
-        """The resampler's coefficients of joints (B, P, T, 14, 3); those of frames that are not valid do not matter.
+        """The resampler's coefficients for joints (B, P, T, 14, 3); joints in frames that are not valid do not matter.
 
         Raises:
             TensorsimError: see :meth:`forward`.
@@ -163,7 +163,7 @@ class PoseToDoppler(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Scatterers (B, M, S, 3) and their RCS (B, M, S) in pulses ``start`` to ``stop`` of the motion.
 
-        Of people who are not there in any of these pulses there are none.
+        People who are absent in all of these pulses have none, unless there are small motions.
 
         Args:
             coefficients: of :meth:`curve`, for joints (B, P, T, 14, 3).
@@ -173,7 +173,7 @@ class PoseToDoppler(nn.Module):
         """
         presence = visibility_fade(valid, fps, self.resampler.prf_hz, start, stop)
         person = torch.arange(valid.shape[1], device=valid.device)
-        # Small motions have a seed for each person, by order.
+        # Small motions are seeded per person, by order, so nobody may be dropped.
         if len(self.small_motions) == 0 and person.shape[0] > 1:
             there = (presence > 0).any(-1).any(0)
             there[:1] |= ~there.any()
@@ -195,18 +195,18 @@ class PoseToDoppler(nn.Module):
     def heard(self, joints: Tensor) -> Tensor:
         """Amplitude factor (..., M) of the receiver's low-pass filter for people with joints (..., M, 14, 3) in metres.
 
-        A range of twice that of the last bin has a beat frequency of the sample rate and would appear at the radar.
+        At twice the range of the last bin the beat frequency equals the sample rate: the echo would alias to range 0.
         Receivers filter before they sample: here the amplitude falls as a raised cosine, from 1 at 1.5 times the range
-        of the last bin to 0 at 1.9 times. What is there does not appear in the maps in any case.
+        of the last bin to 0 at 1.9 times. Echoes from there do not appear in the maps in any case.
         """
         distance = torch.linalg.vector_norm(mid_hips(joints) - self.radar_m.to(joints), dim=-1)
         filtered_m = 1.5 * self.reach_m
         beyond = ((distance - filtered_m) / (self.unheard_m - filtered_m)).clamp(0.0, 1.0)
-        # Exactly 0 there: people that are not heard do not set the level of the noise.
+        # Exactly 0 beyond: people who are filtered out must not affect the noise level.
         return torch.where(beyond < 1, 0.5 + 0.5 * torch.cos(math.pi * beyond), 0.0)
 
     def denoise(self, maps: RadarMaps) -> RadarMaps:
-        """Clean the processed maps and take the ridges again, if there is a denoiser."""
+        """Clean the processed maps and extract the ridges again, if there is a denoiser."""
         if not self.denoises:
             return maps
         doppler_time = self.denoiser(maps.doppler_time)

@@ -1,4 +1,4 @@
-"""Networks of files and names as the pipeline takes them."""
+"""Networks for the pipeline, from files or names."""
 
 import os
 
@@ -19,14 +19,14 @@ from tensorsim.vision.pose2d.topdown import TopDownPose
 
 
 def top_down(pose: nn.Module, flip_test: bool = True) -> nn.Module:
-    """A heat-map network as a stage (frames, boxes, valid) -> (key points, scores); such a stage stays as it is."""
+    """A heat-map network as a stage (frames, boxes, valid) -> (keypoints, scores); such a stage is returned as is."""
     if is_pose_estimator(pose):
         return check_part(pose, "pose")
     return TopDownPose(check_part(pose, "network"), flip_test=flip_test, stand_up=True)
 
 
 def pretrained_detector(source: str | os.PathLike[str] | None = None) -> RTMDet | AcfDetector:
-    """The detector of a file or name, in evaluation mode: ACF where the header of the file says so, else RTMDet.
+    """The detector from a file or name, in evaluation mode: ACF if the file header says so, else RTMDet.
 
     Args:
         source: a path, a name of ``tensorsim models list``, or None for the shipped RTMDet.
@@ -44,12 +44,12 @@ def pretrained_detector(source: str | os.PathLike[str] | None = None) -> RTMDet 
 
 
 def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: bool = True) -> TopDownPose:
-    """Pose estimation with the network of a file or name: ``.onnx`` (heat maps, or RTMPose) in ONNX Runtime; others are
-    CPM or HRNet.
+    """Pose estimation with a network from a file or name: ``.onnx`` (heat maps, or RTMPose) runs in ONNX Runtime;
+    others are CPM or HRNet.
 
     Args:
         source: a path, a name of ``tensorsim models list``, or None for the shipped weights.
-        flip_test: average with the mirror image, as published accuracies are measured: better, at twice the cost.
+        flip_test: average with the mirror image, as for published accuracies: better, at twice the cost.
 
     Raises:
         TensorsimError: no such file or name, or weights of another network.
@@ -70,10 +70,10 @@ def pretrained_pose(source: str | os.PathLike[str] | None = None, flip_test: boo
 
 
 def pretrained_lifter(people: PoseConfig) -> NearestPoseLifter | TemporalLifter:
-    """The lifter that a configuration describes, for its camera and the heights of its people.
+    """The lifter described by a configuration, for its camera and the heights of its people.
 
     Raises:
-        TensorsimError: weights or a library that are not there.
+        TensorsimError: weights or a library that do not exist.
     """
     if people.lifter == "temporal":
         return TemporalLifter.from_pretrained(

@@ -40,30 +40,31 @@ class VideoToPose(nn.Module):
     """Video -> people with metric 3D joints.
 
     Detects in every ``detection_interval``-th frame and in the last one, tracks, estimates COCO-17 keypoints in
-    every frame, lifts them to 3D, places them in the world and smooths them. Above 45 frames per second the detector
+    every frame, lifts them to 3D, places them in the world and smooths them. From 45 frames per second the detector
     runs about as often per second as at 30, because the tracker's limits are counted in frames with detections.
 
     Args:
         detector: images -> :class:`~tensorsim.types.Detections`, e.g. :class:`tensorsim.vision.RTMDet`.
         pose: crops -> heat maps, e.g. :class:`tensorsim.vision.HRNet`, which is also applied to the mirror image;
-            or a module (frames, boxes, valid) -> (key points, scores), e.g. :class:`tensorsim.vision.TopDownPose`.
+            or a module (frames, boxes, valid) -> (keypoints, scores), e.g. :class:`tensorsim.vision.TopDownPose`.
         person_height_m: body heights in metres by person (order of appearance); the last one applies to all further
             people. Default 1.80 and 1.70.
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
-        camera: where the camera stands and its focal length.
+        camera: position and focal length of the camera.
         keypoint_threshold: score from which a keypoint counts as seen.
-        detection_interval: run the detector on every n-th frame (panel: 2), above 45 frames per second less often.
-        fewest_joints: smallest number of the 14 joints for a frame to be used.
+        detection_interval: run the detector on every n-th frame (panel: 2), less often from 45 frames per second.
+        fewest_joints: how many of the 14 joints must be seen for a frame to be used.
         brief_gap_s: a joint hidden for at most this many seconds is predicted by the smoother.
         frames_per_batch: frames that go through a network at once; bounds memory.
-        tracker, lifter, metric_pose, smoother: replacements of the default stages; ``lifter`` is the shipped
-            :class:`~tensorsim.vision.TemporalLifter`. A ``metric_pose`` has heights, distances and camera of its own.
+        tracker, lifter, metric_pose, smoother: replacements for the default stages; the default ``lifter`` is the
+            shipped :class:`~tensorsim.vision.TemporalLifter`. A ``metric_pose`` has its own heights, distances and
+            camera.
         bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
-            keypoints that are exact; None leaves it out.
+            exact keypoints; None leaves it out.
 
     Raises:
-        TensorsimError: numbers out of range; a ``metric_pose`` beside heights,
-            distances or a camera; parts that are not such stages.
+        TensorsimError: numbers out of range; a ``metric_pose`` together with heights, distances or a camera; parts that
+            are not suitable stages.
     """
 
     asks_for_edges: Final[bool]
@@ -107,11 +108,11 @@ class VideoToPose(nn.Module):
             check_instance(metric_pose, nn.Module, "metric_pose")
         if lifter is None:
             lifter = _lifter_beside(metric_pose, keypoint_threshold)
-        # A temporal lifter takes more than the others: COCO key points, boxes, the size of the picture.
+        # A temporal lifter takes more than the others: COCO keypoints, boxes, the image size.
         self.temporal = lifter if isinstance(lifter, TemporalLifter) else None
         self.lifter = None if self.temporal is not None else check_part(lifter, "lifter")
         self.metric_pose = metric_pose
-        # A replacement is called with what every metric pose takes. TorchScript compiles one of both calls.
+        # A replacement is called with the common arguments only. TorchScript compiles just one of the two calls.
         self.asks_for_edges = isinstance(metric_pose, MetricPose)
         known = metric_pose.camera if isinstance(metric_pose, MetricPose) else CameraConfig()
         self.camera_m = known.position_m
@@ -123,29 +124,29 @@ class VideoToPose(nn.Module):
         self.hidden_legs = HiddenLegs()
         self.keypoint_threshold = keypoint_threshold
         self.brief_gap_s = brief_gap_s
-        #: People hidden for longer are gone until they are seen again.
+        #: People hidden for longer are absent until they are seen again.
         self.longest_gap_s = 1.0
-        #: People that would have moved faster while hidden, in m/s, are gone after ``brief_gap_s`` already.
+        #: People who must have moved faster than this (m/s) while hidden are absent after just ``brief_gap_s``.
         self.hidden_speed_m_s = 3.0
-        #: Errors of the temporal lifter last; this share of them changes from frame to frame and looks like noise.
+        #: The temporal lifter's errors persist over time; only this share varies between frames, as noise does.
         self.noise_share = 0.03
-        #: No joint moves faster, in m/s: the foot of a hard kick reaches 10 to 12.
+        #: No joint moves faster than this, in m/s: in a hard kick the foot reaches 10 to 12.
         self.top_speed_m_s = 12.0
-        #: Mean score of the seen key points of a person; in boxes around furniture it is about 0.4.
+        #: Lowest mean score of a person's seen keypoints; in boxes around furniture it is about 0.4.
         self.least_score = 0.5
 
     @classmethod
     def from_config(
         cls, config: SimulationConfig, detector: nn.Module | None = None, pose: nn.Module | None = None
     ) -> "VideoToPose":
-        """The stage that a configuration describes, in evaluation mode, its networks frozen.
+        """The stage described by a configuration, in evaluation mode, its networks frozen.
 
         Args:
             config: its ``tracking``, ``pose`` and ``smoothing``.
-            detector, pose: networks in place of those that the configuration names.
+            detector, pose: networks to use instead of those that the configuration names.
 
         Raises:
-            TensorsimError: weights that are not there or of another network.
+            TensorsimError: weights that do not exist or belong to another network.
         """
         tracking, people, smoothing = config.tracking, config.pose, config.smoothing
         if detector is None:
@@ -186,7 +187,7 @@ class VideoToPose(nn.Module):
         """The same stage, with the same networks, for another camera, known or estimated from a film.
 
         Raises:
-            TensorsimError: a lifter or metric pose of another class, which may know no camera.
+            TensorsimError: a lifter or metric pose of another class, which may have no camera.
         """
         lifter = self.lifter if self.temporal is None else self.temporal
         if not isinstance(lifter, (NearestPoseLifter, TemporalLifter)) or not isinstance(
@@ -214,13 +215,13 @@ class VideoToPose(nn.Module):
         Args:
             video: (B, T, 3, H, W) RGB, uint8 or float in [0, 1].
             fps: frames per second.
-            lengths: (B,) frames of each clip when the shorter ones are padded; None takes all T.
-            times_s: (B, T) seconds, increasing, of frames that are not evenly spaced: the people are interpolated to
+            lengths: (B,) frames of each clip when shorter ones are padded; None takes all T.
+            times_s: (B, T) increasing times in seconds of frames that are not evenly spaced: people are interpolated to
                 ``fps`` frames per second, see :func:`~tensorsim.vision.smoothing.even_time.to_even_time`. None: even.
 
         Raises:
             TensorsimError: wrong rank or channels, fewer than 2 frames, fps not positive, times that do not increase;
-                in eager code ``torch.autocast``, and boxes of a detector in half precision.
+                in eager code also ``torch.autocast``, and detector boxes in half precision.
         """
         check_rank(video, 5, "video", "(B, T, 3, H, W)")
         check_size(video, 2, 3, "video", "(B, T, 3, H, W)")
@@ -255,7 +256,7 @@ class VideoToPose(nn.Module):
         return self.lift_each_length(tracks, keypoints, scores, counts, height, width, fps)
 
     def frames_present(self, clips: int, frames: int, lengths: Tensor | None, device: torch.device) -> Tensor:
-        """(B, T) bool: the frames that belong to a clip rather than to its padding."""
+        """(B, T) bool: the frames that belong to a clip rather than its padding."""
         index = torch.arange(frames, device=device)
         if lengths is None:
             return (index >= 0).expand(clips, frames)
@@ -266,7 +267,7 @@ class VideoToPose(nn.Module):
         return index < lengths.to(device).unsqueeze(-1)
 
     def interval_at(self, fps: float) -> int:
-        """The number n of every n-th frame in which the detector runs, at this frame rate."""
+        """The n of 'every n-th frame' in which the detector runs at this frame rate."""
         return self.detection_interval * times_as_fast(fps)
 
     def observed_frames(self, present: Tensor, fps: float) -> Tensor:
@@ -305,12 +306,12 @@ class VideoToPose(nn.Module):
             valid.unflatten(0, [clips, frames]),
         )
         tracks = self.tracker(whole, observed)
-        # The last frame of a clip is observed, so what follows the last observed frame is padding.
+        # The last frame of a clip is observed, so all after the last observed frame is padding.
         within = (observed.flip(-1).cumsum(-1).flip(-1) > 0).unsqueeze(1)
         return Tracks(tracks.boxes * within.unsqueeze(-1), tracks.valid & within, tracks.matched & within)
 
     def estimate(self, frames: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Keypoints (n, P, 17, 2) and scores (n, P, 17) of boxes (n, P, 4) in frames (n, 3, H, W)."""
+        """Keypoints (n, P, 17, 2) and scores (n, P, 17) for boxes (n, P, 4) in frames (n, 3, H, W)."""
         keypoints: list[Tensor] = []
         scores: list[Tensor] = []
         for start in range(0, frames.shape[0], self.frames_per_batch):
@@ -323,10 +324,10 @@ class VideoToPose(nn.Module):
     def is_person(self, scores: Tensor, valid: Tensor, fps: float) -> Tensor:
         """Whether the pose network sees a person in a quarter of the frames of a track, or for a whole second.
 
-        Somebody who lies after a fall has low scores, perhaps for most of a long film.
+        Somebody lying after a fall has low scores, perhaps for most of a long video.
 
         Args:
-            scores: (B, P, T, 17) of the key points.
+            scores: (B, P, T, 17) of the keypoints.
             valid: (B, P, T) bool.
             fps: frames per second.
 
@@ -352,14 +353,14 @@ class VideoToPose(nn.Module):
         width: int,
         fps: float,
     ) -> Pose:
-        """:meth:`lift` of clips padded to T frames, each as if it were alone, as filters would see the padding.
+        """:meth:`lift` for clips padded to T frames, each on its own, since filters would otherwise see the padding.
 
         Args:
             tracks, keypoints, scores, height, width, fps: see :meth:`lift`.
             counts: (B,) frames of each clip.
 
         Returns:
-            In the padding joints are those of the last frame and nobody is valid.
+            People; in the padding, joints repeat the last frame and nobody is valid.
         """
         frames = keypoints.shape[2]
         lengths: list[int] = torch.unique(counts).tolist()
@@ -382,13 +383,13 @@ class VideoToPose(nn.Module):
     def lift(
         self, tracks: Tracks, keypoints: Tensor, scores: Tensor, height: int, width: int, fps: float
     ) -> Pose:
-        """Tracks and COCO keypoints (B, P, T, 17, 2) of an image of this size -> smooth joints in the world."""
+        """Tracks and COCO keypoints (B, P, T, 17, 2) in images of this size -> smooth joints in the world."""
         keypoints, scores = self.sides(keypoints, scores, tracks.valid, fps)
         body, body_scores = coco_to_body(keypoints, scores, self.keypoint_threshold)
-        # Joints below the threshold have no weight in the match: the network guesses what it cannot see.
+        # Joints below the threshold get no weight in the match: the network guesses what it cannot see.
         reliable = (body_scores >= self.keypoint_threshold) & tracks.valid.unsqueeze(-1)
         body_scores = body_scores * reliable
-        # A foot alone at the edge of the picture does not determine a pose: the smoother predicts such frames.
+        # A lone foot at the edge of the image does not determine a pose: the smoother predicts such frames.
         usable = where_any(tracks.valid & (reliable.sum(dim=-1) >= self.fewest_joints), tracks.valid)
         usable = usable & self.is_person(scores, tracks.valid, fps).unsqueeze(-1)
         if self.temporal is not None:
@@ -411,26 +412,26 @@ class VideoToPose(nn.Module):
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         if self.bone_fit is not None:
             joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)
-        # Nobody is where no frame of a track shows a joint, nor where the last and the next that do are far apart.
+        # A hidden person stays in the scene over short gaps, unless the hips would have moved too far meanwhile.
         hidden = brief_gaps(usable, int(self.longest_gap_s * fps))
         hidden = hidden & crossed_within(mid_hips(joints), usable, self.hidden_speed_m_s / fps)
-        # Somebody followed up to the left or right edge of the picture, and back from there, was beside it.
+        # Somebody tracked to the left or right edge of the image and back was outside it in between.
         hidden = hidden & ~gaps_with(cut_off_beside(tracks.boxes, width) & tracks.valid, usable)
         there = usable | brief_gaps(usable, int(self.brief_gap_s * fps)) | hidden
-        # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift away: there
-        # the joint of the matched pose replaces it, as long as the person is in the scene.
+        # The smoother predicts a joint that is hidden briefly. Over a longer gap the prediction would drift: there the
+        # joint of the matched pose replaces it, as long as the person is in the scene.
         in_scene = usable.unsqueeze(-1).expand_as(seen)
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = self.smoother(joints, measured, fps, noise)
-        if self.temporal is not None:  # a matched pose has legs of its own
+        if self.temporal is not None:  # a matched pose brings its own legs
             joints = self.hidden_legs(joints, reliable, there, fps)
         joints = limit_speed(joints, fps, self.top_speed_m_s)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
 
 
 def joined(parts: list[Detections]) -> Detections:
-    """Detections (n, K) of several calls of a detector, one after the other, padded to the largest K of them."""
+    """Concatenate detections (n, K) of several detector calls, padded to their largest K."""
     most = max([part.valid.shape[1] for part in parts])
     boxes: list[Tensor] = []
     scores: list[Tensor] = []
@@ -446,7 +447,7 @@ def joined(parts: list[Detections]) -> Detections:
 
 
 def _lifter_beside(metric_pose: nn.Module, keypoint_threshold: float) -> TemporalLifter:
-    """The shipped lifter, in float64 and frozen, for the camera and people of a metric pose, or the default ones."""
+    """The shipped lifter, in float64 and frozen, for the camera and heights of a metric pose, or default ones."""
     camera, heights = CameraConfig(), PoseConfig().person_height_m
     if isinstance(metric_pose, MetricPose):
         camera, heights = metric_pose.camera, tuple(metric_pose.heights.tolist())
