@@ -1,15 +1,15 @@
 """tensorsim: what a radar would have seen of the people in a video.
 
 One graph of ``nn.Module`` stages on batched tensors: video -> people -> 2D joints -> 3D joints -> smooth motion ->
-FMCW echo -> range-time -> Doppler-time -> ridges -> activity label. ``VideoToDoppler`` is the whole up to the maps,
+FMCW echo -> range-time -> Doppler-time -> ridges -> activity label. ``VideoToDoppler`` covers the graph up to the maps,
 ``VideoToActivity`` up to the label; ``vision``, ``motion``, ``radar``, ``enhance`` and ``recognition`` hold the stages.
 ``data`` reads and writes films, motion and data sets; ``export`` writes TorchScript and ONNX files.
 
-Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where they are (see ``tensorsim.paper``):
+Equations of the paper, RadHARSimulator V2 (arXiv 2511.09022), and where to find them (see ``tensorsim.paper``):
 """
 
 # isort: off
-from tensorsim import process  # first: the command settles its threads before torch is loaded
+from tensorsim import process  # first: the command sets up its threads before torch is loaded
 
 # isort: on
 from importlib import import_module
@@ -88,13 +88,13 @@ __all__ = [
     "vision",
 ]
 
-#: Modules whose public names are here as well.
+#: Modules whose public names are available here as well.
 _HOMES = ("exceptions", "config", "types", "pipeline", "live")
 
 if not TYPE_CHECKING:  # type checkers take the imports above
 
     def __getattr__(name: str) -> Any:
-        """Import what is not here yet."""
+        """Import a submodule or public name on first use."""
         if find_spec(f"{__name__}.{name}") is not None:
             return import_module(f"{__name__}.{name}")
         homes = (import_module(f"{__name__}.{home}") for home in _HOMES if name in __all__)
@@ -104,7 +104,7 @@ if not TYPE_CHECKING:  # type checkers take the imports above
                 return globals()[name]
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
-    # The command prints its help, and what is wrong with its options, without the seconds that torch takes.
+    # The command prints its help and option errors without spending seconds on importing torch.
     if not process.is_command():
         for _name in __all__:
             __getattr__(_name)

@@ -14,7 +14,7 @@ ARRAY_FORMATS = ("npz", "mat", "h5")
 
 
 def array_formats(text: str) -> tuple[str, ...]:
-    """The formats of a list such as ``"mat,h5"``, NumPy's first: it is always written.
+    """The formats in a list such as ``"mat,h5"``, after NumPy's, which is always written.
 
     Raises:
         TensorsimError: an unknown format, or one whose library is not installed.
@@ -31,12 +31,12 @@ def array_formats(text: str) -> tuple[str, ...]:
 def save_arrays(path: Path, arrays: dict[str, np.ndarray | float], formats: Sequence[str] = ("npz",)) -> None:
     """Write arrays under their names, compressed, once per format.
 
-    In MATLAB a vector becomes a column and a boolean array a logical one; HDF5 has one data set per array.
+    In MATLAB files a vector becomes a column and a boolean array a logical one; HDF5 files have one data set per array.
 
     Args:
-        path: without its suffix.
-        arrays: by name.
-        formats: of :data:`ARRAY_FORMATS`.
+        path: the file, without a suffix.
+        arrays: arrays by name.
+        formats: names from :data:`ARRAY_FORMATS`.
 
     Raises:
         TensorsimError: h5py is not installed, or a file that cannot be written.
@@ -51,7 +51,7 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray | float], formats: Sequ
         with complete_file(path.with_suffix(".mat")) as scratch, scratch.open("wb") as target:
             savemat(target, arrays, do_compression=True, oned_as="column")
     if "h5" in formats:
-        content = io.BytesIO()  # HDF5 can end the process where the disk is full
+        content = io.BytesIO()  # HDF5 can crash the process when the disk is full
         with _h5py().File(content, "w") as file:
             for name, x in arrays.items():
                 compression = {} if np.ndim(x) == 0 else {"compression": "gzip"}

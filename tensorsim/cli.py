@@ -58,7 +58,7 @@ examples:
 Networks come with tensorsim; others can be named once for all runs: set TENSORSIM_DETECTOR and TENSORSIM_POSE.
 """
 
-#: Commands by name; a group of commands is its description and a table of them.
+#: Commands by name; a group is its description and a table of its commands.
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate,
     "demo": Demo,
@@ -168,7 +168,7 @@ def _stop(status: int, message: str) -> NoReturn:
 
 
 def _named(words: list[str]) -> type | None:
-    """The command that the first of these words name, if they name one."""
+    """The command that the first of these words name, if any."""
     commands: Mapping[str, Any] = COMMANDS
     for word in words:
         found = commands.get(word)
@@ -179,7 +179,7 @@ def _named(words: list[str]) -> type | None:
 
 
 def parse(arguments: list[str] | None = None) -> Any:
-    """The command that the arguments (default: those of the command line) name; exits if there is none."""
+    """The command named by the arguments (default: the command line's); exits if there is none."""
     command = _named(sys.argv[1:] if arguments is None else arguments)
     if command is not None:
         describe_options(command)

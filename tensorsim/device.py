@@ -21,7 +21,7 @@ def usable_device(name: str) -> torch.device:
         device = torch.device(name)
         # Some devices have tensors but no values (meta), or a name but no library.
         usable = float(torch.ones(2, device=device).sum()) == 2.0
-    except Exception as error:  # each backend has errors of its own
+    except Exception as error:  # each backend raises its own errors
         raise TensorsimError(f"--device: {name!r} is not usable here: {first_line(error)}") from None
     if not usable:
         raise TensorsimError(f"--device: {name!r} is not usable here: it computes a wrong sum")
@@ -29,9 +29,9 @@ def usable_device(name: str) -> torch.device:
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
-    """Whether products in bfloat16 have instructions of their own there; without them they are slower than in float32.
+    """Whether the device has native bfloat16 multiplication; without it, bfloat16 is slower than float32.
 
-    GPUs have them; processors have them by AMX or AVX-512 (x86) or by its extension (ARM).
+    GPUs have it; processors have it with AMX or AVX-512 (x86) or the bfloat16 extension (ARM).
     """
     if device.type != "cpu":
         return True
@@ -41,9 +41,9 @@ def multiplies_bfloat16(device: torch.device) -> bool:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """In the block torch computes on one thread.
+    """Run torch on one thread inside the block.
 
-    Sums over several threads are not the same to the last bit, and many small operations are slower on them.
+    Sums over several threads can differ in the last bits, and many small operations are slower on several threads.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -54,5 +54,5 @@ def one_thread() -> Iterator[None]:
 
 
 def rank_and_processes() -> tuple[int, int]:
-    """Number of this process among those that ``torchrun`` started together, and how many there are: 0 and 1 alone."""
+    """Rank of this process and number of processes started by ``torchrun``; 0 and 1 for a single process."""
     return int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))

@@ -1,4 +1,4 @@
-"""Exceptions of tensorsim and the input checks that every stage shares.
+"""Exceptions of tensorsim and the input checks that all stages share.
 
 The checks compile under TorchScript, so a scripted graph refuses the same inputs with the same words.
 """
@@ -23,7 +23,7 @@ from tensorsim.exceptions import first_line as first_line
 
 
 def check_is_tensor(x: Any, name: str) -> None:
-    """Refuse anything but an ordinary tensor with values; not called in a scripted graph, whose types are fixed."""
+    """Refuse anything but a dense tensor with values; not called in a scripted graph, whose types are fixed."""
     if not isinstance(x, Tensor):
         hint = ", as torch.from_numpy gives it" if type(x).__module__ == "numpy" else ""
         raise TensorsimError(f"{name}: got {type(x).__name__}, expected a tensor{hint}")
@@ -33,18 +33,18 @@ def check_is_tensor(x: Any, name: str) -> None:
 
 
 def check_tensor(x: Tensor, name: str, layout: str, dtypes: str = "real", finite: bool = True) -> None:
-    """Refuse anything but a tensor of this layout, kind and with finite values: the check at the top of a stage.
+    """Refuse anything but a tensor of this layout and dtype with finite values: the check at the top of a stage.
 
     Args:
-        x: what came.
-        name: what it is, for the message.
-        layout: dimensions in brackets, and what else should be said of them: ``"(..., pulses, 14 joints, 3) metres"``.
-            A dimension that begins with a number has this size; ``...`` at the start stands for any dimensions.
+        x: the input.
+        name: its name, for the message.
+        layout: dimensions in brackets and any remark on them: ``"(..., pulses, 14 joints, 3) metres"``. A dimension
+            that begins with a number must have that size; a leading ``...`` stands for any further dimensions.
         dtypes: ``"real"`` for float32 and float64, ``"complex"`` for complex64 and complex128.
         finite: whether NaN and infinity are refused.
 
     Raises:
-        TensorsimError: it says what came and what was expected.
+        TensorsimError: states what was received and what was expected.
     """
     if not torch.jit.is_scripting():
         check_is_tensor(x, name)
@@ -73,7 +73,7 @@ def check_tensor(x: Tensor, name: str, layout: str, dtypes: str = "real", finite
 
 
 def check_like_weights(x: Tensor, weight: Tensor, name: str) -> None:
-    """Refuse pictures of another dtype or on another device than the weights that they meet.
+    """Refuse images whose dtype or device differs from that of the weights applied to them.
 
     Under ``torch.autocast``, which casts both, dtypes may differ.
     """
@@ -167,7 +167,7 @@ def check_images(images: Tensor) -> None:
 
 
 def check_image_size(height: int, width: int) -> None:
-    """Refuse a picture without pixels."""
+    """Refuse an image without pixels."""
     if height < 1 or width < 1:
         raise TensorsimError(f"image: got {height} x {width} pixels, expected at least 1 x 1")
 
@@ -181,11 +181,11 @@ def check_not_empty(x: Tensor, name: str) -> None:
 
 
 def check_replaced(part: str, given: Mapping[str, bool]) -> None:
-    """Refuse arguments that a ready ``part``, passed beside them, would leave without effect.
+    """Refuse arguments that have no effect because a ready-made ``part`` was passed as well.
 
     Args:
-        part: name of the argument that takes a ready module.
-        given: by name, whether each argument that the part replaces was given.
+        part: name of the argument that takes a ready-made module.
+        given: for each argument that the part replaces, by name, whether it was given.
     """
     unused = [name for name, is_given in given.items() if is_given]
     if unused:
@@ -193,21 +193,21 @@ def check_replaced(part: str, given: Mapping[str, bool]) -> None:
 
 
 def is_exporting() -> bool:
-    """Whether torch.export is tracing: values are then unknown, and checks of values are skipped."""
+    """Whether torch.export is tracing: values are then unknown, and value checks are skipped."""
     if not torch.jit.is_scripting():
         return torch.compiler.is_exporting()
     return False
 
 
 def is_autocast(x: Tensor) -> bool:
-    """Whether ``torch.autocast`` is on for the device of a tensor; a scripted graph does not ask."""
+    """Whether ``torch.autocast`` is on for the device of a tensor; always False in a scripted graph."""
     if not torch.jit.is_scripting():
         return torch.is_autocast_enabled(x.device.type)
     return False
 
 
 def is_writing_onnx() -> bool:
-    """Whether the exporter to ONNX is tracing, which has no complex numbers and few operations."""
+    """Whether the ONNX exporter is tracing; ONNX has no complex numbers and few operations."""
     if not torch.jit.is_scripting():
         return torch.onnx.is_in_onnx_export()
     return False
@@ -217,8 +217,8 @@ def check_finite(x: Tensor, name: str) -> None:
     """Refuse NaN and infinity; skipped while torch.export traces, where values are unknown."""
     if is_exporting():
         return
-    # One pass over the values; only sums that are not finite, which large finite values have too, need a look at each.
-    # A finite sum less itself is zero; isfinite takes several passes over a complex number.
+    # One pass over the values. Only if the sum is not finite, which large finite values can also cause, is each value
+    # checked. A finite sum minus itself is zero; isfinite takes several passes over complex values.
     total = x.detach().sum()
     if not bool(total - total == 0) and not bool(torch.isfinite(x).all()):
         raise TensorsimError(f"{name}: got NaN or infinite values, expected finite numbers")
@@ -240,11 +240,11 @@ def check_scatterers(positions: Tensor, rcs: Tensor) -> None:
 
 
 def check_scene(positions: Tensor, rcs: Tensor) -> Tensor:
-    """Refuse scatterers of which no echo can be computed.
+    """Refuse scatterers whose echo cannot be computed.
 
     Args:
         positions: (..., M, S, 3) metres at M pulses.
-        rcs: m^2, (..., M, S) per pulse, (..., S) per clip, or (S,) for all clips; the rank says which.
+        rcs: m^2, (..., M, S) per pulse, (..., S) per clip, or (S,) for all clips; told apart by shape.
 
     Returns:
         RCS per pulse, (..., M, S).
@@ -281,7 +281,7 @@ def check_interval(value: object, least: float, most: float, name: str) -> None:
 
 
 def check_score(value: object, name: str) -> None:
-    """Refuse anything but a number between 0 and 1: all scores, or none, would pass another threshold."""
+    """Refuse anything but a number between 0 and 1: any other threshold would pass all scores or none."""
     if not isinstance(value, Real) or not 0 < float(value) < 1:
         raise TensorsimError(f"{name}: got {value!r}, expected a score in (0, 1)")
 

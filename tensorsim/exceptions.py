@@ -1,4 +1,4 @@
-"""Exceptions of tensorsim, without torch: the command line says what is wrong with its options before it loads that."""
+"""Exceptions of tensorsim, without torch, so that the command line can report bad options before loading torch."""
 
 import math
 import sys
@@ -19,14 +19,14 @@ class TensorsimWarning(UserWarning):
 
 def check_positive(value: float, name: str) -> None:
     """Refuse anything but a number that is finite and above zero."""
-    if not isinstance(value, float):  # whole numbers, those of NumPy; TorchScript leaves this out
+    if not isinstance(value, float):  # int and NumPy numbers; TorchScript leaves this out
         value = _number(value, name)
     if not (value > 0.0 and value < float("inf")):
         raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
 
 
 def _number(value: Any, name: str) -> Any:
-    """The value if it can be compared as one number; texts, nothing, truth values and several numbers are refused."""
+    """The value if it can be compared as a single number; refuses strings, None, booleans and several numbers."""
     try:
         if str(getattr(value, "dtype", type(value).__name__)).endswith("bool"):
             raise TypeError
@@ -37,7 +37,7 @@ def _number(value: Any, name: str) -> Any:
 
 
 def check_count(value: object, name: str, least: int = 1, most: float = math.inf) -> int:
-    """The integer ``value`` from ``least`` to ``most`` as Python's own; anything else, also a bool, is refused."""
+    """``value`` as a Python int from ``least`` to ``most``; anything else, including a bool, is refused."""
     count = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
     if count is None or not least <= count <= most:
         within = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
@@ -46,7 +46,7 @@ def check_count(value: object, name: str, least: int = 1, most: float = math.inf
 
 
 def check_seed(seed: object, name: str) -> int:
-    """The seed as Python's own integer; one that some generator would not take is refused."""
+    """The seed as a Python int; refuses one that some random generator would not accept."""
     return check_count(seed, name, 0, 2**32 - 1)
 
 
@@ -57,7 +57,7 @@ def check_choice(value: object, choices: Collection[str], name: str) -> None:
 
 
 def check_distinct(values: Iterable[object], name: str) -> None:
-    """Refuse a list in which something stands twice."""
+    """Refuse a list with duplicates."""
     seen: list[object] = []
     for value in values:
         if value in seen:
@@ -66,13 +66,13 @@ def check_distinct(values: Iterable[object], name: str) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says first, or its class if it says nothing."""
+    """The first line of an error's message, or its class name if there is no message."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(":")
 
 
 @contextmanager
 def collected_warnings() -> Iterator[list[str]]:
-    """The messages of tensorsim's own warnings in the block, each once; other warnings pass through."""
+    """Collect the messages of tensorsim's own warnings in the block, each once; other warnings pass through."""
     messages: list[str] = []
     show = warnings.showwarning
 

@@ -29,8 +29,8 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
         path: file to write; it appears only when complete.
 
     Raises:
-        TensorsimError: no module, the path is a folder, or the module contains a stage that cannot be scripted,
-            such as ``OnnxHeatmaps``; what TorchScript says of it is the cause.
+        TensorsimError: not a module, the path is a folder, or the module contains a stage that cannot be scripted,
+            such as ``OnnxHeatmaps``; TorchScript's own error is the cause.
     """
     check_instance(module, nn.Module, "to_torchscript")
     if os.path.isdir(path):
@@ -51,7 +51,7 @@ def to_torchscript(module: nn.Module, path: str | os.PathLike[str]) -> None:
         finally:
             for part in training:
                 part.training = True
-        # Not into the file: torch ends the process where the disk is full.
+        # Not straight into the file: torch crashes the process when the disk is full.
         content = io.BytesIO()
         torch.jit.save(scripted, content)
         write_bytes(path, content.getbuffer())
@@ -64,20 +64,20 @@ def to_onnx(
     dynamic: dict[int, dict[int, str]] | None = None,
     outputs: Sequence[str] = (),
 ) -> None:
-    """Export a stage in evaluation mode to an ONNX file, for ONNX Runtime and what else reads it.
+    """Export a stage in evaluation mode to an ONNX file, for ONNX Runtime and other runtimes.
 
     Args:
         module: takes tensors and returns a tensor or a tuple of them; its training mode is left as it was. ONNX has no
-            complex numbers: see :class:`ComplexPairs` for stages that have.
+            complex numbers: see :class:`ComplexPairs` for stages that use them.
         path: file to write; it appears only when complete.
-        example: inputs of the shapes that the file is for.
-        dynamic: dimensions that may have other sizes, by input and dimension, with their names: ``{0: {0: "batch"}}``.
-            Sizes 0 and 1 of an example cannot be dynamic.
+        example: inputs with the shapes that the file is for.
+        dynamic: names of the dimensions that may vary in size, by input and dimension: ``{0: {0: "batch"}}``.
+            A dimension of size 0 or 1 in the example cannot be dynamic.
         outputs: names of the outputs.
 
     Raises:
-        TensorsimError: no module, the path is a folder, an example that is one tensor, dynamic dimensions that the
-            example does not have, or an operation that ONNX does not have.
+        TensorsimError: not a module, the path is a folder, the example is a single tensor, dynamic dimensions that the
+            example does not have, or an operation that ONNX lacks.
     """
     check_instance(module, nn.Module, "to_onnx")
     if isinstance(example, Tensor):
@@ -101,7 +101,7 @@ def to_onnx(
         )
     training = [part for part in module.modules() if part.training]
     with warnings.catch_warnings():
-        # Of the exporter about its own parts.
+        # The exporter warns about its own internals.
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
         try:
@@ -129,10 +129,10 @@ def to_onnx(
 
 
 class ComplexPairs(nn.Module):
-    """A stage with complex inputs or outputs as one with pairs (..., 2) of real and imaginary part.
+    """Wraps a stage with complex input or output so that it uses pairs (..., 2) of real and imaginary part.
 
     Args:
-        stage: takes and returns a tensor, either of them complex.
+        stage: takes a complex tensor and returns a tensor, complex or real.
     """
 
     def __init__(self, stage: nn.Module) -> None:
@@ -140,6 +140,6 @@ class ComplexPairs(nn.Module):
         self.stage = stage
 
     def forward(self, pairs: Tensor) -> Tensor:
-        """Pairs (..., 2) to what the stage returns, complex numbers as pairs."""
+        """Apply the stage to pairs (..., 2); a complex result is returned as pairs too."""
         found = self.stage(torch.view_as_complex(pairs))
         return torch.view_as_real(found) if found.is_complex() else found

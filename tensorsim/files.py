@@ -1,4 +1,4 @@
-"""Reading files with one kind of error; writing files and folders completely or not at all."""
+"""Read files with one kind of error; write files and folders completely or not at all."""
 
 import hashlib
 import json
@@ -17,27 +17,27 @@ from tensorsim.exceptions import TensorsimError
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-#: The file that identifies the run that a results folder is from.
+#: The file that identifies the run that a results folder comes from.
 SUMMARY = "summary.json"
-#: What a run has in its folder until it ends: a lock, and files that are not complete.
+#: What a run keeps in its folder until it ends: a lock, and incomplete files.
 LOCK, SCRATCH = ".tensorsim.lock", ".tensorsim.scratch"
-#: Entries of the memo of a pickle; Human3.6M and the largest published networks have some thousands.
+#: Most memo entries of a pickle; Human3.6M and the largest published networks have a few thousand.
 MAX_MEMO = 1_000_000
 
 
 def check_folder(path: Path, option: str = "--out") -> None:
-    """Refuse a file where a folder is wanted, which need not be there yet."""
+    """Refuse a file where a folder is wanted; the folder need not exist yet."""
     if path.exists() and not path.is_dir():
         raise TensorsimError(f"{option}: {path} is a file, expected a folder")
 
 
 def shown_name(name: str) -> str:
-    """A name of the file system as text that a file in UTF-8 can hold: other bytes than UTF-8 become ``\\udcff``."""
+    """A file name as text that can be written in UTF-8: bytes that are not UTF-8 become escapes like ``\\udcff``."""
     return name.encode(errors="backslashreplace").decode()
 
 
 def check_name(path: Path, name: str) -> None:
-    """Refuse a path that is not UTF-8: OpenCV ends the process at it."""
+    """Refuse a path that is not UTF-8: it would crash OpenCV, and the process with it."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
@@ -49,7 +49,7 @@ class NotWrittenError(TensorsimError):
 
     Attributes:
         path: the file.
-        reason: in the words of the system.
+        reason: the operating system's message.
     """
 
     def __init__(self, path: Path, reason: str) -> None:
@@ -62,9 +62,9 @@ class NotWrittenError(TensorsimError):
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn the error of the system into one that names the file, or the folder that is no place for it.
+    """Turn a system error into one that names the file, or the folder that it cannot be written to.
 
-    Errors that name other files pass.
+    Errors that name other files pass through.
     """
     try:
         yield
@@ -72,7 +72,7 @@ def writing(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         number, name = getattr(error, "errno", None), getattr(error, "filename", None)
-        in_rust = re.search(r"\(os error (\d+)\)", str(error))  # safetensors has an exception of its own
+        in_rust = re.search(r"\(os error (\d+)\)", str(error))  # safetensors has its own exception
         number = int(in_rust[1]) if in_rust else number
         if number is None or not (name is None or path.is_relative_to(Path(name).parent)):
             raise
@@ -92,13 +92,13 @@ def reading(path: Path, kind: str) -> Iterator[None]:
 
 
 def check_pickle_memo(file: IO[bytes]) -> None:
-    """Refuse the pickle that begins here in a file if its memo is huge; the position in the file stays.
+    """Refuse the pickle that begins here in a file if its memo is huge; the file position is left as it was.
 
-    The memo is a list as long as its highest index, which one instruction of a few bytes can set to anything.
+    The memo is a list as long as its highest index, which an instruction of a few bytes can set to anything.
 
     Raises:
         TensorsimError: an index above :data:`MAX_MEMO`.
-        ValueError: no pickle.
+        ValueError: not a pickle.
     """
     start = file.tell()
     for opcode, argument, _ in pickletools.genops(file):
@@ -117,8 +117,8 @@ def complete_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A scratch path that is renamed to ``path`` when the block succeeds, and removed otherwise.
 
     The folder is created if needed. The scratch path is in the same folder and ends in ``.tmp``. The file gets the
-    permissions that new files usually have, and is on the disk before it has its name: also after a power failure it is
-    complete, or not there.
+    usual permissions of new files, and is flushed to disk before the rename: even after a power failure it is either
+    complete or absent.
 
     Raises:
         NotWrittenError: the disk is full, or the folder is not writable.
@@ -145,7 +145,7 @@ def sha256_of_arrays(*arrays: "npt.NDArray[Any]") -> str:
 
 
 def read_settings(folder: Path) -> Any:
-    """What a folder of results is made with, of its ``settings.json``.
+    """The settings that a folder of results was made with, from its ``settings.json``.
 
     Raises:
         TensorsimError: no such file, or a damaged one.
@@ -156,10 +156,10 @@ def read_settings(folder: Path) -> Any:
 
 
 def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
-    """Write what a folder of results is made with to its ``settings.json``, or compare it with what is there.
+    """Write the settings of a folder of results to its ``settings.json``, or compare them with those already there.
 
     Raises:
-        TensorsimError: the folder holds results of other settings, or a damaged file.
+        TensorsimError: the folder holds results made with other settings, or a damaged file.
     """
     path = folder / "settings.json"
     if path.is_file():
@@ -174,23 +174,23 @@ def keep_settings(folder: Path, settings: dict[str, Any]) -> None:
 def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]:
     """A scratch folder whose files are moved to ``out`` when the block succeeds; otherwise ``out`` is unchanged.
 
-    Other files in ``out`` stay, except those that its ``summary.json`` lists under ``files``: they are from an earlier
-    run. ``summary.json`` is removed first and written last, so that a folder that has one holds the files of one run,
-    even after a crash. The scratch folder is in ``out``, and so on the same file system wherever that is.
+    Other files in ``out`` stay, except those from an earlier run, which its ``summary.json`` lists under ``files``.
+    ``summary.json`` is removed first and written last, so that a folder that has one holds the files of a single run,
+    even after a crash. The scratch folder is inside ``out``, and therefore on the same file system.
 
     Args:
-        out: a folder, made if it is not there, and removed again if the block fails.
-        source: what the files are made from.
+        out: a folder, created if needed; one created here is removed again if it stays empty.
+        source: the file or folder that the results are made from.
 
     Raises:
-        TensorsimError: another process is writing into ``out``, there is a folder where a file should be, or
+        TensorsimError: another process is writing into ``out``, there is a folder where a file should go, or
             ``source`` would be replaced or removed.
         NotWrittenError: the disk is full, or the folder is not writable.
     """
     with locked(out):
         _keep(source, out, _listed(out))
         scratch = out / SCRATCH
-        shutil.rmtree(scratch, ignore_errors=True)  # of a run that was killed; the lock is ours
+        shutil.rmtree(scratch, ignore_errors=True)  # left by a run that was killed; the lock is ours
         try:
             new, old = scratch / "new", scratch / "old"
             with writing(out):
@@ -240,7 +240,7 @@ def _exchange(out: Path, new: Path, old: Path) -> None:
 
 
 def _listed(out: Path) -> list[str]:
-    """Names of the files that the summary of an earlier run lists; none without such a summary."""
+    """Names of the files listed in the summary of an earlier run; empty if there is no summary."""
     try:
         names = json.loads((out / SUMMARY).read_text(encoding="utf-8"))["files"]
         return [name for name in names if Path(name).name == name]
@@ -250,9 +250,9 @@ def _listed(out: Path) -> list[str]:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Lock a folder for this process; the lock is released when the process ends, also by a crash.
+    """Lock a folder for this process; the lock is released when the process ends, even by a crash.
 
-    The folder is made if it is not there, and removed again if nothing came into it.
+    The folder is created if needed, and removed again if it is still empty.
     """
     made = not out.exists()
     with writing(out):
@@ -268,7 +268,7 @@ def locked(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _only_one(out: Path) -> Iterator[None]:
-    """Hold the lock of a folder that is there."""
+    """Hold the lock of an existing folder."""
     try:
         import fcntl
     except ImportError:  # not on Windows
@@ -295,18 +295,18 @@ def _only_one(out: Path) -> Iterator[None]:
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes | memoryview) -> None:
-    """Write bytes; the file appears complete."""
+    """Write bytes; the file appears only when complete."""
     with complete_file(path) as scratch:
         scratch.write_bytes(content)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text in UTF-8; the file appears complete."""
+    """Write text in UTF-8; the file appears only when complete."""
     write_bytes(path, text.encode())
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
-    """Write strict JSON: NaN and infinity, which JSON cannot express, become ``null``. The file appears complete."""
+    """Write strict JSON, with ``null`` for NaN and infinity; the file appears only when complete."""
     write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 

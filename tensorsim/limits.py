@@ -1,7 +1,6 @@
-"""Plausible ranges of physical quantities and counts: one table, which messages quote.
+"""Plausible ranges of physical quantities and counts: one table, quoted in error messages.
 
-The ranges are wide: they keep out slips of the unit and numbers with which nothing can be computed, not unusual
-radars or people.
+The ranges are wide: they catch wrong units and numbers that cannot be computed with, not unusual radars or people.
 """
 
 from numbers import Real
@@ -53,15 +52,15 @@ RANGES: dict[str, Range] = {
 
 
 def check_range(value: float, quantity: str, option: str) -> None:
-    """Refuse a value outside of the range of its quantity.
+    """Refuse a value outside the range of its quantity.
 
     Args:
         value: the number.
         quantity: a key of :data:`RANGES`.
-        option: what the value was given as, such as ``"--fps"`` or ``"RadarConfig.prf_hz"``.
+        option: how the value was given, such as ``"--fps"`` or ``"RadarConfig.prf_hz"``.
 
     Raises:
-        TensorsimError: no number, NaN, or a value that the range does not contain.
+        TensorsimError: not a number, NaN, or a value outside the range.
     """
     low, high, unit = RANGES[quantity]
     number = isinstance(value, Real)

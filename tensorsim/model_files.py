@@ -1,4 +1,4 @@
-"""Where the shipped weights and pools lie."""
+"""Where the shipped weights and pose pools are."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ def model_path(file: str) -> Path:
     """Path of a shipped file by its name, such as ``"pose_library_small.safetensors"``.
 
     Raises:
-        TensorsimError: no such file; the message lists what there is.
+        TensorsimError: no such file; the message lists those that exist.
     """
     folder = models_dir()
     path = folder / file

@@ -1,4 +1,4 @@
-"""Operations that ONNX has and torch has not, for :func:`tensorsim.export.to_onnx`."""
+"""Operations that ONNX has and torch lacks, for :func:`tensorsim.export.to_onnx`."""
 
 from collections.abc import Callable
 from functools import cache
@@ -12,7 +12,7 @@ Suppression = Callable[[Tensor, Tensor, Tensor, Tensor, float, int], tuple[Tenso
 
 @cache
 def suppression() -> Suppression:
-    """:func:`~tensorsim.geometry.boxes.non_maximum_suppression` as one operation of a traced graph."""
+    """:func:`~tensorsim.geometry.boxes.non_maximum_suppression` as a single operation of a traced graph."""
     from tensorsim.geometry.boxes import non_maximum_suppression
 
     operation = torch.library.custom_op(
@@ -37,10 +37,10 @@ def suppression() -> Suppression:
 def onnx_suppression(
     boxes: Any, scores: Any, labels: Any, valid: Any, iou_threshold: float, max_detections: int
 ) -> tuple[Any, Any]:
-    """The same by ONNX's NonMaxSuppression, which lists boxes of each class in no order over the classes."""
+    """The same with ONNX's NonMaxSuppression, which works per class and does not order boxes across classes."""
     from onnxscript import opset18
 
-    op: Any = opset18  # whose annotations know no constants
+    op: Any = opset18  # its annotations do not allow constants
     nothing = op.Constant(value_float=-1.0)
     scores = op.Where(valid, scores, nothing)
     classes = op.Range(0, op.Add(op.ReduceMax(labels, keepdims=0), 1), 1)
@@ -56,6 +56,6 @@ def onnx_suppression(
 
 
 def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
-    """ONNX for the operations of this module."""
+    """ONNX translations of this module's operations."""
     suppression()
     return {torch.ops.tensorsim.non_maximum_suppression.default: onnx_suppression}

@@ -1,4 +1,4 @@
-"""Tensor helpers that several rooms share; they script."""
+"""Tensor helpers shared by several subpackages; all can be scripted."""
 
 import torch
 from torch import Tensor
@@ -15,12 +15,12 @@ def unflatten_batch(x: Tensor, lead: list[int]) -> Tensor:
 
 
 def times_as_fast(fps: float) -> int:
-    """How many times as fast as 30 frames per second this rate is, rounded: 1 up to 45, 2 up to 75."""
+    """The frame rate as a multiple of 30 frames per second, rounded, at least 1: 1 below 45, 2 below 75."""
     return max(int(fps / 30.0 + 0.5), 1)
 
 
 def of_person(values: Tensor, person: Tensor) -> Tensor:
-    """Values (N,) by order of person, for people numbered (...): the last one applies to all further people."""
+    """Pick from values (N,) for people numbered (...); the last value applies to all further people."""
     return values[person.clamp(max=values.shape[0] - 1)]
 
 

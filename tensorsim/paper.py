@@ -1,8 +1,8 @@
 """Where each equation of the paper is: topic, formula, function and test.
 
-The paper is "RadHARSimulator V2: Video to Doppler Generator" (arXiv 2511.09022). Rows are in its order, under the names
-of its two modules and of its recognition network, and are named by topic instead of by equation number. Where the
-project's default differs from the paper, the formula is the paper's and the function has it as an option.
+The paper is "RadHARSimulator V2: Video to Doppler Generator" (arXiv 2511.09022). Rows follow its order, under the names
+of its two modules and of its recognition network, and are named by topic instead of equation number. Where the
+default here differs from the paper, the formula is the paper's, and the function offers it as an option.
 """
 
 from typing import NamedTuple
@@ -12,10 +12,10 @@ class Equation(NamedTuple):
     """A row of the table.
 
     Attributes:
-        topic: what the equation is about, in the terms of the paper.
+        topic: what the equation is about, in the paper's terms.
         formula: the equation in plain text.
         function: dotted path of the function or class that computes it.
-        test: file and function of a test of it.
+        test: file and function of a test that covers it.
     """
 
     topic: str

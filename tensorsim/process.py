@@ -1,7 +1,7 @@
-"""The process of the ``tensorsim`` command: threads that do not spin for long, and an end that leaves nothing behind.
+"""The process of the ``tensorsim`` command: threads that do not spin for long, and an exit that leaves nothing behind.
 
-``tensorsim/__init__.py`` imports this first, because torch's OpenMP runtime reads its settings when it is loaded. In a
-process that is not the command, nothing is changed.
+``tensorsim/__init__.py`` imports this first, because torch's OpenMP runtime reads its settings when it is loaded.
+Importing it changes nothing in processes other than the command.
 """
 
 import gc
@@ -14,9 +14,9 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-#: Rounds that a thread waits busily for its next work before it sleeps. OpenMP's default keeps a core busy for
-#: milliseconds, which makes everything many times slower where somebody else wants that core, such as the thread that
-#: writes a film beside the radar; 1000 is the number that it takes itself once there are more threads than cores.
+#: Iterations that a thread spins while waiting for work before it sleeps. OpenMP's default keeps a core busy for
+#: milliseconds, which makes everything many times slower when another thread needs that core, such as the one that
+#: writes a film during the radar simulation; OpenMP itself uses 1000 when there are more threads than cores.
 SPIN_ROUNDS = 100
 
 
@@ -26,7 +26,7 @@ def is_command() -> bool:
 
 
 def prepare() -> None:
-    """Settle what has to be settled before torch is imported; variables that the user has set stay."""
+    """Do the setup needed before torch is imported; environment variables set by the user are kept."""
     signal.signal(signal.SIGINT, _quit)
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
         os.environ["GOMP_SPINCOUNT"] = str(SPIN_ROUNDS)
@@ -41,7 +41,7 @@ def prepare() -> None:
 
 
 def cpu_quota(limit: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
-    """Processors that this process may use: those it is bound to, and what its container is allowed."""
+    """Processors that this process may use, given its CPU affinity and the limit of its container."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = limit.read_text().split()
@@ -52,13 +52,13 @@ def cpu_quota(limit: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
 
 @contextmanager
 def ending_cleanly() -> Iterator[None]:
-    """In the block, SIGTERM and SIGHUP end the process as exceptions do: temporary files are removed.
+    """In the block, SIGTERM and SIGHUP end the process as an exception would, so temporary files are removed.
 
-    Standard output that is closed is replaced by one that nobody reads.
+    Closed standard streams are replaced by the null device.
     """
     for stream in ("stdin", "stdout", "stderr"):
         if getattr(sys, stream) is None:
-            setattr(sys, stream, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115  # open till the end
+            setattr(sys, stream, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115  # open until exit
     handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _end}
     if hasattr(signal, "SIGHUP"):
         handlers[signal.SIGHUP] = _end
@@ -73,7 +73,7 @@ def ending_cleanly() -> Iterator[None]:
 def load_torch() -> None:
     """Import torch, which takes a second; an interrupt ends the process at once.
 
-    What is imported stays to the end: left to the garbage collector, it costs half a second more, most of it at exit.
+    Imported objects are kept out of garbage collection, which would cost another half second, most of it at exit.
     """
     before = signal.signal(signal.SIGINT, _quit)
     gc.disable()
@@ -86,9 +86,9 @@ def load_torch() -> None:
 
 
 def end_with_parent() -> None:
-    """Let this process, a worker of ``multiprocessing``, end when the one that started it does, also if that is killed.
+    """Make this ``multiprocessing`` worker end when its parent process does, even if the parent is killed.
 
-    Workers of a pool would wait for ever for its next job.
+    Otherwise the workers of a pool would wait forever for their next job.
     """
     import multiprocessing
     import threading
@@ -104,13 +104,13 @@ def end_with_parent() -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:
-    signal.signal(number, signal.SIG_IGN)  # once: what follows is the cleaning up
+    signal.signal(number, signal.SIG_IGN)  # only once: cleanup follows
     sys.exit(128 + number)
 
 
 def _quit(number: int, frame: FrameType | None) -> NoReturn:
     print("tensorsim: interrupted", file=sys.stderr, flush=True)
-    os._exit(130)  # nothing has been written yet, and libraries turn exceptions in their imports into others
+    os._exit(130)  # nothing has been written yet, and libraries turn exceptions during their import into others
 
 
 if is_command():

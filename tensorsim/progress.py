@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on the terminal, and whoever watches, such as the app."""
+"""Progress of long work: a bar on the terminal, and watchers such as the app."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,20 +10,20 @@ from tqdm import tqdm
 
 
 class Watcher(Protocol):
-    """Is told what is done; an exception that it raises ends the work."""
+    """Receives progress reports; an exception that it raises ends the work."""
 
     def advanced(self, stage: str, done: int, total: int | None) -> None:
         """``done`` of ``total`` (None: not known) units of a stage are done."""
 
     def pictured(self, name: str, draw: Callable[[], np.ndarray]) -> None:
-        """There is something to see; ``draw`` gives it as (H, W, 3) uint8 RGB."""
+        """A picture is available; ``draw`` returns it as (H, W, 3) uint8 RGB."""
 
 
 _watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
 
 
 class ProgressBar(tqdm):  # type: ignore[misc]  # tqdm has no types
-    """A bar that tells a watcher of its steps, even where the bar itself is hidden."""
+    """A bar that reports its steps to a watcher, even when the bar itself is hidden."""
 
     done = 0
 
@@ -37,9 +37,9 @@ class ProgressBar(tqdm):  # type: ignore[misc]  # tqdm has no types
 
 
 def progress_bar(name: str, total: int | None, quiet: bool) -> Any:
-    """A progress bar of frames."""
+    """A progress bar that counts frames."""
     bar = ProgressBar(desc=f"{name:<12}", total=total, disable=quiet, unit="frame", leave=True)
-    bar.stage, bar.total = name, total  # a bar that is not shown does not keep them
+    bar.stage, bar.total = name, total  # tqdm does not keep them in a hidden bar
     return bar
 
 
@@ -52,7 +52,7 @@ def picture(name: str, draw: Callable[[], np.ndarray]) -> None:
 
 @contextmanager
 def watched(watcher: Watcher) -> Iterator[None]:
-    """Tell a watcher of the work in the block."""
+    """Report the work in the block to a watcher."""
     token = _watcher.set(watcher)
     try:
         yield

@@ -1,7 +1,7 @@
-"""What each replaceable stage of a pipeline is called with and returns.
+"""Signatures of the replaceable stages of a pipeline.
 
-A stage of your own is an ``nn.Module`` whose ``forward`` has the signature of the ``__call__`` below; it need not
-inherit from anything here. :func:`check_part` refuses others when a pipeline is built. Letters of shapes are those of
+A custom stage is an ``nn.Module`` whose ``forward`` has the signature of the matching ``__call__`` below; it need not
+inherit from anything here. :func:`check_part` refuses others when a pipeline is built. For the letters in shapes see
 :mod:`tensorsim.types`.
 """
 
@@ -20,7 +20,7 @@ class Detector(Protocol):
     """Finds people in images, e.g. :class:`tensorsim.vision.RTMDet`."""
 
     def __call__(self, images: Tensor) -> Detections:
-        """Images (B, 3, H, W), RGB, uint8 or float in [0, 1], to padded boxes.
+        """Find people in images (B, 3, H, W), RGB, uint8 or float in [0, 1].
 
         Returns:
             boxes (B, K, 4) ``xyxy`` in pixels of the images, scores (B, K), labels (B, K) with 0 for people, and
@@ -33,7 +33,7 @@ class Tracker(Protocol):
     """Follows detections through clips, e.g. :class:`tensorsim.vision.GNNTracker`."""
 
     def __call__(self, detections: Detections, observed: Tensor) -> Tracks:
-        """Detections of clips (B, T, K, ...) to tracks (B, P, T, ...).
+        """Turn detections of clips (B, T, K, ...) into tracks (B, P, T, ...).
 
         Args:
             detections: of every frame; not valid where the detector was not run.
@@ -46,7 +46,7 @@ class PoseEstimator(Protocol):
     """Finds the keypoints of people in boxes, e.g. :class:`tensorsim.vision.TopDownPose`."""
 
     def __call__(self, images: Tensor, boxes: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Keypoints of the valid boxes.
+        """Estimate the keypoints in the valid boxes.
 
         Args:
             images: (B, 3, H, W) RGB, uint8 or float in [0, 1].
@@ -60,12 +60,12 @@ class PoseEstimator(Protocol):
 
 
 class HeatmapNetwork(Protocol):
-    """Crops to heat maps, e.g. :class:`tensorsim.vision.HRNet`; ``TopDownPose`` makes a pose estimator of it."""
+    """Turns crops into heat maps, e.g. :class:`tensorsim.vision.HRNet`; ``TopDownPose`` makes it a pose estimator."""
 
     def __call__(self, crops: Tensor) -> Tensor:
-        """Crops (N, 3, H, W), RGB in [0, 1], to heat maps (N, 17, H / 4, W / 4) of the COCO-17 keypoints.
+        """Turn crops (N, 3, H, W), RGB in [0, 1], into heat maps (N, 17, H / 4, W / 4) of the COCO-17 keypoints.
 
-        A module with other sizes says so in its attributes ``input_size`` (H, W) and ``stride``.
+        A module with other sizes states them in its attributes ``input_size`` (H, W) and ``stride``.
         """
         ...
 
@@ -74,7 +74,7 @@ class Lifter(Protocol):
     """Finds 3D poses for 2D joints, e.g. :class:`tensorsim.vision.NearestPoseLifter`."""
 
     def __call__(self, keypoints: Tensor, weights: Tensor) -> Lifted:
-        """The 14 body joints (..., T, 14, 2) in pixels and their weights (..., T, 14), 0 for hidden ones, to poses."""
+        """Lift 14 body joints (..., T, 14, 2) in pixels with weights (..., T, 14), 0 for hidden ones, to poses."""
         ...
 
 
@@ -82,10 +82,10 @@ class Smoother(Protocol):
     """Smooths joints along time, e.g. :class:`tensorsim.vision.KalmanSmoother`."""
 
     def __call__(self, joints: Tensor, valid: Tensor, fps: float, noise_std_m: Tensor) -> Tensor:
-        """Joints (..., T, J, 3) in metres at ``fps``, smoothed, of the same shape.
+        """Smooth joints (..., T, J, 3) in metres; the result has the same shape.
 
         Args:
-            joints: anything where not valid.
+            joints: arbitrary values where not valid.
             valid: (..., T, J) bool; the other joints are filled in.
             fps: frames per second.
             noise_std_m: (..., T, J, 3) or (..., T, J, 1) standard deviation of the joints in metres, from scores, pixel
@@ -98,14 +98,14 @@ class Scatterers(Protocol):
     """Places point scatterers on people, e.g. :class:`tensorsim.motion.JointScatterers`."""
 
     def __call__(self, positions: Tensor, fade: Tensor) -> tuple[Tensor, Tensor]:
-        """Joints at the pulse rate to the scatterers of one scene.
+        """Turn joints at the pulse rate into the scatterers of one scene.
 
         Args:
             positions: (..., P, M, 14, 3) metres.
-            fade: (..., P, M) amplitude of each person in [0, 1], 0 outside of the scene.
+            fade: (..., P, M) amplitude of each person in [0, 1], 0 outside the scene.
 
         Returns:
-            Positions (..., M, S, 3) in metres and radar cross sections (..., M, S) in m^2, those of all people.
+            Positions (..., M, S, 3) in metres and radar cross sections (..., M, S) in m^2, of all people together.
         """
         ...
 
@@ -114,7 +114,7 @@ class Denoiser(Protocol):
     """Cleans maps, e.g. :class:`tensorsim.enhance.MapDenoiser`."""
 
     def __call__(self, maps: Tensor) -> Tensor:
-        """Linear magnitude (..., H, W), rows range or Doppler, to the same shape, not negative."""
+        """Clean linear magnitudes (..., H, W), rows range or Doppler, to the same shape, not negative."""
         ...
 
 
@@ -122,11 +122,11 @@ class Recognizer(Protocol):
     """Names the activity that maps show, e.g. :class:`tensorsim.recognition.ActivityRecognizer`."""
 
     def __call__(self, maps: RadarMaps) -> Tensor:
-        """Maps of B scenes to logits (B, classes)."""
+        """Turn maps of B scenes into logits (B, classes)."""
         ...
 
 
-#: The protocol of each argument of the pipelines.
+#: The protocol that each pipeline argument must follow.
 SLOTS: dict[str, type] = {
     "detector": Detector,
     "tracker": Tracker,
@@ -141,22 +141,22 @@ SLOTS: dict[str, type] = {
 
 
 def check_part(part: Any, slot: str) -> nn.Module:
-    """Return a stage that can be called as its slot requires.
+    """Return the stage if it can be called as its slot requires.
 
-    Looks at the arguments of ``forward`` and at its return annotation if it has one. ``nn.Identity`` passes: it
-    stands for a stage that is not used.
+    Checks the arguments of ``forward`` and its return annotation, if there is one. ``nn.Identity`` passes: it
+    stands for an unused stage.
 
     Args:
         part: the stage.
         slot: a key of :data:`SLOTS`, for the message too.
 
     Raises:
-        TensorsimError: not a module, a class in place of an instance, other arguments, or another result.
+        TensorsimError: not a module, a class instead of an instance, or the wrong arguments or result.
     """
     protocol = SLOTS[slot]
     call = inspect.signature(protocol.__call__)
     wanted = list(call.parameters)[1:]
-    # A function's repr of its annotations would spell out modules.
+    # The repr of a signature would spell out module names.
     result = typing.get_type_hints(protocol.__call__)["return"]
     expected = f"expected a module called as {slot}({', '.join(wanted)}) -> {_name(result)}"
     if inspect.isclass(part):
@@ -176,10 +176,10 @@ def check_part(part: Any, slot: str) -> nn.Module:
 
 
 def check_instance(part: Any, kind: type, name: str) -> None:
-    """Refuse a ready part of another class.
+    """Refuse a ready-made part of the wrong class.
 
     Raises:
-        TensorsimError: something else, or the class in place of an instance.
+        TensorsimError: another class, or the class itself instead of an instance.
     """
     if not isinstance(part, kind):
         got = f"the class {part.__name__}" if inspect.isclass(part) else f"a {type(part).__name__}"
@@ -192,7 +192,7 @@ def is_pose_estimator(part: nn.Module) -> bool:
 
 
 def check_detections(found: Any) -> None:
-    """Refuse what a detector returned if it is not :class:`~tensorsim.types.Detections` (or alike).
+    """Refuse a detector's result that is not :class:`~tensorsim.types.Detections` or the like.
 
     Raises:
         TensorsimError: a list of dictionaries, as torchvision's detectors return, or anything else; boxes in half
@@ -212,7 +212,7 @@ def check_detections(found: Any) -> None:
 
 
 def _takes(part: nn.Module, arguments: int) -> bool:
-    """Whether ``forward`` can be called with this many positional arguments; True where it does not say."""
+    """Whether ``forward`` can be called with this many positional arguments; True if that is unknown."""
     try:
         inspect.signature(part.forward).bind(*[None] * arguments)
     except TypeError:
@@ -223,7 +223,7 @@ def _takes(part: nn.Module, arguments: int) -> bool:
 
 
 def _return_type(part: nn.Module) -> Any:
-    """The return annotation of ``forward``, None where there is none that can be read."""
+    """The return annotation of ``forward``, or None if there is none or it cannot be resolved."""
     try:
         found = typing.get_type_hints(type(part).forward).get("return")
     except (NameError, TypeError, AttributeError):
@@ -232,7 +232,7 @@ def _return_type(part: nn.Module) -> Any:
 
 
 def _serves_as(found: Any, wanted: Any) -> bool:
-    """Whether a value annotated as ``found`` can be used where ``wanted`` is expected, as far as is known."""
+    """Whether a value annotated as ``found`` can be used where ``wanted`` is expected, as far as can be told."""
     found_class, wanted_class = typing.get_origin(found) or found, typing.get_origin(wanted) or wanted
     if not inspect.isclass(found_class) or found_class is object:
         return True
@@ -243,7 +243,7 @@ def _serves_as(found: Any, wanted: Any) -> bool:
 
 
 def _name(hint: Any) -> str:
-    """An annotation without the names of modules."""
+    """An annotation without module names."""
     arguments = ", ".join(_name(a) for a in typing.get_args(hint))
     plain = getattr(typing.get_origin(hint) or hint, "__name__", str(hint))
     return f"{plain}[{arguments}]" if arguments else plain

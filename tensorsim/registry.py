@@ -1,7 +1,7 @@
-"""Weights by name: those shipped with tensorsim, and those that others publish.
+"""Weights by name: those shipped with tensorsim, and those published by others.
 
 Shipped files are inside the package; others are downloaded once into the user's cache and checked against their
-SHA-256. A path can be given in place of a name.
+SHA-256. A path can be given instead of a name.
 """
 
 import os
@@ -20,12 +20,12 @@ class ModelEntry:
 
     Attributes:
         name: what ``from_pretrained`` takes.
-        network: class that loads it; "" of poses.
+        network: class that loads it; "" for poses.
         file: its file name.
-        licence: terms of the weights.
+        licence: licence of the weights.
         source: authors and training data.
-        metrics: accuracy as its authors state it, or a reference to the card.
-        preprocessing: of the input, which the class does.
+        metrics: accuracy as stated by its authors, or a reference to the model card.
+        preprocessing: of the input, done by the class.
         sha256: full digest, or its first eight digits where only those are published.
         url: address of the file; None for a shipped one.
         default: whether ``from_pretrained()`` without a name loads it.
@@ -49,14 +49,14 @@ class ModelEntry:
 
     @property
     def assurance(self) -> str:
-        """How well a download is verified, in words."""
+        """How thoroughly a download is verified, in words."""
         if len(self.sha256) == 64:
             return "whole SHA-256"
         return f"{len(self.sha256)} digits of SHA-256, which is weak"
 
     @property
     def path(self) -> Path:
-        """Where the file is, or will be after its download."""
+        """Where the file is, or will be once downloaded."""
         return (models_dir() if self.shipped else cache_dir()) / self.file
 
 
@@ -138,8 +138,8 @@ def _videopose(frames: int, kind: str, sha256: str, error_mm: str, joints: str) 
     )
 
 
-#: Published by others. Eight digits of SHA-256 are part of their file names; a whole digest is that of a copy
-#: that gives the published accuracy.
+#: Published by others. Eight digits of SHA-256 are part of their file names; a full digest comes from a copy
+#: that reproduces the published accuracy.
 PUBLISHED: tuple[ModelEntry, ...] = (
     _coco_rtmdet("tiny", "20220902_112414", "78e30dcc", "41.1"),
     _coco_rtmdet("s", "20220905_161602", "387a891e", "44.6"),
@@ -191,7 +191,7 @@ def shipped() -> tuple[ModelEntry, ...]:
 
 
 def shipped_weights(*networks: str) -> dict[str, str]:
-    """Digests of the shipped files of these networks by name: a result that they made is not that of others."""
+    """Digests of the shipped files of these networks by name, to tell their results from those of other weights."""
     return {entry.name: entry.sha256 for entry in shipped() if entry.network in networks}
 
 
@@ -208,7 +208,7 @@ def cache_dir() -> Path:
 
 
 def find(name: str, *networks: str) -> ModelEntry:
-    """The entry of this name, among those of ``networks`` if any are given.
+    """The entry with this name, limited to ``networks`` if any are given.
 
     Raises:
         TensorsimError: no such name; the message lists the known names and the most similar one.
@@ -224,16 +224,16 @@ def find(name: str, *networks: str) -> ModelEntry:
 
 
 def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
-    """Path of the weights that ``from_pretrained`` was called with, downloaded if necessary.
+    """Path of the weights passed to ``from_pretrained``, downloaded if necessary.
 
     Args:
         source: a path (with a suffix or a folder, or an existing file), the name of an entry, or None for the shipped
             weights.
-        networks: names of the classes that can load them; shipped weights are those of the first class that has any.
+        networks: names of the classes that can load them; None takes the weights of the first class with shipped ones.
 
     Raises:
-        TensorsimError: no such name, no such shipped weights, or a failed download; a path is returned unchanged,
-            even if there is no such file.
+        TensorsimError: no such name, no shipped weights, or a failed download. A path is returned unchanged, even if
+            the file does not exist.
     """
     if source is None:
         defaults = {entry.network: entry for entry in shipped() if entry.default}
@@ -248,14 +248,14 @@ def locate(source: str | os.PathLike[str] | None, *networks: str) -> Path:
 
 
 def name_of(path: Path) -> str:
-    """The name of weights that are shipped, which is the same on every machine, or the path of others."""
+    """The name of shipped weights, which is the same on every machine; for others, their path."""
     return next((entry.name for entry in shipped() if entry.path == path), str(path))
 
 
 def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
-    """The file of an entry, downloaded if it is not there. An interrupted download is resumed.
+    """The file of an entry, downloaded if missing. An interrupted download is resumed.
 
-    The whole SHA-256 of the download is kept beside it, so that later changes are noticed also where only eight digits
+    The full SHA-256 of the download is stored beside it, so that later changes are noticed even if only eight digits
     are published.
 
     Args:
@@ -263,7 +263,7 @@ def fetch(entry: ModelEntry, quiet: bool = False) -> Path:
         quiet: no progress bar.
 
     Raises:
-        TensorsimError: no connection, or a file whose SHA-256 is another (it is removed).
+        TensorsimError: no connection, or a file with the wrong SHA-256 (it is removed).
     """
     path = entry.path
     if entry.url is None:
@@ -295,7 +295,7 @@ def verify(entry: ModelEntry) -> str:
     """Check the file of an entry against its digest, and return the digest.
 
     Raises:
-        TensorsimError: it is not there, or has another digest; a fetched file is then removed.
+        TensorsimError: the file is missing, or its digest is wrong; a downloaded file is then removed.
     """
     if not entry.path.is_file():
         raise TensorsimError(

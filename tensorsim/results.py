@@ -1,4 +1,4 @@
-"""What a simulation writes into its folder: maps, poses, pictures and the overlay film."""
+"""What a simulation writes into its folder: maps, poses, pictures and the overlay video."""
 
 import math
 import warnings
@@ -44,9 +44,9 @@ class Axes:
         doppler_hz: (F,), positive = approaching if ``signed``.
         time_s: (K,) centres of the Doppler-time columns.
         range_time_rate_hz: columns of the range-time maps per second.
-        speed_per_hz: m/s per Hz of Doppler.
+        speed_per_hz: speed in m/s per Hz of Doppler.
         block: pulses per column of the range-time maps.
-        signed: whether the Doppler-time map tells approaching from receding; the paper's does not.
+        signed: whether the Doppler-time map distinguishes approaching from receding; the paper's does not.
     """
 
     range_m: np.ndarray
@@ -59,20 +59,20 @@ class Axes:
 
     @property
     def doppler_label(self) -> str:
-        """What is written beside the Doppler axis."""
+        """Label of the Doppler axis."""
         return "Doppler in Hz, " + ("positive = approaching" if self.signed else "without its sign")
 
     def range_time_s(self, columns: int) -> np.ndarray:
-        """Times (columns,) of the middles of the range-time columns."""
+        """Times (columns,) of the centres of the range-time columns."""
         return (np.arange(columns) + (self.block - 1) / (2 * self.block)) / self.range_time_rate_hz
 
 
 def axes_of(stage: PoseToDoppler, maps: RadarMaps) -> Axes:
-    """Axes of the maps that this stage made."""
+    """Axes of maps made by this stage."""
     simulator = stage.simulator
     doppler = simulator.doppler
     pulses = doppler.length + (maps.doppler_time.shape[-1] - 1) * doppler.hop
-    # What the two-pulse canceller gives lies between the two pulses that it subtracts.
+    # The output of the two-pulse canceller lies midway between the two pulses that it subtracts.
     delay_s = simulator.mti.delay_pulses / simulator.radar.prf_hz
     return Axes(
         range_m=simulator.range_profile.range_m.cpu().numpy(),
@@ -121,7 +121,7 @@ def draw_maps(
     """Write a picture per map.
 
     Args:
-        folder: where to.
+        folder: where to write them.
         maps: on the CPU, without batch dimensions.
         axes: of the maps.
         truth: maps of the true motion, of the same shapes, drawn beside the others.
@@ -132,7 +132,7 @@ def draw_maps(
         ("range_time_mti", "range-time map after moving target indication"),
     ):
         magnitude = getattr(maps, name).numpy()
-        # What the two-pulse canceller gives lies half a pulse later; nothing is left of it at a display rate.
+        # The output of the two-pulse canceller lies half a pulse later; with a display rate there is no such offset.
         offset = (maps.range_time.shape[1] - magnitude.shape[1]) / 2
         time_s = axes.range_time_s(magnitude.shape[1]) + offset / axes.range_time_rate_hz
         reference = None if truth is None else getattr(truth, name).numpy()
@@ -154,7 +154,7 @@ def draw_maps(
 def doppler_figure(
     maps: RadarMaps, axes: Axes, pictures: Pictures, truth: RadarMaps | None = None
 ) -> "Figure":
-    """The picture of a Doppler-time map with its ridges; that of the true motion beside it, if given."""
+    """The picture of a Doppler-time map with its ridges; beside it that of the true motion, if given."""
     both = [maps] if truth is None else [maps, truth]
     range_db = pictures.style.dynamic_range_db
     return plot.map_figure(
@@ -196,7 +196,7 @@ def save_maps(path: Path, maps: RadarMaps, axes: Axes, formats: Sequence[str] = 
 
 
 def strong_ridges(maps: RadarMaps, axes: Axes) -> np.ndarray:
-    """Ridges (3, K) in Hz, NaN where one is no more than noise at the floor of the colours."""
+    """Ridges (3, K) in Hz, NaN where they are no stronger than the floor of the colour scale."""
     floor = float(maps.doppler_time.max()) * 10 ** (-plot.DYNAMIC_RANGE_DB / 20)
     return np.where(maps.ridge_magnitudes.numpy() > floor, axes.doppler_hz[maps.ridges.numpy()], np.nan)
 
@@ -246,13 +246,13 @@ def write_overlay(
     camera: CameraConfig | None = None,
     from_film: Tensor | None = None,
 ) -> FilmStrip:
-    """Write ``overlay.mp4``: pictures in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons.
+    """Write ``overlay.mp4``: frames in chunks (n, 3, H, W) uint8 RGB with boxes, ids and skeletons.
 
-    With a ``camera`` the floor that it sees is drawn as well, with ``from_film`` (:class:`~tensorsim.streaming.Found`)
-    where the film's own camera has it.
+    With a ``camera`` the floor that it sees is drawn as well; ``from_film`` (:class:`~tensorsim.streaming.Found`)
+    maps it to where the video's own moving camera sees it.
 
     Returns:
-        The same film as a report has it.
+        The same video in the form that a report uses.
     """
     boxes, keypoints = pose.boxes[0].numpy(), pose.keypoints[0].numpy()
     scores, valid = pose.keypoint_scores[0].numpy(), pose.valid[0].numpy()
@@ -285,16 +285,16 @@ def write_overlay(
 
 
 def check_length(frames: int, fps: float, stage: PoseToDoppler, uncertain: int = 0) -> None:
-    """Refuse what is shorter than a Doppler window.
+    """Refuse a clip shorter than a Doppler window.
 
     Args:
-        frames: how many there are.
+        frames: number of frames.
         fps: frames per second.
         stage: makes the maps.
-        uncertain: how many more there may be.
+        uncertain: how many more frames there may be.
 
     Raises:
-        TensorsimError: it is shorter.
+        TensorsimError: the clip is too short.
     """
     pulses, prf_hz = stage.simulator.min_pulses, stage.resampler.prf_hz
     if stage.resampler.pulses(frames + uncertain, fps) < pulses:
@@ -305,7 +305,7 @@ def check_length(frames: int, fps: float, stage: PoseToDoppler, uncertain: int =
 
 
 def _chosen(found: Found, people: str, fps: float) -> Found:
-    """Those of the people found who count, with a warning where there is nobody."""
+    """Keep the people selected by ``people``; warns if nobody is left."""
     chosen = found._replace(pose=select_people(found.pose, people, fps))
     if bool(found.pose.valid.any()) and not bool(chosen.pose.valid.any()):
         warnings.warn(
@@ -327,10 +327,10 @@ def simulated(
     device: torch.device,
     quiet: bool = False,
 ) -> Iterator[tuple[Found, RadarMaps, Future[FilmStrip]]]:
-    """Find the people of a source, choose, and simulate their maps.
+    """Find the people of a source, select among them, and simulate their maps.
 
-    The overlay film is written in another thread meanwhile, and during the block; it is complete at its end. Until then
-    torch computes on one thread.
+    The overlay video is written in another thread meanwhile and during the block, and is complete at its end. Until
+    then torch runs on one thread.
 
     Raises:
         TensorsimError: see :func:`check_length`, and :func:`~tensorsim.vision.tracking.selection.select_people`.
@@ -359,7 +359,7 @@ def simulated(
             folder, chunks, source.fps, pose, source.threshold, quiet, camera, found.from_film
         )
 
-    # The radar is as fast on one thread as on two, and the film needs the other.
+    # The radar simulation is as fast on one thread as on two, and the video needs the other.
     with beside(overlay, source.frames()) as film, one_thread():
         maps = maps_of_pose(stage, pose, source.fps, device, quiet)
         yield found, maps, film

@@ -67,7 +67,7 @@ def _device() -> str:
 
 
 def _threads() -> str:
-    """How threads wait for one another; those that spin for long stop each other on a busy machine."""
+    """How threads wait for each other; long spinning slows them all down on a busy machine."""
     waits = ", ".join(
         f"{name}={os.environ[name]}" for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT") if name in os.environ
     )
@@ -90,7 +90,7 @@ def run_checks() -> bool:
     for name, check in checks.items():
         try:
             print(f"ok    {name}: {check()}")
-        except Exception as error:  # a self-check reports whatever is wrong and goes on
+        except Exception as error:  # a self-check reports whatever is wrong and continues
             good = False
             print(f"WRONG {name}: {type(error).__name__}: {error}")
     return good

@@ -1,4 +1,4 @@
-"""Where the people of a simulation come from: a film, keypoints of one, or motion that is known."""
+"""Where the people of a simulation come from: a video, keypoints from one, or known motion."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -24,26 +24,26 @@ from tensorsim.streaming import Found, lifted_film, people_of_film
 from tensorsim.types import Pose, Tracks
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
-#: Size of the picture on which people without a film are drawn, and its grey.
+#: Size and grey level of the blank picture on which people without a video are drawn.
 CANVAS = (360, 640)
 _GREY = 40
 
-#: What the simulation of a path starts from.
+#: Kinds of input files, by name.
 KINDS = {"video": "a video", "keypoints": "keypoints (.json)", "motion": "motion capture (.bvh, .npz)"}
 
 
 @dataclass(frozen=True)
 class Source:
-    """People and the pictures to draw them on.
+    """People and the frames to draw them on.
 
     Attributes:
         kind: one of :data:`KINDS`.
         fps: frames per second.
         frame_count: expected number of frames, None if it is not known.
         find: finds the people, with or without progress bars (``quiet``).
-        frames: the pictures, in chunks (n, 3, H, W) uint8 RGB.
-        threshold: score from which a keypoint is drawn.
-        about: what the summary says of the source beside its kind.
+        frames: the frames, in chunks (n, 3, H, W) uint8 RGB.
+        threshold: minimum score for a keypoint to be drawn.
+        about: what the summary says about the source besides its kind.
     """
 
     kind: str
@@ -56,7 +56,7 @@ class Source:
 
 
 def kind_of(path: Path) -> str:
-    """The kind of source that a path is, by its suffix; a folder is one of keypoints if it has any JSON."""
+    """The kind of source by the suffix of its path; a folder with any JSON file holds keypoints."""
     if path.is_dir():
         return "keypoints" if any(path.glob("*.json")) else "video"
     return {".bvh": "motion", ".npz": "motion", ".json": "keypoints"}.get(path.suffix.lower(), "video")
@@ -65,7 +65,7 @@ def kind_of(path: Path) -> str:
 def film_source(
     reader: VideoReader, stage: VideoToPose, device: torch.device, calibrate: bool = False
 ) -> Source:
-    """People of a film, found by the networks of ``stage``; the camera estimated from them, if asked for."""
+    """People of a video, found by the networks of ``stage``; on request the camera is estimated from them."""
     return Source(
         "video",
         reader.fps,
@@ -85,10 +85,10 @@ class Cut(NamedTuple):
     stride: int = 1
 
     def frames(self, count: int, fps: float, path: Path) -> slice:
-        """The frames of ``count`` at ``fps`` as a slice.
+        """The frames to keep, out of ``count`` at ``fps``, as a slice.
 
         Raises:
-            TensorsimError: a stride below 1, an end that is not above the start, or fewer than 2 frames left.
+            TensorsimError: a stride below 1, an end that is not after the start, or fewer than 2 frames left.
         """
         check_count(self.stride, "stride")
         start = 0.0 if self.start_s is None else self.start_s
@@ -114,18 +114,18 @@ def keypoint_source(
     cut: Cut = Cut(),  # noqa: B008  # immutable
     calibrate: bool = False,
 ) -> Source:
-    """People whose COCO or BlazePose keypoints are known; only lifting, placing and smoothing of ``stage`` run.
+    """People with known COCO or BlazePose keypoints; of ``stage``, only lifting, placing and smoothing run.
 
     Args:
         path: see :func:`~tensorsim.data.blazepose.load_keypoints`.
-        stage: its networks are not used.
-        fps: frames per second; no such file states them.
-        size: (height, width) of the pictures; None where the file says it.
+        stage: its detector, tracker and pose network are not used.
+        fps: frames per second; such files do not state it.
+        size: (height, width) of the frames; None if the file states it.
         cut: the frames to keep.
-        calibrate: estimate the camera from the people in place of that of the stage.
+        calibrate: estimate the camera from the people instead of using the camera of the stage.
 
     Raises:
-        TensorsimError: no frame rate, no size, a file that cannot be read, or pictures of another size.
+        TensorsimError: no frame rate, no size, a file that cannot be read, or a size that does not fit the keypoints.
     """
     if fps is None:
         raise TensorsimError(f"{path}: the file has no frame rate; give --fps")
@@ -150,7 +150,7 @@ def keypoint_source(
 
 
 def _check_size(found: Keypoints2D, size: tuple[int, int]) -> None:
-    """Refuse pictures (height, width) that do not hold most of the key points that were seen, and shares of them."""
+    """Refuse a frame size (height, width) that most seen keypoints lie outside of, and normalised coordinates."""
     seen = found.keypoints[(found.scores > 0.3) & found.valid[..., None]]
     if len(seen) and float(seen.abs().quantile(0.95)) <= 2.0:
         raise TensorsimError(
@@ -169,13 +169,13 @@ def _check_size(found: Keypoints2D, size: tuple[int, int]) -> None:
 def _lifted(
     found: Keypoints2D, stage: VideoToPose, kept: slice, size: tuple[int, int], fps: float, calibrate: bool
 ) -> Found:
-    """The people of known keypoints."""
+    """Lift people with known keypoints."""
     keypoints = found.keypoints[kept].transpose(0, 1)
     scores = found.scores[kept].transpose(0, 1)
     matched = found.valid[kept].transpose(0, 1)
     somebody = matched.any(dim=-1)
     keypoints, scores, matched = keypoints[somebody], scores[somebody], matched[somebody]
-    # As for tracks: somebody who is missed for some frames is still there.
+    # As for tracks: somebody missed for some frames is still there.
     valid = (matched.cumsum(-1) > 0) & (matched.flip(-1).cumsum(-1).flip(-1) > 0)
     nearest = nearest_valid(matched)[..., None].expand(-1, -1, 4)
     boxes = keypoint_boxes(keypoints, scores).gather(1, nearest) * valid[..., None]
@@ -193,15 +193,15 @@ def motion_source(
 ) -> Source:
     """People of a motion file.
 
-    The pictures are empty; on them people are drawn as a camera at the radar would see them if it were turned and
-    zoomed to have them all in its picture.
+    The frames are blank; people are drawn on them as a camera at the radar would see them, turned and zoomed so that
+    everybody is in view.
 
     Args:
         path, clip, fps: see :func:`~tensorsim.data.motion_files.load_motion`.
-        heading_rad: turn about the vertical, counter-clockwise seen from above.
-        start_range_m: y of the first person's hips in the first frame; None keeps the places of the file if these
-            are in front of the radar, else moves the people as near as
-            :data:`~tensorsim.pipeline.reach.NEAREST_M`.
+        heading_rad: rotation about the vertical, counter-clockwise seen from above.
+        start_range_m: y of the first person's hips in the first frame; None keeps the positions of the file unless
+            somebody comes nearer than :data:`~tensorsim.pipeline.reach.NEAREST_M`: then all people are moved so that
+            the nearest is at that distance.
         cut: the frames to keep.
 
     Raises:
@@ -244,14 +244,14 @@ def motion_source(
 
 
 def _in_front(motion: Motion, nearest: float) -> Motion:
-    """People moved so that none comes too near and their paths are centred on x = 0."""
+    """Move people so that nobody comes too near and their paths are centred on x = 0."""
     x = mid_hips(motion.joints[motion.valid])[:, 0]
     shift = motion.joints.new_tensor([-float(x.min() + x.max()) / 2, NEAREST_M - nearest, 0.0])
     return motion._replace(joints=(motion.joints + shift) * motion.valid[..., None, None])
 
 
 def drawn_by(camera: CameraConfig, size: tuple[int, int]) -> dict[str, Any]:
-    """What the summary says of a camera."""
+    """What the summary says about a camera."""
     return {
         "camera": {
             "position_m": list(camera.position_m),
@@ -264,6 +264,6 @@ def drawn_by(camera: CameraConfig, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def blank_frames(count: int, size: tuple[int, int]) -> Iterator[Tensor]:
-    """Empty pictures, one by one."""
+    """Blank frames, one at a time."""
     for _ in range(count):
         yield torch.full((1, 3, *size), _GREY, dtype=torch.uint8)

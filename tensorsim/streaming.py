@@ -1,7 +1,7 @@
-"""Long films, frame by frame, and long motion, pulse by pulse.
+"""Long videos, frame by frame, and long motion, pulse by pulse.
 
-Memory does not grow with their length, but for poses: lifting and smoothing take some 12 KB per person and frame, also
-of frames before and after a person.
+Memory does not grow with their length, except for poses: lifting and smoothing take about 12 KB per person and frame,
+including frames before and after a person appears.
 """
 
 import warnings
@@ -39,16 +39,15 @@ from tensorsim.vision.smoothing.even_time import to_even_time
 
 
 class Found(NamedTuple):
-    """Who was found, and what of the camera.
+    """The people found, and what is known about the camera.
 
     Attributes:
         pose: of one clip (B = 1), on the CPU.
-        camera: as estimated from the people; None where it was not.
-        background_px_s: how far the background shifts within a second at most, in pixels of the film; None where
-            that is not known.
+        camera: as estimated from the people; None if it was not.
+        background_px_s: largest shift of the background within a second, in pixels of the video; None if unknown.
         radar_ahead_m: how far in front of the camera the radar stands, see :func:`within_reach`.
-        from_film: (T, 3, 3) homographies from pixels of each frame to those of ``camera``, which does not move, see
-            :mod:`tensorsim.vision.calibration.stabilisation`; None where the film's camera does not either.
+        from_film: (T, 3, 3) homographies from pixels of each frame to those of ``camera``, which is static, see
+            :mod:`tensorsim.vision.calibration.stabilisation`; None if no camera motion was taken out.
     """
 
     pose: Pose
@@ -59,11 +58,11 @@ class Found(NamedTuple):
 
 
 def within_reach(found: Found, radar: RadarConfig) -> Found:
-    """The same people before a radar that stands as far in front of the camera as it takes to see them.
+    """The same people, with the radar moved as far in front of the camera as needed to see them.
 
-    Only where the camera was estimated: who tells where it is knows where the radar is. People whom the radar does not
-    see from beside the camera (:func:`~tensorsim.pipeline.reach.radar_ahead_m`) are nearer by as much, which a
-    TensorsimWarning says.
+    Only if the camera was estimated: a user who specifies the camera also knows where the radar is. If people are out
+    of reach of a radar beside the camera (:func:`~tensorsim.pipeline.reach.radar_ahead_m`), all people come nearer by
+    that distance, and a TensorsimWarning is issued.
     """
     if found.camera is None:
         return found
@@ -87,23 +86,24 @@ def people_of_film(
     quiet: bool = False,
     calibrate: bool = False,
 ) -> Found:
-    """Detect and track in a first pass over the film, estimate and lift poses in a second one.
+    """Detect and track in a first pass over the video, estimate and lift poses in a second one.
 
-    A camera that moves is said in a TensorsimWarning; if the camera is estimated, its turns and zooms are taken out.
+    A moving camera causes a TensorsimWarning; if the camera is estimated, its rotation and zoom are compensated.
 
     Args:
         stage: with the networks.
-        reader: of the film.
+        reader: of the video.
         device: to compute on.
         quiet: no progress bars.
-        calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
+        calibrate: estimate the camera from the people, see :func:`calibrated`, instead of using that of the stage.
 
     Returns:
-        The people and the camera; the Pose is at ``reader.fps`` frames per second and equal to ``stage(video, fps)`` of
-        the whole film, or ``stage(video, fps, times_s=...)`` where its frames are at uneven times.
+        The people and the camera; the Pose is at ``reader.fps`` frames per second and, without ``calibrate``, equal to
+        ``stage(video, fps)`` of the whole video, or ``stage(video, fps, times_s=...)`` if its frames are unevenly
+        spaced.
 
     Raises:
-        TensorsimError: the film has fewer than 2 frames.
+        TensorsimError: the video has fewer than 2 frames.
     """
     detections, observed = detections_of_film(stage, reader, device, quiet)
     tracks = stage.follow(detections, observed)
@@ -121,7 +121,7 @@ def people_of_film(
 
 
 def steps_of_camera(reader: VideoReader, tracks: Tracks, quiet: bool = False) -> Tensor | None:
-    """How the background of a film moves from frame to frame, (T, 4); None if that is not clear.
+    """How the background of a video moves from frame to frame, (T, 4); None if that is unclear.
 
     See :func:`~tensorsim.vision.calibration.stabilisation.camera_path`.
     """
@@ -147,17 +147,18 @@ def lifted_film(
     calibrate: bool,
     steps: Tensor | None = None,
 ) -> Found:
-    """People of one film in metres.
+    """People of one video in metres.
 
     Args:
         stage: lifts them.
         tracks: of one clip (B = 1).
         keypoints: (1, P, T, 17, 2) pixels.
         scores: (1, P, T, 17).
-        size: (height, width) of the pictures.
+        size: (height, width) of the frames.
         fps: frames per second.
-        calibrate: estimate the camera from the people, see :func:`calibrated`, in place of that of the stage.
-        steps: (T, 4) of an estimated camera that turns and zooms, which is taken out if it does not turn too far.
+        calibrate: estimate the camera from the people, see :func:`calibrated`, instead of using that of the stage.
+        steps: (T, 4) background motion of a camera that turns and zooms, compensated unless it turns too far; used
+            only with ``calibrate``.
     """
     if not calibrate:
         return Found(_on_cpu(stage.lift(tracks, keypoints, scores, *size, fps)))
@@ -178,17 +179,17 @@ def _lifted_in_still_picture(
     fps: float,
     steps: Tensor,
 ) -> Found | None:
-    """:func:`lifted_film` of a camera that moves; None where it turns too far."""
+    """:func:`lifted_film` for a moving camera; None if it turns too far."""
 
     def told(camera: CameraConfig) -> tuple[StillPicture, CameraEstimate] | None:
-        """The still picture if the film's camera has the field of view of this one, and the camera that it tells."""
+        """The stabilised picture, given this camera's field of view, and the camera estimated from it."""
         still = still_picture(tracks, keypoints, scores, size, steps, focal_length(camera, size[1]))
         if still is None:
             return None
         of_size = still.keypoints - still.margin.to(still.keypoints)
         return still, calibrated(stage, of_size, still.scores, tracks.valid, size, fps)[1]
 
-    # Angles of turns need the field of view, which is estimated when the turns are taken out.
+    # Turn angles need the field of view, which can be estimated only once the turns are compensated: two rounds.
     usual = horizontal_fov(torch.tensor(USUAL_FOV_RAD, dtype=torch.float64), *size)
     first = told(CameraConfig(horizontal_fov_rad=float(usual)))
     second = None if first is None else told(camera_config(first[1]))
@@ -210,14 +211,14 @@ def _on_cpu(pose: Pose) -> Pose:
 def calibrated(
     stage: VideoToPose, keypoints: Tensor, scores: Tensor, valid: Tensor, size: tuple[int, int], fps: float
 ) -> tuple[VideoToPose, CameraEstimate]:
-    """The stage for the camera that the people of one film tell, and what they tell.
+    """Estimate the camera from the people of one video; returns the stage for that camera, and the estimate.
 
     Args:
-        stage: of another camera.
+        stage: for another camera.
         keypoints: (1, P, T, 17, 2) pixels.
         scores: (1, P, T, 17).
         valid: (1, P, T) bool.
-        size: (height, width) of the pictures.
+        size: (height, width) of the frames.
         fps: frames per second.
     """
     heights = stage.metric_pose.heights
@@ -232,10 +233,10 @@ def calibrated(
 def detections_of_film(
     stage: VideoToPose, reader: VideoReader, device: torch.device, quiet: bool = False
 ) -> tuple[Detections, Tensor]:
-    """Detections (n, K) of the observed frames of a film, and which frames were observed (1, T).
+    """Detections (n, K) in the observed frames of a video, and which frames were observed (1, T).
 
     Raises:
-        TensorsimError: the film has fewer than 2 frames.
+        TensorsimError: the video has fewer than 2 frames.
     """
     interval, size = stage.interval_at(reader.fps), stage.frames_per_batch
     found: list[Detections] = []
@@ -244,7 +245,7 @@ def detections_of_film(
 
     def parts() -> Iterator[tuple[int, Tensor, Tensor]]:
         for frames in reader.chunks(size * interval):
-            # Copies, so that the other frames need no memory; chunks begin at multiples of the interval.
+            # Copies, so that the other frames can be freed; chunks begin at multiples of the interval.
             yield frames.shape[0], frames[::interval].clone(), frames[-1:].clone()
 
     def detected(part: tuple[int, Tensor, Tensor]) -> tuple[int, Tensor, Detections]:
@@ -277,9 +278,9 @@ def keypoints_of_film(
     quiet: bool = False,
     background: BackgroundMotion | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """COCO keypoints (1, P, T, 17, 2) of tracked people of a film and their scores (1, P, T, 17).
+    """COCO keypoints (1, P, T, 17, 2) of the tracked people of a video, and their scores (1, P, T, 17).
 
-    ``background`` is given the frames as well.
+    ``background`` receives the frames as well.
     """
     boxes, valid = tracks.boxes[0].transpose(0, 1), tracks.valid[0].transpose(0, 1)
     keypoints: list[Tensor] = []
@@ -310,7 +311,7 @@ def keypoints_of_film(
 def _drawn(
     frames: Tensor, boxes: Tensor, keypoints: Tensor, scores: Tensor, valid: Tensor, threshold: float
 ) -> np.ndarray:
-    """The last of some frames (n, 3, H, W) with its people."""
+    """Draw the people on the last of some frames (n, 3, H, W)."""
     box, points, point_scores, there = (x[-1].cpu().numpy() for x in (boxes, keypoints, scores, valid))
     frame = frames[-1].permute(1, 2, 0).numpy()
     return plot.draw_people(frame, box, points, point_scores, there, threshold)
@@ -331,7 +332,7 @@ def maps_of_pose(
             stacklevel=2,
         )
 
-    # The simulator passes over the motion twice: for the level of the noise, and for the maps.
+    # The simulator passes over the motion twice: once for the noise level, once for the maps.
     with progress_bar("radar", 2 * pulses, quiet) as bar:
         bar.unit = "pulse"
 

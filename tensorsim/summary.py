@@ -1,4 +1,4 @@
-"""What ``summary.json`` says of a simulation: people, camera, configuration, activity."""
+"""What ``summary.json`` says about a simulation: people, camera, configuration, activity."""
 
 import math
 import uuid
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def people_of(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]]:
-    """One row per person: when it is in the scene, how far its torso is from the radar, and how fast that shrinks."""
+    """One row per person: first and last frame, mean range of the torso from the radar, and mean approach speed."""
     rows = []
     antennas = torch.tensor(radar.middle_m, dtype=torch.float64)
     for person in range(pose.joints.shape[1]):
@@ -43,7 +43,7 @@ def people_of(pose: Pose, fps: float, radar: RadarConfig) -> list[dict[str, Any]
 
 
 def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: RadarMaps) -> dict[str, Any]:
-    """What ``summary.json`` says of every simulation; ``config`` is read by :meth:`SimulationConfig.from_yaml`."""
+    """What ``summary.json`` says of every simulation; :meth:`SimulationConfig.from_yaml` can read its ``config``."""
     snr_db = float(maps.snr_db)
     document = config.to_document()
     return {
@@ -64,17 +64,16 @@ def summary_of(source: "Source", config: SimulationConfig, found: Found, maps: R
 def label_of(
     recognizer: ActivityRecognizer | None, maps: RadarMaps, duration_s: float, least_probability: float = 0.0
 ) -> dict[str, Any]:
-    """What ``summary.json`` says of the activity.
+    """What ``summary.json`` says about the activity.
 
-    ``timeline`` has the label of each window of four seconds; ``label`` and ``probabilities`` are of the whole scene,
-    see :func:`~tensorsim.recognition.timeline.scene_probabilities`. None where there is no recognizer, or one that
-    cannot see the speeds of this radar.
+    ``timeline`` has the label of each window of four seconds; ``label`` and ``probabilities`` are for the whole scene,
+    see :func:`~tensorsim.recognition.timeline.scene_probabilities`. All are None without a recognizer.
 
     Args:
-        recognizer: of the radar of the maps.
+        recognizer: made for the radar of the maps.
         maps: without batch dimensions.
-        duration_s: of the scene.
-        least_probability: below it the label is "not sure".
+        duration_s: duration of the scene.
+        least_probability: below this the label is "not sure".
     """
     if recognizer is None:
         return {"label": None, "probabilities": None, "timeline": None}
@@ -100,6 +99,6 @@ def label_of(
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write ``summary.json``: strict JSON, with the names of the files of this run and an id of the run."""
+    """Write ``summary.json``: strict JSON, with a run id and the names of the files of this run."""
     files = sorted({file.name for file in folder.iterdir()} | {"summary.json"})
     write_json(folder / "summary.json", summary | {"run": uuid.uuid4().hex, "files": files})

@@ -1,4 +1,4 @@
-"""Work in other threads: decoding and encoding of films, and networks on several parts of a film at a time."""
+"""Work in other threads: decoding and encoding videos, and running networks on several parts of a video at a time."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -20,9 +20,9 @@ Result = TypeVar("Result")
 def shared(
     settings: Callable[[], AbstractContextManager[None]],
 ) -> Callable[[], AbstractContextManager[None]]:
-    """Settings of the whole process for blocks in several threads, from when the first begins to when the last ends.
+    """Process-wide settings for blocks in several threads, held from the start of the first to the end of the last.
 
-    If each thread put back what it had found, one could find what another had set, and leave that for ever.
+    If each thread restored what it had found, one could find what another had set, and leave that in place forever.
     """
     lock, held, inside = Lock(), ExitStack(), 0
 
@@ -46,7 +46,7 @@ def shared(
 
 
 def ahead(items: Generator[Item, None, None], count: int = 2) -> Iterator[Item]:
-    """The same items, made in another thread, at most ``count`` more than were taken; errors come in their place."""
+    """The same items, made in another thread up to ``count`` ahead; errors are raised when their item is reached."""
     nothing: Any = object()
     with ThreadPoolExecutor(1) as pool:
         try:
@@ -58,16 +58,16 @@ def ahead(items: Generator[Item, None, None], count: int = 2) -> Iterator[Item]:
             pool.submit(items.close)
 
 
-#: Items that are worked on at a time, at most: of a film each needs the memory of its frames.
+#: Most items in progress at a time: for a video, each needs memory for its frames.
 MOST_AT_A_TIME = 4
 
 
 def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.device) -> Iterator[Result]:
-    """``work`` of each item, in the order of the items; on the CPU by several threads at a time.
+    """``work`` of each item, in the order of the items; on the CPU, several threads run in parallel.
 
-    Small convolutions gain little from a second thread, while two parts of a film side by side take half as long. So
-    torch computes on one thread in each, and as many items are worked on as it had threads. ``work`` must not
-    depend on what it was given before. Items are taken in the thread of the caller, and errors come in their place.
+    Small convolutions gain little from a second thread, while two parts of a video in parallel take half as long. So
+    each item runs with one torch thread, and as many items run at a time as torch had threads. ``work`` must not
+    depend on earlier items. Items are taken in the caller's thread; errors are raised when their item is reached.
     """
     count = min(torch.get_num_threads(), MOST_AT_A_TIME) if device.type == "cpu" else 1
     if count == 1:
@@ -76,7 +76,7 @@ def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
 
     def in_mode(item: Item) -> Result:
-        # Both modes are of a thread.
+        # Both modes are set per thread.
         with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
             return work(item)
 
@@ -96,9 +96,9 @@ def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.
 
 @contextmanager
 def beside(work: Callable[[Iterable[Item]], Result], items: Iterable[Item]) -> Iterator["Future[Result]"]:
-    """``work(items)`` in another thread during the block, which waits for it at its end.
+    """Run ``work(items)`` in another thread during the block, which waits for it at its end.
 
-    If the block fails, the items end early and what ``work`` made of them is of no use.
+    If the block fails, the items end early and the result of ``work`` must not be used.
     """
     stopped = Event()
 

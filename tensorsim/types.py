@@ -1,6 +1,6 @@
-"""What stages hand to each other: NamedTuples of padded, batched tensors, and the table of their shapes.
+"""What stages pass to each other: NamedTuples of padded, batched tensors, and the letters used for their shapes.
 
-Letters used in every docstring:
+Letters used in all docstrings:
 
 =====  ==========================================================================================
 ``B``  clips in a batch
@@ -44,7 +44,7 @@ class Tracks(NamedTuple):
     Attributes:
         boxes: (B, P, T, 4) ``xyxy`` pixels; zeros where not valid.
         valid: (B, P, T) bool, true from a track's first to its last matched frame, coasted frames included, and
-            in frames next to these in which the detector was not run.
+            in adjacent frames in which the detector was not run.
         matched: (B, P, T) bool, true where a detection was assigned in that frame.
     """
 
@@ -57,13 +57,14 @@ class Lifted(NamedTuple):
     """3D poses found for 2D joints, one per frame.
 
     Attributes:
-        depth: (..., T, 14) body heights along the line of sight from the middle of the hips, positive =
+        depth: (..., T, 14) depth along the line of sight relative to the mid-hip point, in body heights, positive =
             further away.
-        scale: (..., T) pixels that the standing body would be high at its distance, whatever its pose.
+        scale: (..., T) height in pixels that the body would have standing at its distance, whatever its pose.
         keypoints: (..., T, 14, 2) pixels, the found pose placed in the image: stands in for hidden joints.
-        nearest: (..., T) int64 of the best match, ``pose * yaws + heading``.
+        nearest: (..., T) int64 index of the best match, ``pose * yaws + heading``.
         distance: (..., T) its weighted squared error over the spread of the joints; 0 is a perfect fit.
-        deviation: (..., T, 14) standard deviation of ``depth`` in body heights, among the poses that fit; 0 of one.
+        deviation: (..., T, 14) standard deviation of ``depth`` among the poses that fit, in body heights; 0 for a
+            single pose.
     """
 
     depth: Tensor
@@ -80,7 +81,7 @@ class Pose(NamedTuple):
     Attributes:
         boxes: (B, P, T, 4) ``xyxy`` pixels.
         keypoints: (B, P, T, 17, 2) COCO-17 ``uv`` pixels.
-        keypoint_scores: (B, P, T, 17) from 0, higher is surer.
+        keypoint_scores: (B, P, T, 17) from 0, higher means more certain.
         joints: (B, P, T, 14, 3) world metres in the order of ``tensorsim.JOINTS``; finite everywhere.
         valid: (B, P, T) bool, whether the person is in the scene.
     """
@@ -113,10 +114,10 @@ class RadarMaps(NamedTuple):
 
 
 class Simulation(NamedTuple):
-    """Everything :class:`tensorsim.VideoToDoppler` makes of clips: the fields of Pose, then of RadarMaps.
+    """Everything that :class:`tensorsim.VideoToDoppler` returns for clips: the fields of Pose, then of RadarMaps.
 
-    ``valid`` is false everywhere in a clip in which nobody was found: its maps show the empty scene. Eager code warns
-    of it as well; TorchScript cannot.
+    ``valid`` is false throughout a clip in which nobody was found: its maps show the empty scene. Eager code also
+    issues a warning; TorchScript cannot.
 
     Attributes:
         boxes: (B, P, T, 4) ``xyxy`` pixels.
@@ -146,7 +147,7 @@ class Simulation(NamedTuple):
 
 
 class Recognition(NamedTuple):
-    """Everything :class:`tensorsim.VideoToActivity` makes of clips: the fields of :class:`Simulation`, then logits.
+    """Everything that :class:`tensorsim.VideoToActivity` returns: the fields of :class:`Simulation`, then logits.
 
     Attributes:
         logits: (B, classes) in the order of the recognizer's ``class_names``.

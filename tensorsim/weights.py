@@ -1,7 +1,7 @@
 """Weight files: read without running code in them, and loaded completely or not at all.
 
-A ``.pth`` file is a pickle, that is, a program. It is read here by an unpickler that can build tensors and nothing
-else, so that files from any source are safe to open.
+A ``.pth`` file is a pickle, that is, a program. Here it is read by an unpickler that can only build tensors and
+containers, so that files from any source are safe to open.
 """
 
 import functools
@@ -25,7 +25,7 @@ from tensorsim.files import check_pickle_memo, complete_file
 
 PICKLE_SUFFIXES = (".pth", ".pt", ".bin")
 
-# Published files are called `...-HASH8.pth` or `...-HASH8_DATE.pth`, where HASH8 are the first digits of the SHA-256.
+# Published files are called `...-HASH8.pth` or `...-HASH8_DATE.pth`; HASH8 is the first 8 digits of the SHA-256.
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8})(?:_\d{8})?$")
 _DATE = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 
@@ -41,16 +41,16 @@ _TENSOR_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
 }
 
 # Published checkpoints also contain training logs (mmengine's message hub, NumPy scalars). Their objects are read as
-# placeholders that do nothing; names of other packages are refused.
+# placeholders that do nothing; names from other packages are refused.
 _LOG_PACKAGES = ("mmengine", "mmcv", "numpy", "collections", "datetime", "_codecs")
 _LOG_BUILTINS = ("getattr", "set", "frozenset", "slice", "range", "complex", "bytearray")
 
-# Largest ratio of unpacked to packed size of a checkpoint; files that torch writes have about 1.
+# Largest ratio of unpacked to packed size of a checkpoint; files written by torch have about 1.
 _MAX_COMPRESSION = 20
 
 
 class _Placeholder:
-    """Takes the place of an object beside the weights: accepts all calls of a pickle and does nothing."""
+    """Stands in for an object stored beside the weights: accepts any call from a pickle and does nothing."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
@@ -85,7 +85,7 @@ class _TensorUnpickler(pickle.Unpickler):
         if (module, name) in _TENSOR_PARTS:
             return _TENSOR_PARTS[module, name]
         if (module, name) in _TENSOR_FUNCTIONS:
-            # A pickle can set the state of what it names: of a partial made for it, not of torch's own function.
+            # A pickle can set the state of what it names: let that be a partial made for it, not torch's own function.
             return functools.partial(_TENSOR_FUNCTIONS[module, name])
         if module == "torch" and isinstance(getattr(torch, name, None), torch.dtype):
             return getattr(torch, name)
@@ -117,7 +117,7 @@ def load_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         raise TensorsimError(f"{path}: got the suffix {path.suffix!r}, expected a weight file ({expected})")
     if not path.is_file():
         raise TensorsimError(f"{path}: no such file, expected weights")
-    # One read serves hash and tensors, so that what was verified is what is loaded.
+    # Hash and tensors come from a single read, so that what was verified is what is loaded.
     data = path.read_bytes()
     _verify_hash_in_name(path, data)
     content = _read_safetensors(path, data) if path.suffix == ".safetensors" else _read_pickle(path, data)
@@ -159,8 +159,8 @@ def read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
 
 
 def input_size_of(path: Path) -> tuple[int, int] | None:
-    """(height, width) of the pictures that weights were trained on, from the header (``"128x96"``) or from the name of
-    a published file (``...384x288...``); None where neither states it.
+    """(height, width) of the images that weights were trained on, from the header (``"128x96"``) or from the name of
+    a published file (``...384x288...``); None if neither states it.
 
     Raises:
         TensorsimError: a damaged file.
@@ -171,10 +171,10 @@ def input_size_of(path: Path) -> tuple[int, int] | None:
 
 
 def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | os.PathLike[str]) -> None:
-    """Copy weights into a module, or refuse and leave it as it was.
+    """Copy weights into a module, or refuse and leave it unchanged.
 
     Every key and shape must match. A tensor that a module lists under several names (a shared convolution)
-    may come under one of them, as safetensors stores it, or under all with equal values.
+    may be given under one of them, as safetensors stores it, or under several with equal values.
 
     Args:
         module: receives the weights.
@@ -182,7 +182,7 @@ def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | 
         source: their file, for the message.
 
     Raises:
-        TensorsimError: names what is missing, unexpected or of another shape.
+        TensorsimError: lists keys that are missing, unexpected, or of the wrong shape or kind.
     """
     expected = module.state_dict(keep_vars=True)
     aliases: dict[int, list[str]] = {}
@@ -212,20 +212,19 @@ def load_strict(module: nn.Module, state_dict: dict[str, Tensor], source: str | 
         raise TensorsimError(
             f"{source}: not the weights of this {type(module).__name__}: " + ", ".join(problems)
         )
-    # Not strict: names that alias a tensor already given may be absent.
+    # Not strict: further names of a tensor already given may be absent.
     module.load_state_dict(state_dict, strict=False)
 
 
 def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict[str, str]) -> None:
-    """Write the weights of a module as ``.safetensors`` for shipping: parameters in float16, statistics as they are.
+    """Write the weights of a module as ``.safetensors`` for shipping: parameters in float16, buffers as they are.
 
-    A tensor that the module lists under several names is stored under the first. The file appears whole or not at
-    all.
+    A tensor that the module lists under several names is stored under the first. The file appears only when complete.
 
     Args:
         module: its state dict is written.
         path: ends in ``.safetensors``.
-        metadata: strings stored in the header, beside those of ``module.metadata`` if there is one.
+        metadata: strings stored in the header, in addition to ``module.metadata``, if there is any.
 
     Raises:
         TensorsimError: a parameter that float16 cannot hold.
@@ -251,7 +250,7 @@ def save_weights(module: nn.Module, path: str | os.PathLike[str], metadata: dict
 
 
 def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Refuse values that trained weights cannot have: not finite, negative variances, fewer stored than shown."""
+    """Refuse values that trained weights cannot have: not finite, negative variances, fewer stored than the shape."""
     for key, value in tensors.items():
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise TensorsimError(
