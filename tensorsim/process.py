@@ -110,7 +110,7 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 def _quit(number: int, frame: FrameType | None) -> NoReturn:
     print("tensorsim: interrupted", file=sys.stderr, flush=True)
-    os._exit(130)  # nothing has been written yet, and libraries turn exceptions during their import into others
+    os._exit(130)  # nothing is written yet, and libraries turn exceptions in their imports into others
 
 
 if is_command():

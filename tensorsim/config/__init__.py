@@ -2,9 +2,9 @@
 
 Defaults follow the control panel of the original application (RadHARSimulator V2) except: the tracker's measurement
 noise is 0.0004 (panel: 0.01), there is no Savitzky-Golay filter (panel: 0.25 s), no initial distances are assumed
-(panel: 4.00 and 0.50 m), a network lifts people (the paper: the nearest pose; the nearest lifter averages 128), and the
-wall touches the plane of the antennas. Formulas of the paper that are not physically correct are replaced by correct
-ones; :meth:`SimulationConfig.paper` is the literal paper.
+(panel: 4.00 and 0.50 m), a network lifts people (paper: the nearest pose; the nearest lifter here averages 128), and
+the wall touches the antenna plane. Formulas of the paper that are physically incorrect are replaced by correct ones;
+:meth:`SimulationConfig.paper` follows the paper literally.
 """
 
 from tensorsim.config.camera import CameraConfig

@@ -16,21 +16,21 @@ from tensorsim.errors import TensorsimError
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """A pinhole camera. By default it stands at the radar and looks along +y with the x axis level.
+    """A pinhole camera. By default it is at the radar and looks along +y, with its x axis level.
 
     Attributes:
         focal_px: focal length in pixels; None derives it from ``horizontal_fov_rad``.
         horizontal_fov_rad: horizontal field of view in radians, used when ``focal_px`` is None.
         center_px: principal point (u, v); None is the middle of the image, ((W - 1) / 2, (H - 1) / 2).
-        position_m: the camera in the world.
+        position_m: position of the camera in the world.
         pitch_rad: upward tilt of the optical axis.
-        yaw_rad: turn of the optical axis from +y towards +x.
-        roll_rad: turn about the optical axis, positive = clockwise as the camera sees it, so that upright bodies lean
-            to the left in its picture.
+        yaw_rad: rotation of the optical axis from +y towards +x.
+        roll_rad: rotation about the optical axis, positive = clockwise as the camera sees it, so that upright bodies
+            lean to the left in its image.
 
     Raises:
-        TensorsimError: a focal length or field of view that is not physical, a position, principal point or angle
-            that is not finite.
+        TensorsimError: an unphysical focal length or field of view, or a position, principal point or angle that is
+            not finite.
     """
 
     focal_px: float | None = None

@@ -1,4 +1,4 @@
-"""Checks that the configurations share."""
+"""Checks shared by the configurations."""
 
 import dataclasses
 import math
@@ -32,25 +32,25 @@ def require_finite(config: Any, *names: str) -> None:
 
 
 def require_ranges(config: Any, **quantities: str) -> None:
-    """Refuse fields of a configuration outside of the range of their quantity, see :mod:`tensorsim.limits`."""
+    """Refuse fields of a configuration outside the range of their quantity, see :mod:`tensorsim.limits`."""
     for name, quantity in quantities.items():
         check_range(getattr(config, name), quantity, f"{type(config).__name__}.{name}")
 
 
 def as_plain(value: Any) -> Any:
-    """Arrays and lists as tuples, numbers of NumPy as Python's; anything else stays as it is."""
+    """Turn arrays and lists into tuples and NumPy numbers into Python ones; anything else is returned as is."""
     value = value.tolist() if hasattr(value, "tolist") else value
     return tuple(as_plain(v) for v in value) if isinstance(value, list | tuple) else value
 
 
 def make_plain(config: Any) -> None:
-    """:func:`as_plain` of every field, so that a configuration is hashable and modules made from it can be scripted."""
+    """Apply :func:`as_plain` to every field: configurations become hashable, and modules made from them scriptable."""
     for field in dataclasses.fields(config):
         object.__setattr__(config, field.name, as_plain(getattr(config, field.name)))
 
 
 def listed(positions: Any) -> tuple[Vector, ...]:
-    """One position, or several, as several."""
+    """One position or several, as a tuple of positions."""
     several = isinstance(positions, tuple) and len(positions) > 0 and isinstance(positions[0], tuple)
     return positions if several else (positions,)
 
@@ -84,7 +84,7 @@ def require_choices(config: Any, **choices: Any) -> None:
 
 
 def require_counts(config: Any, *names: str, least: int = 1, most: float = math.inf) -> None:
-    """Refuse fields that are not integers from ``least`` to ``most``; integers of NumPy become Python's."""
+    """Refuse fields that are not integers from ``least`` to ``most``; NumPy integers become Python ones."""
     for name in names:
         value = check_count(getattr(config, name), f"{type(config).__name__}.{name}", least, most)
         object.__setattr__(config, name, value)

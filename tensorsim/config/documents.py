@@ -1,4 +1,4 @@
-"""Configurations from and to plain documents (mappings, lists, numbers), as YAML holds them."""
+"""Convert configurations from and to plain documents (mappings, lists, numbers), as stored in YAML."""
 
 import dataclasses
 import difflib
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def to_document(value: Any) -> Any:
-    """A configuration as mappings, lists, numbers and strings; those of NumPy become Python's."""
+    """A configuration as mappings, lists, numbers and strings; NumPy values become Python ones."""
     value = value.tolist() if hasattr(value, "tolist") else value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_document(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -24,19 +24,19 @@ def to_document(value: Any) -> Any:
 
 
 def digest(settings: Any) -> str:
-    """Ten hexadecimal digits that tell configurations, and versions of this package, apart."""
+    """Ten hexadecimal digits that identify a configuration and the version of this package."""
     text = json.dumps([version("tensorsim"), to_document(settings)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
 def from_document(where: str, config: type, document: Any, more_keys: tuple[str, ...] = ()) -> Any:
-    """A configuration of this dataclass from a mapping; fields that are missing keep their default.
+    """A configuration of this dataclass from a mapping; missing fields keep their defaults.
 
     Args:
-        where: begins the message of an error, e.g. file and section.
+        where: start of error messages, e.g. file and section.
         config: a dataclass.
-        document: a mapping, its keys the fields; numbers may be strings such as ``77e9``, which YAML 1.1 reads so.
-        more_keys: keys that are allowed elsewhere, for the message.
+        document: a mapping whose keys are the fields; numbers may be strings: YAML 1.1 reads ``77e9`` as one.
+        more_keys: further keys to list in the message about an unknown key.
 
     Raises:
         TensorsimError: an unknown key, a value of the wrong type, or one that the configuration refuses.
@@ -59,10 +59,10 @@ def from_document(where: str, config: type, document: Any, more_keys: tuple[str,
 
 
 def find_named(table: Mapping[str, T], name: str, kind: str) -> T:
-    """The entry of this name.
+    """The entry with this name.
 
     Raises:
-        TensorsimError: no such one; the message lists the known ones.
+        TensorsimError: no such entry; the message lists the known ones.
     """
     if name not in table:
         known = list(table)
@@ -73,13 +73,13 @@ def find_named(table: Mapping[str, T], name: str, kind: str) -> T:
 
 
 def suggestion(name: str, known: list[str]) -> str:
-    """``, perhaps 'x'`` where one of the known names is close to this one; else nothing."""
+    """``, perhaps 'x'`` if one of the known names is similar to this one; else an empty string."""
     close = difflib.get_close_matches(name.lower(), known, n=1)
     return f", perhaps {close[0]!r}" if close else ""
 
 
 def _convert(where: str, value: Any, hint: Any) -> Any:
-    """A value of a document in the type of a field."""
+    """A value of a document converted to the type of a field."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return _convert_union(where, value, arguments)
@@ -97,7 +97,7 @@ def _convert(where: str, value: Any, hint: Any) -> Any:
             return value
         raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        return value  # a float would round those beyond 2**53
+        return value  # a float would round integers beyond 2**53
     number = _number(value)
     if number is None or (hint is int and not number.is_integer()):
         raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
@@ -107,7 +107,7 @@ def _convert(where: str, value: Any, hint: Any) -> Any:
 def _convert_union(where: str, value: Any, kinds: tuple[Any, ...]) -> Any:
     if value is None and type(None) in kinds:
         return None
-    # A list of lists is for a tuple of tuples, where the field takes one as well as a plain tuple.
+    # A list of lists means a tuple of tuples, if the field accepts both that and a plain tuple.
     nested = isinstance(value, list) and any(isinstance(item, list) for item in value)
     fitting = [
         kind
@@ -123,7 +123,7 @@ def _convert_union(where: str, value: Any, kinds: tuple[Any, ...]) -> Any:
 
 
 def _kind(hint: Any) -> str:
-    """What a document has for this type, in words."""
+    """How a document represents this type, in words."""
     if typing.get_origin(hint) is tuple:
         return f"a list of {'names' if typing.get_args(hint)[0] is str else 'numbers'}"
     if dataclasses.is_dataclass(hint):

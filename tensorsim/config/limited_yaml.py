@@ -1,10 +1,11 @@
-"""YAML that people write by hand: small, flat, and without what could take long, take memory or surprise."""
+"""Hand-written YAML: small, flat, and without features that cost time or memory, or cause surprises."""
 
 from typing import Any
 
 from tensorsim.errors import TensorsimError
 
-#: Characters of a document, of a value, and nesting; configurations need a tenth of each, but for long paths of files.
+#: Limits on the characters of a document and of a value, and on nesting; apart from long file paths, configurations
+#: need a tenth of each.
 MAX_CHARACTERS = 100_000
 MAX_VALUE = 4096
 MAX_DEPTH = 20
@@ -14,14 +15,14 @@ def load_limited_yaml(text: str, name: str) -> Any:
     """The content of a YAML document.
 
     Numbers are decimal as in Python (``010`` is ten and ``77e9`` a number, unlike in YAML 1.1); dates, anchors, tags
-    and repeated keys are refused. Bounds are checked while the text is read, before anything is built from it.
+    and repeated keys are refused. Limits are checked while the text is parsed, before anything is built from it.
 
     Args:
         text: the document.
-        name: of its file, for messages.
+        name: name of its file, for messages.
 
     Raises:
-        TensorsimError: text that is not YAML, is larger or deeper than the bounds above, or has what is refused.
+        TensorsimError: text that is not YAML, exceeds the limits above, or uses a refused feature.
     """
     import yaml
 
@@ -52,7 +53,7 @@ def load_limited_yaml(text: str, name: str) -> Any:
 
 
 def dump_limited_yaml(document: Any) -> str:
-    """YAML from which :func:`load_limited_yaml` reads the same: text that it would take for a number is quoted."""
+    """YAML that :func:`load_limited_yaml` reads back unchanged: strings that look like numbers are quoted."""
     import yaml
 
     class Dumper(yaml.SafeDumper):
@@ -62,7 +63,7 @@ def dump_limited_yaml(document: Any) -> str:
 
 
 def _loader() -> Any:
-    """YAML's safe loader with decimal numbers, without dates, and without equal keys."""
+    """YAML's safe loader with decimal numbers, without dates, and refusing repeated keys."""
     import re
 
     import yaml

@@ -1,6 +1,6 @@
-"""Names of joints, key points and activities, in their order."""
+"""Names of joints, keypoints and activities, in their order."""
 
-#: The 14 joints of the radar body, the OpenPose order that the paper indexes.
+#: The 14 joints of the radar body, in the OpenPose order whose indices the paper uses.
 JOINTS = (
     "head",
     "neck",
@@ -18,7 +18,7 @@ JOINTS = (
     "left_ankle",
 )
 
-#: Radar cross section of each joint in m^2 (the legs are not legible in the panel: hip 0.1, knee 0.4, ankle 0.3).
+#: Radar cross section of each joint in m^2 (illegible in the panel for the legs: hip 0.1, knee 0.4, ankle 0.3).
 JOINT_RCS_M2 = (0.5, 1.0, 0.1, 0.3, 0.2, 0.1, 0.3, 0.2, 0.1, 0.4, 0.3, 0.1, 0.4, 0.3)
 
 #: The 17 keypoints of COCO, in the order of its annotations.

@@ -1,4 +1,4 @@
-"""From frames to smooth motion: tracking, pose and its place in the world, smoothing."""
+"""From frames to smooth motion: tracking, pose, position in the world, smoothing."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -12,11 +12,11 @@ Lifting = Literal["temporal", "nearest"]
 Resampling = Literal["spline", "linear"]
 SmoothingMode = Literal["rts", "forward"]
 
-#: Body weights of the panel in kg, at which its cross sections hold.
+#: Body weights of the panel in kg, for which its cross sections are valid.
 PANEL_WEIGHTS_KG = (84.24, 75.00)
-#: Initial distances of the panel in metres; the paper's position cannot do without.
+#: Initial distances of the panel in metres; the paper's position method needs them.
 PANEL_DISTANCES_M = (4.00, 0.50)
-#: Body surface grows with this power of the weight (Du Bois and Du Bois, Arch. Intern. Med. 17, 1916).
+#: Body surface area grows with this power of the weight (Du Bois and Du Bois, Arch. Intern. Med. 17, 1916).
 WEIGHT_EXPONENT = 0.425
 
 
@@ -26,13 +26,13 @@ class TrackerConfig:
 
     Attributes:
         detector: name or file of the detector's weights; None is the shipped network.
-        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2), above 45 frames per
-            second less often, see :class:`~tensorsim.pipeline.VideoToPose`.
+        detection_interval: the detector runs on every n-th frame (panel: detection interval, 2), less often from
+            45 frames per second, see :class:`~tensorsim.pipeline.VideoToPose`.
         min_box_px: smallest width and height of a detection in pixels (panel: minimum detection size, 5 x 5).
         max_tracks: largest number of people tracked at once (panel: maximum number of tracks, 5).
-        confirm_hits: detections that confirm a track (panel: confirmation threshold, 2 of 5) ...
+        confirm_hits: detections needed to confirm a track (panel: confirmation threshold, 2 of 5) ...
         confirm_window: ... within this many frames in which the detector ran.
-        delete_misses: misses that end a track (panel: deletion threshold, 23 of 23) ...
+        delete_misses: misses after which a track ends (panel: deletion threshold, 23 of 23) ...
         delete_window: ... within this many frames in which the detector ran.
         assignment_threshold: largest squared Mahalanobis distance of an assignment (panel: 150).
         process_noise: density of the acceleration noise of a box in size^2 / frame^3, where size is the longer side of
@@ -76,30 +76,29 @@ class TrackerConfig:
 
 @dataclass(frozen=True)
 class PoseConfig:
-    """Key points, lifting to 3D and position in the world.
+    """Keypoints, lifting to 3D and position in the world.
 
     Attributes:
         network: name or file of the pose network's weights; None is the shipped network.
-        flip_test: average the network's answer with that for the mirror image.
-        keypoint_threshold: score from which a key point counts as seen (panel: key point threshold, 0.3).
+        flip_test: average the network's output with that for the mirror image.
+        keypoint_threshold: score from which a keypoint counts as seen (panel: key point threshold, 0.3).
         person_height_m: body heights in metres in order of appearance; the last one applies to all further people
             (panel: 1.80, 1.70 m).
         person_weight_kg: body weights in kg likewise (panel: 84.24, 75.00 kg). Cross sections scale with the body
-            surface, ``(weight / panel weight)^0.425``.
-        initial_distance_m: distances of the people when they appear, which calibrate the focal length (panel:
+            surface area, ``(weight / panel weight)^0.425``.
+        initial_distance_m: distances of the people when they first appear, used to calibrate the focal length (panel:
             4.00, 0.50 m); None takes the camera's focal length.
         camera: pinhole camera.
-        calibrate: estimate tilt, height and field of view of the camera from the people of a film, in place of
+        calibrate: estimate tilt, height and field of view of the camera from the people of a video instead of using
             ``camera``; see :class:`tensorsim.vision.CameraCalibrator`.
         position: ``"camera"`` (pinhole camera) or ``"paper"`` (increments of pixels times metres per pixel).
-        lifter: ``"temporal"`` (a network that uses a window of frames) or ``"nearest"`` (nearest poses of a library).
+        lifter: ``"temporal"`` (a network that uses a window of frames) or ``"nearest"`` (nearest poses in a library).
         lifter_weights: name or file of the temporal lifter's weights; None is the shipped network.
         library: nearest lifter only: file of the pose library; None is the shipped one.
-        neighbours: nearest lifter only: poses of the library that are averaged per frame; 1 is the paper's nearest
-            match.
-        temporal: nearest lifter only: weight of the change between frames in the choice of poses; 0 matches each frame
-            alone.
-        fewest_joints: smallest number of the 14 joints for a frame to be used.
+        neighbours: nearest lifter only: library poses averaged per frame; 1 is the paper's nearest match.
+        temporal: nearest lifter only: weight of the change between frames when choosing poses; 0 matches each frame
+            on its own.
+        fewest_joints: how many of the 14 joints must be seen for a frame to be used.
         people: who is simulated: ``"all"``, ``"moving"``, ``"nearest"`` or a person's number from 1.
 
     Raises:
@@ -146,7 +145,7 @@ class PoseConfig:
                 check_per_person(getattr(self, name), f"PoseConfig.{name}")
 
     def rcs_scale(self, person: int) -> float:
-        """Factor, without unit, on the cross sections in m^2 of person number ``person`` (from 0), by weight."""
+        """Dimensionless factor on the cross sections of person number ``person`` (from 0), by weight."""
         weight = self.person_weight_kg[min(person, len(self.person_weight_kg) - 1)]
         panel = PANEL_WEIGHTS_KG[min(person, len(PANEL_WEIGHTS_KG) - 1)]
         return (weight / panel) ** WEIGHT_EXPONENT
@@ -162,7 +161,7 @@ class SmoothingConfig:
         resampling: ``"spline"`` (twice differentiable) or ``"linear"``, the paper's.
         smoothing_ratio: length of a Savitzky-Golay filter at pulse rate in seconds (panel: smoothing ratio, 0.25);
             None leaves it out.
-        polynomial_order: of the Savitzky-Golay filter.
+        polynomial_order: order of the Savitzky-Golay filter.
 
     Raises:
         TensorsimError: numbers out of range or an unknown choice.

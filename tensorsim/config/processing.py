@@ -27,21 +27,21 @@ class ProcessingConfig:
         range_window: window over fast time; None is rectangular.
         mti: moving target indicator, see :class:`tensorsim.radar.MovingTargetIndicator`.
         window_s: length of the STFT window in seconds (panel: STFT window, 0.1 s).
-        overlap: shared part of neighbouring STFT windows (panel: overlap, 0.9).
-        integration: sum over range bins, see :class:`tensorsim.radar.DopplerTimeMap`.
-        ridge_count: ridges of the Doppler-time map, 1 to 6 (panel: 3).
+        overlap: overlap of neighbouring STFT windows, as a fraction (panel: overlap, 0.9).
+        integration: how range bins are summed, see :class:`tensorsim.radar.DopplerTimeMap`.
+        ridge_count: number of ridges of the Doppler-time map, 1 to 6 (panel: 3).
         denoiser: what cleans the maps (panel: denoiser on/off): ``"none"``, ``"perona-malik"``, ``"ksvd"``,
             ``"dncnn"``, or DnCNN weights by name or file, see :func:`tensorsim.enhance.choice.map_denoiser`; None
             is off.
         display_rate_hz: columns per second of the range-time maps; None keeps every pulse.
         engine: ``"time"`` synthesises the signal and transforms it; ``"range-bins"`` computes the range bins in
             closed form.
-        near_bins: with ``engine="range-bins"``, bins on each side of a path that are computed; None is all.
-        energy_stride: with ``engine="range-bins"``, the power of the echo that the noise refers to is the mean over
-            every n-th pulse; working it out takes a third of the time.
-        range_gate_m: (nearest, farthest) metres of the bins that are used, or the width in metres of a gate
-            that follows the people; None uses all bins.
-        pulse_chunk: pulses that are worked on at a time; bounds memory.
+        near_bins: with ``engine="range-bins"``, number of bins computed on each side of a path; None computes all.
+        energy_stride: with ``engine="range-bins"``, the echo power that the noise refers to is the mean over every
+            n-th pulse; computing it takes a third of the time.
+        range_gate_m: (nearest, farthest) range in metres of the bins used, or the width in metres of a gate that
+            follows the people; None uses all bins.
+        pulse_chunk: pulses processed at a time; bounds memory.
 
     Raises:
         TensorsimError: an unknown choice, or numbers out of range.

@@ -14,27 +14,28 @@ class RadarConfig:
     """An FMCW radar. World frame: x right, y range, z height, metres.
 
     The chirp sweeps upwards from ``carrier_hz``, the **start** of the sweep: ``f(t) = fc + (B / T) t``.
-    Defaults are the free-space preset of the original's panel.
+    Defaults are the free-space preset of the original application's panel.
 
     ``tx_m`` and ``rx_m`` are one position (x, y, z) each, or K and A of them: ``((x, y, z), ...)`` or anything
-    of shape (A, 3). Several give the echo an antenna dimension of K * A channels, transmitter by transmitter.
-    Transmitters fire in turn (time division): number k at ``k / (K PRF)`` after the start of a pulse interval.
+    of shape (A, 3). A list of positions gives the echo an antenna dimension of K * A channels, transmitter by
+    transmitter. Transmitters fire in turn (time division): number k at ``k / (K PRF)`` after the start of a pulse
+    interval.
 
     Attributes:
         carrier_hz: frequency at the start of the sweep in Hz.
         bandwidth_hz: width of the sweep in Hz.
         chirp_s: duration of the sweep in seconds.
-        prf_hz: pulse repetition frequency in Hz; K transmitters fire once each in a pulse interval.
+        prf_hz: pulse repetition frequency in Hz; each of the K transmitters fires once per pulse interval.
         sample_rate_hz: complex samples of the intermediate frequency per second.
         tx_m: position of the transmitter in metres, or K positions.
         rx_m: position of the receiver in metres, or A positions.
         antenna_gain_dbi: gain of each antenna in dBi, transmitters and receivers alike.
-        isolation_db: attenuation in dB of the direct signal from transmitter to receiver; it counts with leakage only
+        isolation_db: attenuation in dB of the direct signal from transmitter to receiver; used only with leakage
             (:attr:`SceneConfig.leakage`).
 
     Raises:
-        TensorsimError: a frequency or duration that is not positive, a position without three finite numbers, values
-            beyond the plausible (:mod:`tensorsim.limits`), or K chirps that do not fit a pulse interval.
+        TensorsimError: a frequency or duration that is not positive, a position without three finite numbers,
+            implausible values (:mod:`tensorsim.limits`), or K chirps that do not fit into a pulse interval.
     """
 
     carrier_hz: float = 77e9
@@ -89,12 +90,12 @@ class RadarConfig:
 
     @property
     def tx_positions_m(self) -> tuple[Vector, ...]:
-        """Position (x, y, z) in metres of every transmitter, also where there is one."""
+        """Position (x, y, z) in metres of every transmitter, even if there is only one."""
         return listed(self.tx_m)
 
     @property
     def rx_positions_m(self) -> tuple[Vector, ...]:
-        """Position (x, y, z) in metres of every receiver, also where there is one."""
+        """Position (x, y, z) in metres of every receiver, even if there is only one."""
         return listed(self.rx_m)
 
     @property
@@ -120,17 +121,17 @@ class RadarConfig:
 
     @property
     def wavelength_m(self) -> float:
-        """Wavelength of the amplitude (radar equation) in metres, c / fc."""
+        """Wavelength in metres used for the amplitude (radar equation), c / fc."""
         return SPEED_OF_LIGHT_M_S / self.carrier_hz
 
     @property
     def doppler_wavelength_m(self) -> float:
-        """Wavelength of Doppler shifts in metres, c / (fc + B/2): those of a range bin go with the sweep's centre."""
+        """Wavelength in metres for Doppler shifts, c / (fc + B/2): in a range bin they follow the sweep's centre."""
         return SPEED_OF_LIGHT_M_S / (self.carrier_hz + self.bandwidth_hz / 2)
 
     @property
     def range_resolution_m(self) -> float:
-        """Spacing of range bins in metres, c / (2B); where fs T is no whole number, B is what the N samples span."""
+        """Spacing of range bins in metres, c / (2B); if fs T is not an integer, B is the span of the N samples."""
         span = self.samples_per_chirp / (self.sample_rate_hz * self.chirp_s)
         return SPEED_OF_LIGHT_M_S / (2 * self.bandwidth_hz * span)
 

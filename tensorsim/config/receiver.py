@@ -1,4 +1,4 @@
-"""Imperfections of the receiver, the furniture of a room, and an interfering radar."""
+"""Receiver imperfections, room clutter, and an interfering radar."""
 
 import math
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from tensorsim.errors import TensorsimError
 
 @dataclass(frozen=True)
 class ReceiverConfig:
-    """What the receiver does to the signal. Every effect is off unless it is asked for.
+    """What the receiver does to the signal. Every effect is off by default.
 
     Attributes:
-        phase_noise_dbc_hz: single-sideband phase noise of the oscillator in dBc/Hz, 1 MHz from the carrier; its form
-            over frequency is that of :class:`tensorsim.radar.PhaseNoise`. None is a clean oscillator.
+        phase_noise_dbc_hz: single-sideband phase noise of the oscillator in dBc/Hz, 1 MHz from the carrier; for its
+            shape over frequency see :class:`tensorsim.radar.PhaseNoise`. None is an ideal oscillator.
         iq_imbalance_db: gain of Q relative to I in dB, see :class:`tensorsim.radar.QuadratureImbalance`.
         iq_phase_rad: deviation of the I/Q phase difference from a quarter turn, in radians.
-        dc_offset_db: power of a constant offset relative to the mean power of the echo that the noise refers to, in dB;
-            None is no offset.
-        real: the receiver has one channel, I alone, see :class:`tensorsim.radar.RealReceiver`. With the same
-            ``snr_db``, which is that of samples, range bins have 3 dB less.
-        adc_bits: bits of the converters of I and Q, see :class:`tensorsim.radar.Converter`; None does not quantise.
-        adc_headroom_db: full scale of the converters above the rms magnitude of their input over the clip, in dB; 0 dB
-            is a wave of full scale, smaller values saturate more.
+        dc_offset_db: power of a constant offset in dB relative to the mean echo power that the noise refers to; None
+            is no offset.
+        real: the receiver has only the I channel, see :class:`tensorsim.radar.RealReceiver`. For the same
+            ``snr_db``, which is per sample, the SNR of range bins is 3 dB lower.
+        adc_bits: bits of the I and Q converters, see :class:`tensorsim.radar.Converter`; None does not quantise.
+        adc_headroom_db: full scale of the converters relative to the rms magnitude of their input over the clip, in
+            dB; 0 dB is a full-scale wave, smaller values saturate more.
 
     Raises:
         TensorsimError: numbers that are not finite, bits out of range.
@@ -58,7 +58,7 @@ class ReceiverConfig:
 
     @classmethod
     def typical(cls) -> "ReceiverConfig":
-        """An integrated 77 GHz radar: its oscillator, converters of 12 bits, and what is left after calibration."""
+        """An integrated 77 GHz radar: its oscillator, 12-bit converters, and typical residuals after calibration."""
         return cls(
             phase_noise_dbc_hz=-93.0,
             iq_imbalance_db=0.3,
@@ -111,8 +111,8 @@ class InterferenceConfig:
 
     Attributes:
         position_m: its position (x, y, z) in metres.
-        chirp_ratio: duration of its sweeps relative to that of this radar; the slopes differ, and the sweeps cross. Its
-            sweeps follow one another almost without a pause.
+        chirp_ratio: duration of its sweeps relative to that of this radar; the slopes differ, so the sweeps cross. Its
+            sweeps follow each other almost without a pause.
         power_ratio_db: its transmit power relative to that of this radar, in dB.
         delay_s: time in seconds at which its first sweep arrives.
 

@@ -1,4 +1,4 @@
-"""What the radar looks at: the radar itself, wall, floor, propagation paths, scatterers of the body, receiver."""
+"""What the radar looks at: the radar itself, wall, floor, propagation paths, body scatterers, receiver."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -29,26 +29,26 @@ class SceneConfig:
     Attributes:
         radar: the radar (panel: RADAR group).
         wall: the wall (panel: WALL group); None is free space.
-        floor: a reflecting floor; None is a floor that does not reflect.
-        multipath: paths reflected inside the wall or by it; None: on where there is a wall.
-        direct: the path straight to the scatterer and back.
+        floor: a reflecting floor; None means no floor reflection.
+        multipath: paths reflected inside the wall or by it; None: on if there is a wall (and no ``paths``).
+        direct: the direct path to the scatterer and back.
         leakage: direct signal from transmitter to receiver (panel: isolation).
         wall_echo: static specular reflection from the wall, if there is one.
         wall_paths: internal reflections in the wall, complete to first order (``"series"``) or as in the paper.
-        wall_attenuation: False lets echoes through the wall keep their power; their delay stays.
+        wall_attenuation: False removes the power loss of echoes through the wall but keeps their delay.
         incidence: ``"normal"``, ``"oblique"`` (refraction, Fresnel) or ``"airy"`` (closed slab per frequency).
         polarization: ``"te"`` or ``"tm"`` at the wall.
-        bounces: largest number of pairs of bounces inside the wall on each leg.
-        paths: names of propagation paths in place of the switches above, see :class:`tensorsim.radar.EchoSynthesizer`.
+        bounces: largest number of bounce pairs inside the wall on each leg.
+        paths: names of propagation paths, replacing the switches above, see :class:`tensorsim.radar.EchoSynthesizer`.
         body: scatterers of a person: the 14 joints of the panel, 36 points along the limbs, the 13 points of the
-            original's first version, or 59 points on torso and limbs whose power per speed matches measured walks
+            original's first version, or 59 points on torso and limbs whose power over speed matches measured walks
             (``"surface"``, :class:`tensorsim.motion.BodyScatterers`).
         sway: people sway while they stand, see :class:`tensorsim.motion.PosturalSway`.
         vital_signs: people breathe and their hearts beat, see :class:`tensorsim.motion.VitalSigns`.
         clutter: furniture and walls of a room, or None.
         interference: an interfering radar, or None.
         receiver: imperfections of the receiver.
-        snr_db: signal-to-noise ratio per IF sample in dB (panel: SNR, 50 dB); None is free of noise.
+        snr_db: signal-to-noise ratio per IF sample in dB (panel: SNR, 50 dB); None means no noise.
         noise_reference: signal power that ``snr_db`` refers to, see :class:`tensorsim.radar.ReceiverNoise`.
         noise_figure_db: noise figure of the receiver in dB for ``noise_reference="absolute"``.
         transmit_power_w: transmit power in watts for ``noise_reference="absolute"``.
@@ -116,7 +116,7 @@ class SceneConfig:
 
     @property
     def has_multipath(self) -> bool:
-        """``multipath``; where it is None, whether there is a wall (and no list of ``paths``)."""
+        """``multipath``; if it is None, whether there is a wall (and no list of ``paths``)."""
         if self.multipath is None:
             return self.wall is not None and self.paths is None
         return self.multipath

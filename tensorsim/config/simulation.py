@@ -25,10 +25,10 @@ class SimulationConfig:
         scene: radar, wall, floor, propagation paths, scatterers, noise.
         processing: signal to maps.
         tracking: detection and tracking.
-        pose: key points to joints in the world.
+        pose: keypoints to joints in the world.
         smoothing: smoothing and interpolation along time.
         classifier: name or file of the activity classifier; None is the shipped one, ``"none"`` gives no label.
-        seed: of the receiver noise, and of everything else that is random.
+        seed: for the receiver noise and everything else that is random.
 
     Example:
         >>> config = SimulationConfig.through_wall().replace(seed=3)
@@ -71,16 +71,16 @@ class SimulationConfig:
 
     @classmethod
     def paper(cls, base: "SimulationConfig | None" = None) -> "SimulationConfig":
-        """The literal formulas of the paper, wrong or ambiguous ones included.
+        """The literal formulas of the paper, including wrong or ambiguous ones.
 
-        Rectangular range window; STFT of the sum of range bins' magnitudes; only ``T1^2`` of the bounces in the wall,
-        and the propagation phase of the wall counted twice; noise relative to the total power; metres per pixel from
-        the current frame, position by increments, each frame matched alone to its nearest pose; a Kalman filter
-        without smoothing, straight lines between frames and a Savitzky-Golay filter over a quarter of a second. Bodies
-        that neither sway nor breathe, an empty room, and an ideal receiver.
+        Rectangular range window; STFT of the sum of the range bins' magnitudes; only ``T1^2`` of the bounces in the
+        wall, and the propagation phase of the wall counted twice; noise relative to the total power; metres per pixel
+        from the current frame, position by increments, each frame matched on its own to its nearest pose; a forward
+        Kalman filter, linear interpolation between frames and a Savitzky-Golay filter over a quarter of a second.
+        Bodies neither sway nor breathe, the room is empty, and the receiver is ideal.
 
         Args:
-            base: gives radar, wall, people and networks; None is the free-space scene of the panel.
+            base: provides radar, wall, people and networks; None is the free-space scene of the panel.
         """
         base = cls() if base is None else base
         return base.replace(
@@ -108,10 +108,10 @@ class SimulationConfig:
         )
 
     def replace(self, **changes: Any) -> "SimulationConfig":
-        """A copy with other values; ``section__field=value`` changes a field of a section, at any depth.
+        """A copy with some values changed; ``section__field=value`` changes a field of a section, at any depth.
 
         Raises:
-            TensorsimError: an unknown field, a field of a part that is not there, or values that are refused.
+            TensorsimError: an unknown field, a field of a part that is None, or invalid values.
 
         Example:
             >>> config = SimulationConfig().replace(scene__snr_db=20.0, scene__radar__prf_hz=4096.0)
@@ -125,7 +125,7 @@ class SimulationConfig:
 
     @classmethod
     def from_document(cls, document: dict[str, Any], where: str = "configuration") -> "SimulationConfig":
-        """The configuration of a mapping such as that of ``summary.json``.
+        """The configuration in a mapping such as the one in ``summary.json``.
 
         Raises:
             TensorsimError: unknown keys, or values that the configuration refuses.
@@ -134,15 +134,15 @@ class SimulationConfig:
         return config
 
     def to_document(self) -> dict[str, Any]:
-        """Mappings, lists, numbers and strings from which :meth:`from_document` makes the same."""
+        """Mappings, lists, numbers and strings that :meth:`from_document` turns back into the same configuration."""
         document: dict[str, Any] = to_document(self)
         return document
 
     @classmethod
     def from_yaml(cls, path: str | os.PathLike[str]) -> "SimulationConfig":
-        """The configuration of a YAML file; what it does not name keeps its default.
+        """The configuration in a YAML file; values that it omits keep their defaults.
 
-        The ``summary.json`` of a run is such a file as well: its section ``config`` is read.
+        The ``summary.json`` of a run also works: its ``config`` section is read.
 
         Raises:
             TensorsimError: no such file, not YAML, unknown keys, or values that the configuration refuses.
@@ -153,7 +153,7 @@ class SimulationConfig:
         return cls.from_document(document.get("config", document), str(path))
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
-        """Write a file from which :meth:`from_yaml` reads the same.
+        """Write a file that :meth:`from_yaml` reads back unchanged.
 
         Raises:
             TensorsimError: the disk is full, or the folder is not writable.
@@ -162,7 +162,7 @@ class SimulationConfig:
 
 
 def _replaced(config: Any, path: list[str], value: Any) -> Any:
-    """A configuration with another value at the end of a path of fields."""
+    """A copy of a configuration with the field at the end of a path of names changed."""
     known = list(config.__dataclass_fields__) if hasattr(config, "__dataclass_fields__") else []
     if path[0] not in known:
         raise TensorsimError(

@@ -19,16 +19,16 @@ class WallConfig:
     """A homogeneous slab normal to y.
 
     The default centre puts the near face of the panel's wall on the antenna plane. (The paper's centre
-    (-0.1, 0, 1.5) has the antennas inside the slab; the simulator then moves it here, with a warning.)
+    (-0.1, 0, 1.5) puts the antennas inside the slab; the simulator then moves the wall here, with a warning.)
 
     Attributes:
         center_m: centre (x, y, z) in metres.
         size_m: width (along x), thickness (along y) and height (along z) in metres.
         relative_permittivity: real part of the relative permittivity.
-        loss_tangent: imaginary over real part of the permittivity.
+        loss_tangent: ratio of the imaginary to the real part of the permittivity.
 
     Raises:
-        TensorsimError: a size or permittivity that is not physical.
+        TensorsimError: an unphysical size or permittivity.
     """
 
     center_m: Vector = (-0.1, 0.12, 1.5)
@@ -56,15 +56,15 @@ class WallConfig:
 
 @dataclass(frozen=True)
 class FloorConfig:
-    """A smooth floor, the plane z = 0, that reflects.
+    """A smooth reflecting floor, the plane z = 0.
 
     Attributes:
         relative_permittivity: of the material; the default is concrete (ITU-R P.2040-3, table 3).
         loss_tangent: of the material.
-        reflection: a constant reflection coefficient in place of Fresnel's, for a floor that was measured.
+        reflection: a constant reflection coefficient instead of Fresnel's, for a measured floor.
 
     Raises:
-        TensorsimError: numbers that are not physical.
+        TensorsimError: unphysical numbers.
     """
 
     relative_permittivity: float = 5.24

@@ -1,4 +1,4 @@
-"""Reading YAML files, and JSON files, which hold the same."""
+"""Read YAML files, and JSON files with the same content."""
 
 import json
 import os
@@ -10,10 +10,10 @@ from tensorsim.errors import TensorsimError
 
 
 def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
-    """The mapping that a YAML file holds, or a ``.json``, within the limits of :func:`load_limited_yaml`.
+    """The mapping in a YAML file, within the limits of :func:`load_limited_yaml`, or in a ``.json`` file.
 
     Raises:
-        TensorsimError: no such file, no YAML, a repeated key, or no mapping.
+        TensorsimError: no such file, not YAML or JSON, a repeated key in YAML, or not a mapping.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")

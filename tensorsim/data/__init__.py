@@ -1,4 +1,4 @@
-"""Reading of films, keypoints and motion capture; writing of films and sound; rendered people; labelled data sets."""
+"""Reading video, keypoints and motion capture; writing video and sound; rendered people; labelled data sets."""
 
 from tensorsim.data.blazepose import load_keypoints
 from tensorsim.data.clip import Clip, read_video

@@ -1,4 +1,4 @@
-"""BlazePose landmarks of a video, as MediaPipe gives them, in JSON."""
+"""BlazePose landmarks of a video, as output by MediaPipe, in JSON."""
 
 import os
 from pathlib import Path
@@ -11,29 +11,30 @@ from tensorsim.errors import TensorsimError, check_finite
 from tensorsim.files import reading
 from tensorsim.limits import check_range
 
-#: BlazePose's landmark of each of ``tensorsim.COCO_KEYPOINTS`` (https://ai.google.dev/edge/mediapipe, Pose Landmarker).
+#: BlazePose landmark for each of ``tensorsim.COCO_KEYPOINTS`` (https://ai.google.dev/edge/mediapipe, Pose Landmarker).
 COCO_OF_BLAZEPOSE = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 _LANDMARKS = 33
-#: Names under which MediaPipe's interfaces (Python, JavaScript, protocol buffers) have the landmarks of a picture.
+#: Names that MediaPipe's interfaces (Python, JavaScript, protocol buffers) use for the landmarks of an image.
 _NAMES = ("pose_landmarks", "poseLandmarks", "landmarks", "landmark")
 
 
 def load_keypoints(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Keypoints2D:
-    """Read key points of a video: COCO-17 or BlazePose-33, in one JSON file or a folder with one per frame.
+    """Read keypoints of a video: COCO-17 or BlazePose-33, in one JSON file or a folder with one per frame.
 
-    COCO is what :func:`~tensorsim.data.coco.load_coco_keypoints` reads. BlazePose is a list of frames, or an object
-    with ``frames`` and perhaps ``width`` and ``height``. A frame is what MediaPipe gives of a picture: 33 landmarks, a
-    list of these per person, an object that has them as ``pose_landmarks``, ``poseLandmarks``, ``landmarks`` or
-    ``landmark``, or null or nothing where nobody is. A landmark has ``x`` and ``y``, 0 to 1 over the picture, and
+    For COCO see :func:`~tensorsim.data.coco.load_coco_keypoints`. BlazePose is a list of frames, or an object with
+    ``frames`` and optionally ``width`` and ``height``. A frame is MediaPipe's output for an image: 33 landmarks, a
+    list of these per person, an object that holds them as ``pose_landmarks``, ``poseLandmarks``, ``landmarks`` or
+    ``landmark``, or null or empty if nobody is there. A landmark has ``x`` and ``y``, 0 to 1 across the image, and
     ``visibility``.
-    People are told apart by where they were last seen, as those of COCO. 17 of the 33 landmarks are those of COCO.
+    People are matched between frames by where they were last seen, as in COCO files without ``track_id``. Of the 33
+    landmarks, only the 17 of COCO are used.
 
     Args:
         path: the file or folder.
-        size: (height, width) of the pictures in pixels; None where a file says it.
+        size: (height, width) of the images in pixels; None if a file states it.
 
     Raises:
-        TensorsimError: files that are missing or neither of the two, nobody in them, landmarks without a size.
+        TensorsimError: missing files, files in neither format or without people, or landmarks without an image size.
     """
     path = Path(path)
     contents = json_files(path)
@@ -51,7 +52,7 @@ def load_keypoints(path: str | os.PathLike[str], size: tuple[int, int] | None = 
 
 
 def _in_pixels(frames: list[list[Any]], size: tuple[int, int], path: Path) -> Keypoints2D:
-    """Landmarks of the people of each frame as COCO key points in pictures of (height, width) pixels."""
+    """Landmarks of the people in each frame as COCO keypoints in images of (height, width) pixels."""
     count = max(len(people) for people in frames)
     check_range(count, "people in a frame", str(path))
     data, valid = torch.zeros(len(frames), count, 17, 3), torch.zeros(len(frames), count, dtype=torch.bool)
@@ -65,7 +66,7 @@ def _in_pixels(frames: list[list[Any]], size: tuple[int, int], path: Path) -> Ke
             data[t, p] = torch.tensor([[one["x"], one["y"], one.get("visibility", 1.0)] for one in chosen])
             valid[t, p] = True
     check_finite(data, str(path))
-    # 0 and 1 are the borders of a picture; the centres of its pixels are at whole numbers.
+    # 0 and 1 are the borders of an image; the centres of its pixels are at integers.
     pixels = data[..., :2] * torch.tensor([size[1], size[0]]) - 0.5
     scores = data[..., 2:].clamp(0.0, 1.0)
     data, valid = told_apart(torch.cat([pixels, scores], dim=-1), valid, path)
@@ -75,7 +76,7 @@ def _in_pixels(frames: list[list[Any]], size: tuple[int, int], path: Path) -> Ke
 def _frames(
     contents: list[tuple[Path, Any]], one_each: bool
 ) -> tuple[list[Any] | None, tuple[int, int] | None]:
-    """Frames of BlazePose landmarks, None where there are none; and (height, width) where a file says it."""
+    """Frames of BlazePose landmarks, or None if there are none, and (height, width) if a file states it."""
     frames, size = [content for _, content in contents], None
     if not one_each:
         whole = frames[0]
@@ -92,7 +93,7 @@ def _is_landmark(content: Any) -> bool:
 
 
 def _is_blazepose(frame: Any) -> bool:
-    """Whether landmarks are in what a file has of a picture."""
+    """Whether a file's entry for an image contains landmarks."""
     if isinstance(frame, dict):
         return any(_is_blazepose(frame[name]) for name in _NAMES if name in frame)
     if not isinstance(frame, list):
@@ -101,7 +102,7 @@ def _is_blazepose(frame: Any) -> bool:
 
 
 def _people(frame: Any) -> list[Any]:
-    """The landmarks of every person of a picture."""
+    """The landmarks of every person in an image."""
     if isinstance(frame, dict):
         named = [frame[name] for name in _NAMES if name in frame]
         return _people(named[0]) if named else []

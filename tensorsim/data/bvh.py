@@ -12,10 +12,10 @@ from tensorsim.files import reading
 
 
 def read_bvh(path: Path, fps: float | None, unit_m: float | None) -> Motion:
-    """The motion of a BVH file; arguments as in :func:`tensorsim.data.motion_files.load_motion`.
+    """The motion in a BVH file; arguments as in :func:`tensorsim.data.motion_files.load_motion`.
 
     Raises:
-        TensorsimError: a file that is not BVH, unknown joints.
+        TensorsimError: not a BVH file, or unknown joints.
     """
     try:
         import pybvh
@@ -24,7 +24,7 @@ def read_bvh(path: Path, fps: float | None, unit_m: float | None) -> Motion:
     with reading(path, "BVH"):
         clip = pybvh.read_bvh_file(path)
         nodes = torch.from_numpy(np.ascontiguousarray(clip.node_positions(), dtype=np.float64))
-        # For example "+y". The frame stays right-handed, and people of y-up files face the radar.
+        # For example "+y". The frame stays right-handed, and people in y-up files face the radar.
         vertical = str(clip.world_up)
         head = next((n for n in clip.joint_names if plain_name(n) == "head"), None)
         end = None if head is None else clip.joint_tips.get(head)
@@ -36,7 +36,7 @@ def read_bvh(path: Path, fps: float | None, unit_m: float | None) -> Motion:
 
 
 def _upright(points: Tensor, vertical: str) -> Tensor:
-    """Points of a right-handed frame with this vertical ("+y", "z", ...) turned to z up."""
+    """Rotate points of a right-handed frame with this vertical axis ("+y", "z", ...) to z up."""
     axis = "xyz".index(vertical[-1].lower())
     sign = -1.0 if vertical[0] == "-" else 1.0
     order = {0: (2, 1, 0), 1: (0, 2, 1), 2: (0, 1, 2)}[axis]

@@ -1,4 +1,4 @@
-"""A short film as one tensor."""
+"""A short video as one tensor."""
 
 import os
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from tensorsim.data.video import VideoReader
 
 
 class Clip(NamedTuple):
-    """A film in memory, as :class:`tensorsim.VideoToDoppler` takes it.
+    """A video in memory, in the form that :class:`tensorsim.VideoToDoppler` takes.
 
     Attributes:
         video: (1, T, 3, H, W) uint8 RGB.
@@ -29,11 +29,11 @@ def read_video(
     end_s: float | None = None,
     stride: int = 1,
 ) -> Clip:
-    """Read a film, or a part of it, into memory: 0.9 MB per frame of 640x480 pixels.
+    """Read a video, or part of it, into memory: 0.9 MB per frame of 640x480 pixels.
 
-    ``tensorsim simulate`` and :class:`VideoReader` read films of any length in pieces. Of a film whose frames are at
-    uneven times, the frames nearest to even times are taken, so that it has its true duration; ``simulate`` is more
-    accurate there, since it interpolates between frames.
+    ``tensorsim simulate`` and :class:`VideoReader` read videos of any length in pieces. If the frames are unevenly
+    spaced, those nearest to evenly spaced times are taken, so that the duration is right; ``simulate`` is more
+    accurate then, since it interpolates between frames.
 
     Args:
         path, fps, start_s, end_s, stride: see :class:`VideoReader`.

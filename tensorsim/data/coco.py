@@ -17,9 +17,9 @@ from tensorsim.files import reading
 from tensorsim.limits import check_range
 from tensorsim.vision.tracking.assignment import assign
 
-#: Whoever is more than this many body sizes from where everybody was last is somebody new.
+#: A person more than this many body sizes from everybody's last position counts as new.
 _NEW = 2.0
-#: Image ids that span more frames than this, almost an hour at 30 per second, do not number those of a film.
+#: Image ids that span more frames than this, almost an hour at 30 per second, are not taken as frame numbers.
 _LONGEST = 100_000
 
 
@@ -30,7 +30,7 @@ class Keypoints2D(NamedTuple):
         keypoints: (T, P, 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
         scores: (T, P, 17); 0 where a keypoint is not labelled.
         valid: (T, P) bool, whether the person is in the frame.
-        size: (height, width) of the frames in pixels; None where the file does not say.
+        size: (height, width) of the frames in pixels; None if the file does not state it.
     """
 
     keypoints: Tensor
@@ -42,19 +42,21 @@ class Keypoints2D(NamedTuple):
 def load_coco_keypoints(path: str | os.PathLike[str]) -> Keypoints2D:
     """Read COCO keypoints of a video: annotations or results in one JSON file, or a folder with one file per frame.
 
-    Frames are in ascending order of their image ids, or of the names of the files in a folder; names go by the numbers
-    in them, ``2.jpg`` before ``10.jpg``. Results do not list images in which nobody was found: numbers that are left
-    out between others are such frames. That holds for three or more ids that are numbers, or names that differ in their
-    last number alone, if half of the steps between them or more are at most three frames, a frame being the largest
-    step of which all are multiples, and if they span 100 000 frames at most; else they are pictures with numbers that
-    count nothing, and frames are those that are listed. People are told apart by ``track_id`` where there is one (null
-    is none), else by where they were last seen, in the order in which they come; whoever is more than two body sizes
-    from there is somebody new. ``keypoints`` are 51 numbers: x, y, and visibility (0, 1 or 2) or score (0 to 1) of
-    each; scores a little above 1 count as 1.
+    Frames are in ascending order of their image ids, or of the file names in a folder; names sort by the numbers in
+    them, ``2.jpg`` before ``10.jpg``.
+
+    Results do not list images in which nobody was found, so gaps in the numbering count as such frames. This applies
+    to three or more ids that are numbers, or names that differ only in their last number, if at least half of the
+    steps between them are at most three frames (one frame being the largest step that divides all steps) and if they
+    span at most 100 000 frames. Otherwise the numbers are not taken as frame numbers, and only listed frames count.
+
+    People are identified by ``track_id`` if there is one (null is none), else by where they were last seen, in order
+    of appearance; a person more than two body sizes from there counts as new. ``keypoints`` are 51 numbers: x, y, and
+    visibility (0, 1 or 2) or score (0 to 1) of each; scores slightly above 1 count as 1.
 
     Raises:
-        TensorsimError: files that are missing or not such JSON, no people, another number of keypoints, scores
-            above 2, a ``track_id`` for some people only, or one twice in a frame.
+        TensorsimError: files that are missing or not such JSON, no people, the wrong number of keypoints, scores
+            above 2, a ``track_id`` for only some people, or the same one twice in a frame.
     """
     path = Path(path)
     return coco_of(path, json_files(path))
@@ -64,7 +66,7 @@ def json_files(path: Path) -> list[tuple[Path, Any]]:
     """The JSON of a file, or of all files of a folder in the order of the numbers in their names, each with its path.
 
     Raises:
-        TensorsimError: no such file, or one that is no JSON.
+        TensorsimError: no such file, or one that is not JSON.
     """
     if not path.exists():
         raise TensorsimError(f"{path}: no such file, expected keypoints (.json)")
@@ -78,10 +80,10 @@ def json_files(path: Path) -> list[tuple[Path, Any]]:
 
 
 def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
-    """:func:`load_coco_keypoints` of files that were read already.
+    """:func:`load_coco_keypoints` for files that were already read.
 
     Args:
-        path: of the file or folder.
+        path: path of the file or folder.
         contents: see :func:`json_files`.
     """
     people: dict[Any, list[dict[str, Any]]] = {}
@@ -144,10 +146,10 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
 
 
 def told_apart(data: Tensor, valid: Tensor, path: Path) -> tuple[Tensor, Tensor]:
-    """People (T, P, 17, 3), the first ones of each frame ``valid`` (T, P), each in the place of the nearest before.
+    """Reorder people (T, P, 17, 3) so that each keeps one index over time, by nearest last position.
 
-    Whoever is far from everybody before gets a place of their own. Places are in the order in which people come, those
-    of one frame as they are listed.
+    In each frame the first entries are people, as ``valid`` (T, P) tells. A person far from everybody seen before gets
+    a new index. Indices are in order of appearance, within a frame in the order listed.
 
     Raises:
         TensorsimError: more people than a file may have; ``path`` is that of the file.
@@ -160,7 +162,7 @@ def told_apart(data: Tensor, valid: Tensor, path: Path) -> tuple[Tensor, Tensor]
         place[new] = torch.arange(len(last), len(last) + int(new.sum()))
         last = torch.cat([last, people[new]])
         check_range(len(last), "people", str(path))
-        # Key points that are hidden stay where they were: of a foot alone nobody could tell the size of the body.
+        # Hidden keypoints stay where they were: from a foot alone the size of the body cannot be told.
         last[place] = torch.where(people[..., 2:] > 0, people, last[place])
         places[t] = place
     ordered = data.new_zeros(len(data), len(last), 17, 3)
@@ -171,17 +173,17 @@ def told_apart(data: Tensor, valid: Tensor, path: Path) -> tuple[Tensor, Tensor]
 
 
 def _apart(people: Tensor, others: Tensor) -> Tensor:
-    """Mean distances (n, m) of the key points (..., 17, 3) that both have, in sizes of the larger one."""
+    """Mean distances (n, m) between the keypoints (..., 17, 3) that both have, in units of the larger body's size."""
     here, other = people[:, None, :, :2].double(), others[None, :, :, :2].double()
     both = (people[:, None, :, 2] > 0) & (others[None, :, :, 2] > 0)
     size = torch.maximum(_size(people)[:, None], _size(others)[None])
     apart = ((here - other).norm(dim=-1) * both).sum(dim=-1) / both.sum(dim=-1).clamp(min=1) / size
-    # Nothing says that people without a key point in common are others.
+    # Without a common keypoint there is no evidence that they are different people.
     return torch.where(both.any(dim=-1), apart, 0.99 * _NEW)
 
 
 def _size(people: Tensor) -> Tensor:
-    """Width or height (n,) of key points (n, 17, 3), whichever is larger, at least a pixel."""
+    """Width or height (n,) of the keypoints (n, 17, 3), whichever is larger, at least one pixel."""
     seen, place = people[..., 2:] > 0, people[..., :2].double()
     high, low = (
         torch.where(seen, place, -math.inf).amax(dim=1),
@@ -191,7 +193,7 @@ def _size(people: Tensor) -> Tensor:
 
 
 def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:
-    """The image ids of results in order, with None for frames without anybody where ids number the frames."""
+    """The image ids of results in order; if ids number the frames, None stands for frames without anybody."""
     ids = sorted(people, key=_by_number)
     parts = [re.split(r"(\d+)", str(id_)) for id_ in ids]
     if len(ids) < 3 or any(len(name) < 3 or _but_number(name) != _but_number(parts[0]) for name in parts):
@@ -208,12 +210,12 @@ def _numbered(people: dict[Any, list[dict[str, Any]]]) -> list[Any]:
 
 
 def _but_number(name: list[str]) -> list[str]:
-    """What is before and after the last number of a name, which is split at its numbers."""
+    """A name, split at its numbers, without its last number."""
     return [*name[:-2], name[-1]]
 
 
 def _by_number(name: Any) -> Any:
-    """What names are sorted by so that ``2.jpg`` comes before ``10.jpg``; numbers by themselves."""
+    """Sort key that puts ``2.jpg`` before ``10.jpg``; numbers sort by value."""
     if not isinstance(name, str):
         return name
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]

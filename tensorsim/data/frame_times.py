@@ -1,26 +1,26 @@
-"""Times of the frames of a film: whether they are even, how often they come, and which is nearest to each even time."""
+"""Frame times of a video: whether they are evenly spaced, their rate, and the nearest frame to each even time."""
 
 import torch
 from torch import Tensor
 
 from tensorsim.vision.smoothing.even_time import even_count
 
-#: Frames whose times differ from even ones by more than this many seconds and this many frames are at uneven times.
+#: Frames are unevenly spaced if they are more than this many seconds and this many frames off an even grid.
 _UNEVEN_S, _UNEVEN_FRAMES = 0.05, 1.5
 
 
 class FilmClock:
-    """Times of the frames of a film as they are read one after the other.
+    """Times of the frames of a video, read one after the other.
 
-    A frame is where the file has it, counted from the first one; at ``k / fps`` where that is within a quarter of a
-    frame (files round times), and in files whose times do not increase.
+    A frame has its time in the file, relative to the first frame, or ``k / fps`` if that is within a quarter of a
+    frame (files round times), and from where the file's times stop increasing.
 
     Args:
-        fps: frames per second that the file announces.
-        own_times: whether the file's times count; otherwise frames are evenly spaced.
+        fps: frames per second stated by the file.
+        own_times: whether to use the file's times; otherwise frames are evenly spaced.
 
     Attributes:
-        last_s: time of the last frame that was asked for.
+        last_s: time of the last frame queried.
 
     Example:
         >>> clock = FilmClock(10.0)
@@ -34,7 +34,7 @@ class FilmClock:
         self._first_own_s, self._last_own_s = 0.0, 0.0
 
     def time_s(self, index: int, own_s: float) -> float:
-        """Seconds from the start of the film of frame ``index``, the next one, to which the file gives ``own_s``."""
+        """Time in seconds from the start for the next frame, number ``index``, whose time in the file is ``own_s``."""
         if index == 0:
             self._first_own_s = own_s
         elif own_s <= self._last_own_s:
@@ -47,9 +47,9 @@ class FilmClock:
 
 
 def unevenness_s(times_s: Tensor, fps: float) -> float:
-    """How far the times (T,) of frames are from ``fps`` frames per second at most, in seconds; 0 where that is little.
+    """Largest deviation in seconds of frame times (T,) from ``fps`` frames per second; 0 if it is small.
 
-    Also 0 for times that do not increase, as of files without times.
+    Also 0 for times that do not increase, as in files without times.
     """
     if times_s.numel() < 3 or not bool((times_s.diff() > 0).all()):
         return 0.0
@@ -59,7 +59,7 @@ def unevenness_s(times_s: Tensor, fps: float) -> float:
 
 
 def usual_fps(times_s: Tensor) -> float:
-    """Frames per second of increasing times (T,), where pauses do not count.
+    """Frames per second of increasing times (T,), ignoring pauses.
 
     >>> usual_fps(torch.tensor([0.0, 0.5, 1.0, 30.0, 30.5]))
     2.0

@@ -1,8 +1,8 @@
-"""Human3.6M as VideoPose3D publishes it: a pickle inside an npz.
+"""Human3.6M as published by VideoPose3D: a pickle inside an npz.
 
 A pickle is a program, and one that builds NumPy objects from raw bytes can read and write any address of the process.
-Here a pickle can refer to five names only. Each is a class of this file that stores its arguments; the arrays are built
-afterwards, from numbers of plain types.
+Here a pickle can refer to only five names. Each is replaced by a class of this file that stores its arguments; the
+arrays are built afterwards, from plain numeric types.
 """
 
 import io
@@ -19,14 +19,14 @@ from tensorsim.data.skeletons import Motion, motion_of
 from tensorsim.errors import TensorsimError
 from tensorsim.files import check_pickle_memo
 
-#: Those of the 32 joints of Human3.6M that the body needs, by index.
+#: The joints that the body needs, by index among the 32 joints of Human3.6M.
 H36M_JOINTS = {
     14: "nose", 25: "right_shoulder", 26: "right_elbow", 27: "right_wrist", 17: "left_shoulder", 18: "left_elbow",
     19: "left_wrist", 1: "right_hip", 2: "right_knee", 3: "right_ankle", 6: "left_hip", 7: "left_knee", 8: "left_ankle",
 }  # fmt: skip
 H36M_FPS = 50.0
 
-#: Types of arrays that are read: no objects, structures or text.
+#: Array types that are read: no objects, structures or text.
 _NUMBERS = ("f2", "f4", "f8")
 
 
@@ -38,7 +38,7 @@ class _Dtype:
         self.order = "|"
 
     def __setstate__(self, state: Any) -> None:
-        # (version, byte order, subarray, names, fields, ...): the last three are there for structured types.
+        # (version, byte order, subarray, names, fields, ...): the last three are for structured types.
         self.order = state[1]
         if any(part is not None for part in state[2:5]):
             self.code = "a structure"
@@ -62,7 +62,7 @@ class _Array:
         return item
 
     def numbers(self) -> np.ndarray:
-        """The array; refused unless it has plain numbers, and as many bytes as its shape needs."""
+        """The array; refused unless it holds plain numbers, and as many bytes as its shape needs."""
         _, shape, dtype, columns_first, content = self.state
         if dtype.code not in _NUMBERS or dtype.order not in ("<", ">", "="):
             raise pickle.UnpicklingError(f"an array of {dtype.code!r}, expected one of {', '.join(_NUMBERS)}")
@@ -74,7 +74,7 @@ class _Array:
 
 
 class _Encoded:
-    """``_codecs.encode(text, "latin1")``, by which older protocols write bytes."""
+    """``_codecs.encode(text, "latin1")``, which older pickle protocols use to write bytes."""
 
     def __new__(cls, text: str, _: str) -> Any:
         """The bytes themselves."""
@@ -122,7 +122,7 @@ def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) ->
     """The clip ``key`` ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
 
     Raises:
-        TensorsimError: a pickle that holds anything but dictionaries of arrays, no such clip.
+        TensorsimError: a pickle that holds anything but dictionaries of arrays, or no such clip.
     """
     clips = clips_of_h36m(path, arrays)
     if key is None and len(clips) == 1:

@@ -1,4 +1,4 @@
-"""Reading of motion capture files: npz, BVH, Human3.6M as VideoPose3D publishes it, AMASS.
+"""Read motion capture files: npz, BVH, Human3.6M as published by VideoPose3D, AMASS.
 
 Positions are converted to metres in the world frame (x right, y away, z up).
 """
@@ -17,12 +17,12 @@ from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError, check_positive, check_tensor
 from tensorsim.limits import check_range
 
-#: Height of the ankles of somebody who stands, above the floor.
+#: Height of a standing person's ankles above the floor.
 ANKLE_HEIGHT_M = 0.07
 
 
 def motion_keys(path: str | os.PathLike[str]) -> list[str | None]:
-    """The ``key`` of each motion of a file for :func:`load_motion`; [None] where there is nothing to choose.
+    """The ``key`` for :func:`load_motion` of each motion in a file; [None] if there is nothing to choose.
 
     Raises:
         TensorsimError: an npz that cannot be read.
@@ -38,10 +38,10 @@ def motion_keys(path: str | os.PathLike[str]) -> list[str | None]:
 
 
 def h36m_keys(path: str | os.PathLike[str]) -> list[str]:
-    """The clips ("S1/Walking") of VideoPose3D's ``data_3d_h36m.npz``.
+    """The clips ("S1/Walking") in VideoPose3D's ``data_3d_h36m.npz``.
 
     Raises:
-        TensorsimError: no such file, or another one.
+        TensorsimError: no such file, or a different one.
     """
     path = Path(path)
     if not path.is_file():
@@ -59,12 +59,12 @@ def load_motion(
     joint_names: tuple[str, ...] | None = None,
     unit_m: float | None = None,
 ) -> Motion:
-    """Read a motion capture file. Its suffix and, for npz, its arrays tell the format.
+    """Read a motion capture file. The format follows from its suffix and, for npz, its arrays.
 
-    - ``.bvh``: joints with the names of CMU, Mixamo, Biped or Biovision; the reader finds the vertical axis.
+    - ``.bvh``: joints named as in CMU, Mixamo, Biped or Biovision; the reader finds the vertical axis.
     - ``.npz`` with ``joints_m``, or any array (T, J, 3) or (P, T, J, 3) in world axes, and ``fps``. Names of the
       joints, as ``joint_names`` in the file or as argument, are needed unless J is 14 (``tensorsim.JOINTS``), 17 (COCO)
-      or 22, 24, 52 or more (SMPL). ``valid`` (P, T) is read if it is there.
+      or 22, 24, 52 or more (SMPL). ``valid`` (P, T) is read if present.
     - ``.npz`` with ``joints`` or ``Jtr`` and ``mocap_framerate``: AMASS, SMPL joints, z up.
     - ``.npz`` with ``positions_3d``: VideoPose3D's Human3.6M, 32 joints. Its pickle may hold dictionaries, strings
       and arrays; anything else in it is refused and not run.
@@ -72,10 +72,10 @@ def load_motion(
     Args:
         path: the file.
         key: the array in an npz, or subject and action as in ``"S1/Walking"``; not needed where there is only one.
-        fps: frames per second, in place of what the file states; needed where it states none.
+        fps: frames per second, overriding the file's; needed if the file states none.
         joint_names: names of the joints in the file, in order.
-        unit_m: length of the file's unit in metres. None: for BVH the unit that gives a body nearest to the size of an
-            adult, for npz the metre.
+        unit_m: length of the file's unit in metres. None: for BVH the unit that makes the body closest to adult size,
+            for npz the metre.
 
     Raises:
         TensorsimError: a file that is missing or cannot be read, unknown joints, no frame rate, NaN.
@@ -101,16 +101,16 @@ def place(motion: Motion, range_m: float | None = None, heading_rad: float = 0.0
     """Put a motion on the floor, turn it and move its start.
 
     Args:
-        motion: one or more people; their relative places stay.
-        range_m: y of the first person's hips in its first valid frame; None keeps x and y where they are.
-        heading_rad: turn about the vertical through these hips, counter-clockwise seen from above.
+        motion: one or more people; their relative positions are kept.
+        range_m: y of the first person's hips in its first valid frame; None keeps x and y as they are.
+        heading_rad: rotation about the vertical through these hips, counter-clockwise seen from above.
         x_m: x of these hips, used with ``range_m``.
 
     Returns:
         The motion with its lowest joint at ankle height over z = 0; joints of absent people are zeros.
 
     Raises:
-        TensorsimError: a first person without a valid frame; joints or a place that are not finite.
+        TensorsimError: the first person has no valid frame, or joints or the position are not finite.
     """
     joints = motion.joints
     check_tensor(joints, "motion", "(P, T, 14, 3)")

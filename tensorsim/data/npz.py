@@ -28,7 +28,7 @@ MAX_BYTES = 10**9
 
 
 class Arrays:
-    """The arrays of an npz. Types and sizes are checked before data is read, and pickles are never run."""
+    """The arrays in an npz file. Types and sizes are checked before data is read, and pickles are never run."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
@@ -50,7 +50,7 @@ class Arrays:
             return np.lib.format.read_array(file, allow_pickle=False)
 
     def pickled(self, name: str) -> bytes:
-        """The pickle in which NumPy stores an array of objects."""
+        """The pickle that NumPy stores for an array of objects."""
         with self._archive.open(f"{name}.npy") as file:
             _, _, dtype = _header(file)
             if not dtype.hasobject:
@@ -71,7 +71,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 @contextmanager
 def open_npz(path: Path) -> Iterator[Arrays]:
-    """The arrays of an npz; errors name the file."""
+    """The arrays in an npz file; errors name the file."""
     with reading(path, "npz"):
         if not zipfile.is_zipfile(path):
             raise ValueError("it is no archive of arrays")
@@ -80,13 +80,13 @@ def open_npz(path: Path) -> Iterator[Arrays]:
 
 
 def motions_in(arrays: Arrays) -> list[str]:
-    """Names of the arrays (T, J, 3) and (P, T, J, 3)."""
+    """Names of the arrays of shape (T, J, 3) or (P, T, J, 3)."""
     shapes = {name: arrays.shape(name) for name in arrays.files}
     return [name for name, shape in shapes.items() if len(shape) in (3, 4) and shape[-1] == 3]
 
 
 def preferred(motions: list[str]) -> str | None:
-    """The array with a usual name, where there are several; None if none has one."""
+    """Of several arrays, the one with a usual name; None if there is none."""
     return next((name for name in ("joints_m", "joints", "Jtr") if name in motions), None)
 
 
@@ -94,7 +94,7 @@ def read_npz(
     path: Path, arrays: Arrays, key: str | None, fps: float | None, names: tuple[str, ...] | None,
     unit_m: float | None,
 ) -> Motion:  # fmt: skip
-    """The motion of opened ``arrays``; arguments as in :func:`tensorsim.data.motion_files.load_motion`.
+    """The motion in opened ``arrays``; arguments as in :func:`tensorsim.data.motion_files.load_motion`.
 
     Raises:
         TensorsimError: no such array, joints without names, no frame rate.
@@ -110,7 +110,7 @@ def read_npz(
         raise TensorsimError(f"{path}: got {got}, expected one of {', '.join(candidates)} (--clip)")
     for name in (f"{key}_fps", "fps", "mocap_framerate", "mocap_frame_rate"):
         if fps is None and name in arrays.files:
-            fps = float(arrays[name].item())  # also of one element, as MATLAB has them
+            fps = float(arrays[name].item())  # also from a one-element array, as written by MATLAB
     positions = torch.from_numpy(arrays[key].astype(np.float64))
     count = positions.shape[-2]
     if names is None and "joint_names" in arrays.files:

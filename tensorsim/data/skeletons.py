@@ -1,6 +1,6 @@
-"""Skeletons of capture files as the 14 joints of ``tensorsim.JOINTS``.
+"""Map skeletons from capture files to the 14 joints of ``tensorsim.JOINTS``.
 
-File formats differ in their joints and in how they name them; joints are found by their names.
+File formats differ in their joints and joint names; joints are found by name.
 """
 
 import math
@@ -48,12 +48,12 @@ class Motion(NamedTuple):
 def body_joints(positions: Tensor, names: tuple[str, ...], top: Tensor | None = None) -> Tensor:
     """The 14 joints from a skeleton with named joints.
 
-    The neck is the middle of the shoulders. Where there is no nose, it is placed in front of the head joint: half way
-    to the top of the head and as far forward, or by the size of a typical head where ``top`` is not known.
+    The neck is the midpoint of the shoulders. A missing nose is placed in front of the head joint: half way up to the
+    top of the head and as far forward, or by the size of a typical head if ``top`` is unknown.
 
     Args:
         positions: (..., J, 3) world metres.
-        names: J names, with "right", "r", "left" or "l" before or after, in upper or lower case, with any prefix.
+        names: J names, with "right", "r", "left" or "l" before or after, in any case, with any prefix.
         top: (..., 3) top of the head.
     """
     index = {plain_name(name): i for i, name in reversed(list(enumerate(names)))}
@@ -95,7 +95,7 @@ def body_joints(positions: Tensor, names: tuple[str, ...], top: Tensor | None = 
 
 
 def plain_name(name: str) -> str:
-    """A joint's name without prefix and punctuation in lower case: "mixamorig:RightArm" -> "rightarm"."""
+    """A joint's name in lower case without prefix and punctuation: "mixamorig:RightArm" -> "rightarm"."""
     name = re.sub(
         r"^(bip\d*|valvebiped|mixamorig\d*|character\d*)[\s_:.]+", "", name.strip(), flags=re.IGNORECASE
     )
@@ -106,20 +106,20 @@ def motion_of(
     path: Path, positions: Tensor, names: tuple[str, ...], fps: float | None, valid: Tensor | None = None,
     top: Tensor | None = None, unit_m: float | None = 1.0,
 ) -> Motion:  # fmt: skip
-    """The motion in a file, checked.
+    """Build and check the motion read from a file.
 
     Args:
         path: the file, for messages.
         positions: (..., T, J, 3) in the world.
-        names: of the J joints.
+        names: names of the J joints.
         fps: frames per second.
-        valid: (P, T) bool; None: everybody is there in all frames.
+        valid: (P, T) bool; None: everybody is present in all frames.
         top: (..., T, 3) top of the head.
-        unit_m: of positions and top in metres; None: the usual unit that gives a body nearest to the size of an adult.
+        unit_m: unit of positions and top in metres; None: the common unit that makes the body closest to adult size.
 
     Raises:
-        TensorsimError: no frame rate, no frames, NaN, joints that are missing, ``valid`` of another shape, bodies that
-            are too small or too large for people.
+        TensorsimError: no frame rate, no frames, NaN, missing joints, ``valid`` of another shape, or bodies that are
+            too small or too large for people.
     """
     if fps is None:
         raise TensorsimError(f"{path}: got no frame rate in the file, expected one as fps")
@@ -150,13 +150,13 @@ def motion_of(
 
 
 def _likely_unit_m(joints: Tensor) -> float:
-    """The unit in which bodies (..., T, 14, 3) are nearest to the size of an adult."""
+    """The unit that makes bodies (..., T, 14, 3) closest to adult size."""
     tall = float(body_height(joints).median())
     return min(_UNITS_M, key=lambda unit: abs(math.log(max(tall * unit, 1e-9) / _TYPICAL_HEIGHT_M)))
 
 
 def _check_height(height_m: float, path: Path) -> None:
-    """Refuse a body that is too small or too large for a person; most often the unit is another one."""
+    """Refuse a body too small or too large for a person, which usually means a wrong unit."""
     low, high, _ = RANGES["body height"]
     if not low <= height_m <= high:
         raise TensorsimError(

@@ -15,7 +15,7 @@ from tensorsim.files import complete_file
 from tensorsim.radar.processing.doppler import coherent_sum
 from tensorsim.radar.simulator import RadarSimulator
 
-#: Highest Doppler frequencies that are played unchanged; others are scaled to ``_TOP_HZ``.
+#: Range of the highest Doppler frequency for which sound is unscaled; otherwise it is scaled to ``_TOP_HZ``.
 _UNCHANGED_HZ = (1000.0, 8000.0)
 _TOP_HZ = 4000.0
 #: Window of the time stretching in seconds: shorter than a step, about as long as a kick.
@@ -28,7 +28,7 @@ class Sound(NamedTuple):
     Attributes:
         waveform: (2, n) float32 in [-1, 1]: approaching, receding.
         rate_hz: samples per second.
-        scale: ratio of the frequency in the sound to the Doppler frequency.
+        scale: ratio of sound frequency to Doppler frequency.
     """
 
     waveform: Tensor
@@ -39,7 +39,7 @@ class Sound(NamedTuple):
 def slow_time_signal(
     simulator: RadarSimulator, source: Callable[[int, int], tuple[Tensor, Tensor]], pulses: int
 ) -> Tensor:
-    """The echo of a scene as one complex number per pulse, after moving target indication, free of noise.
+    """The echo of a scene as one complex number per pulse, after moving target indication, without noise.
 
     Args:
         simulator: computes the range profiles, which are summed coherently over range.
@@ -60,23 +60,23 @@ def slow_time_signal(
         positions, rcs = source(start, min(start + simulator.recorder.pulse_chunk, pulses))
         rcs = rcs.expand(positions.shape[:-1])
         profiles = simulator.recorder.engine(positions[None], rcs[None], start)[0]
-        parts.append(coherent_sum(profiles[..., :bins], samples)[0])  # of an array, its first channel
-    # The indicator is linear along the pulses and the same in each range bin, so it may follow the sum over range.
+        parts.append(coherent_sum(profiles[..., :bins], samples)[0])  # for an array, the first channel
+    # The indicator is linear along the pulses and the same in all range bins, so it can follow the sum over range.
     return simulator.mti(torch.cat(parts))[:, 0].conj().resolve_conj()
 
 
 def doppler_sound(signal: Tensor, prf_hz: float, scale: float | None = None, rate_hz: int = 16_000) -> Sound:
     """Turn a slow-time signal into sound of the same duration, with every frequency multiplied by ``scale``.
 
-    Positive Doppler, motion towards the radar, is heard on the left and negative Doppler on the right. Where
+    Positive Doppler, motion towards the radar, is heard on the left and negative Doppler on the right. If
     ``scale`` is not 1, a phase vocoder stretches the signal in time and the sound is played that much faster
     (Flanagan and Golden, *Phase Vocoder*, Bell System Technical Journal 45, 1966).
 
     Args:
         signal: (M,) complex, one number per pulse, free of clutter: see :func:`slow_time_signal`.
         prf_hz: pulses per second.
-        scale: ratio of the frequency in the sound to the Doppler frequency. Default: 1 where half of the PRF is between
-            1 and 8 kHz, else such that half of the PRF becomes 4 kHz.
+        scale: ratio of sound frequency to Doppler frequency. Default: 1 if half the PRF is between 1 and 8 kHz, else
+            such that half the PRF becomes 4 kHz.
         rate_hz: samples per second of the sound.
 
     Returns:
@@ -107,10 +107,10 @@ def doppler_sound(signal: Tensor, prf_hz: float, scale: float | None = None, rat
 
 
 def _rates(ratio: float) -> tuple[int, int]:
-    """Two small whole numbers of this ratio, which it is changed to by less than 0.1 %.
+    """Two small integers whose ratio is within 0.1 % of this one.
 
-    The memory of torchaudio's filter grows with their product: the usual ratio of a PRF such as 5165.02 Hz to the rate
-    of the sound would take terabytes. A change of pitch and time by 0.1 % is not heard.
+    The memory of torchaudio's filter grows with their product: the exact ratio of a PRF such as 5165.02 Hz to the
+    sound's sample rate would take terabytes. A change of pitch and time by 0.1 % is inaudible.
     """
     below_one = min(ratio, 1 / ratio)
     nearest = Fraction(below_one).limit_denominator(math.ceil(1000 + 1 / below_one))
@@ -119,7 +119,7 @@ def _rates(ratio: float) -> tuple[int, int]:
 
 
 def _by_direction(signal: Tensor) -> Tensor:
-    """Complex (M,) to real (2, M): the parts of positive and of negative frequencies."""
+    """Complex (M,) to real (2, M): the parts with positive and with negative frequencies."""
     spectrum = torch.fft.fft(signal)
     frequency = torch.fft.fftfreq(signal.shape[0], device=signal.device)
     return torch.stack(
@@ -136,7 +136,7 @@ def _stretched(
     size = 2 ** max(4, round(math.log2(_WINDOW_S * prf_hz)))
     hop = size // 8
     window = torch.hann_window(size, dtype=channels.dtype, device=channels.device)
-    padded = torch.nn.functional.pad(channels, (size, size))  # a window fits into short signals too
+    padded = torch.nn.functional.pad(channels, (size, size))  # so that a window fits into short signals too
     spectrum = torch.stft(padded, size, hop, window=window, return_complex=True)
     advance = torch.linspace(0, math.pi * hop, size // 2 + 1, dtype=channels.dtype, device=channels.device)
     longer = phase_vocoder(spectrum, 1 / scale, advance[:, None])
@@ -164,7 +164,7 @@ def write_sound(path: str | os.PathLike[str], sound: Sound) -> None:
 
 
 def _torchaudio() -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
-    """``resample`` and ``phase_vocoder`` of torchaudio, which is imported on use."""
+    """``resample`` and ``phase_vocoder`` of torchaudio, imported only when used."""
     try:
         from torchaudio.functional import phase_vocoder, resample
     except (ImportError, OSError) as error:

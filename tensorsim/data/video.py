@@ -1,4 +1,4 @@
-"""Video files in, through OpenCV, streamed in chunks."""
+"""Read video files through OpenCV, streamed in chunks."""
 
 import math
 import os
@@ -18,13 +18,13 @@ from tensorsim.files import check_name
 from tensorsim.limits import RANGES, check_range
 from tensorsim.threads import ahead, shared
 
-#: Memory for the frames of a film that is passed over several times: enough for 12 s of 720p at 30 frames per second.
+#: Memory in MB for keeping the frames of a video that is read several times: 12 s of 720p at 30 frames per second.
 KEPT_MB = 1000.0
-#: A file that announces this many frames per second has a broken header (1000 and 90000 are clock rates).
+#: A file that states this many frames per second has a broken header (1000 and 90000 are clock rates).
 ABSURD_FPS = 1000.0
 
 _JPEG = b"\xff\xd8\xff"
-#: First bytes of films, and where they are: FFmpeg would also open playlists, which name further files and addresses.
+#: First bytes of video files and their offsets: FFmpeg would also open playlists, which refer to other files and URLs.
 _CONTAINERS = (
     *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")),  # mp4, mov, 3gp
     (8, b"AVI "),
@@ -40,37 +40,36 @@ _CONTAINERS = (
     (0, b"YUV4MPEG2 "),
     (0, b"DKIF"),  # IVF
     (0, b"\x06\x0e\x2b\x34"),  # MXF
-    (0, _JPEG),  # one picture after the other
+    (0, _JPEG),  # one image after another
 )
 
 
 class VideoReader:
-    """A film as chunks of frames; every pass over it starts anew, so it can be read several times.
+    """A video as chunks of frames; every pass starts from the beginning, so it can be read several times.
 
-    Frame k is at ``k / fps`` of the file unless the file gives it another time (see
-    :class:`~tensorsim.data.frame_times.FilmClock`); ``uneven_times_s`` says where frames really are. Frames are
-    decoded one after the other from the first, also to reach ``start_s``: seeking is not exact in every format. Frames
-    are turned upright as the file says.
+    Frame k is at ``k / fps`` unless the file gives it another time (see
+    :class:`~tensorsim.data.frame_times.FilmClock`); ``uneven_times_s`` holds the actual times. Frames are decoded in
+    order from the first, even to reach ``start_s``: seeking is not exact in every format. Frames are rotated upright
+    as stated by the file.
 
     Args:
         path: an mp4, mov, 3gp, mkv, webm, avi, gif, mpg, ts, flv, ogv, wmv, mxf, mjpeg, y4m or ivf that OpenCV decodes.
-        fps: frames per second of the film, instead of those that the file announces.
-        start_s, end_s: keep the frames from ``start_s`` on that are before ``end_s``, in seconds of the film.
+        fps: frames per second of the video, overriding the file's.
+        start_s, end_s: keep frames from ``start_s`` up to but not including ``end_s``, in seconds of the video.
         stride: keep every stride-th of them.
-        kept_mb: a film whose frames fit into this many megabytes stays in memory after the first pass, and is not
+        kept_mb: a video whose frames fit into this many megabytes stays in memory after the first pass and is not
             decoded again for passes in chunks of the same size or a divisor of it.
 
     Attributes:
-        path: of the file.
-        fps: frames per second of what is read: the film's divided by ``stride``. Those of the film are what it
-            announces or, where its frames come at other times, what they are without pauses.
-        height, width: of the frames, in pixels.
-        frame_count: frames to expect by what the file announces, None if it does not say; the film may have
-            fewer.
-        duration_s: seconds to expect, likewise.
-        uneven_times_s: (n,) float64 times in seconds of the frames that were read, known once all have been, where they
-            are not evenly spaced (a GIF with a pause, a telephone that saves power); None where they are, or where
-            ``fps`` was given.
+        path: path of the file.
+        fps: frames per second of what is read: that of the video divided by ``stride``. For the video it is the rate
+            stated by the file or, if the frames are unevenly spaced, their rate without pauses.
+        height, width: size of the frames, in pixels.
+        frame_count: expected number of frames according to the file, None if not stated; there may be fewer.
+        duration_s: expected duration in seconds, likewise.
+        uneven_times_s: (n,) float64 times in seconds of the frames read, known once all have been read, if they are
+            unevenly spaced (a GIF with a pause, a phone that saves power); None if they are even or ``fps`` was
+            given.
 
     Example:
         >>> reader = VideoReader("clip.mp4", start_s=1.0)
@@ -80,8 +79,8 @@ class VideoReader:
         torch.uint8 torch.Size([3, 3, 48, 64])
 
     Raises:
-        TensorsimError: no such file, one of another kind, a single picture, no frame that OpenCV decodes, a frame rate
-            that is neither sensible nor given, or a range without frames.
+        TensorsimError: no such file, an unsupported type, a single image, no frame that OpenCV can decode, no sensible
+            frame rate in the file and none given, or a range without frames.
     """
 
     def __init__(
@@ -113,7 +112,7 @@ class VideoReader:
             film_fps, length_s = float(file_fps if fps is None else fps), None
             if fps is None:
                 times_s = self._times_in_file(start_s)
-                # Of a film with a long pause the file announces the mean rate.
+                # For a video with a long pause the file states the mean rate.
                 if unevenness_s(times_s, film_fps) and usual_fps(times_s) < ABSURD_FPS:
                     film_fps = usual_fps(times_s)
                     length_s = float(times_s[-1] - times_s[0]) + 1 / film_fps
@@ -151,14 +150,14 @@ class VideoReader:
     def chunks(self, size: int) -> Iterator[Tensor]:
         """The frames in order, at most ``size`` at a time: (n, 3, H, W) uint8 RGB on the CPU, n >= 1, channels last.
 
-        They are decoded in a thread of their own, two chunks ahead.
+        They are decoded in a separate thread, two chunks ahead.
 
-        A film that ends before the frames that its file announces (a cut-off download) gives what is there,
-        with a TensorsimWarning. Frames at uneven times are given as they come, with a TensorsimWarning, and
-        ``uneven_times_s`` has their times afterwards; :meth:`even_chunks` gives them at even times.
+        A video with fewer frames than its file states (a truncated download) yields those that exist, with a
+        TensorsimWarning. Unevenly spaced frames are yielded as they come, with a TensorsimWarning, and their times
+        are in ``uneven_times_s`` afterwards; :meth:`even_chunks` yields them at even times.
 
         Raises:
-            TensorsimError: a size below 1, or a film whose frames change their size.
+            TensorsimError: a size below 1, or frames that change size.
         """
         if size < 1:
             raise TensorsimError(f"chunks: got a size of {size} frames, expected 1 or more")
@@ -168,9 +167,9 @@ class VideoReader:
         return ahead(self._keeping(size) if fits else self._chunks(size))
 
     def even_chunks(self, size: int) -> Iterator[Tensor]:
-        """As :meth:`chunks`; of a film whose ``uneven_times_s`` are known, the frames nearest to even times.
+        """As :meth:`chunks`, but if ``uneven_times_s`` is known, the frames nearest to evenly spaced times.
 
-        A frame that is shown for long is repeated, one that is shown briefly may be left out.
+        A frame shown for long is repeated; one shown only briefly may be left out.
         """
         if self.uneven_times_s is None:
             yield from self.chunks(size)
@@ -184,12 +183,12 @@ class VideoReader:
             done += frames.shape[0]
 
     def _keeping(self, size: int) -> Generator[Tensor, None, None]:
-        """The chunks, which are kept once the pass has come to its end."""
+        """The chunks, which are kept in memory once the pass is complete."""
         kept: list[Tensor] = []
         count = 0
         for chunk in self._chunks(size):
             count += chunk.shape[0]
-            if count > self._most_kept:  # more than the file announces
+            if count > self._most_kept:  # more than the file states
                 kept.clear()
             else:
                 kept.append(chunk)
@@ -197,9 +196,9 @@ class VideoReader:
         self._kept = kept
 
     def timed_frames(self) -> Iterator[tuple[float, Tensor]]:
-        """The frames one by one: the time of each in seconds of the film, and the frame (3, H, W) uint8 RGB.
+        """The frames one at a time: the time of each in seconds of the video, and the frame (3, H, W) uint8 RGB.
 
-        Warnings and errors are those of :meth:`chunks`, but for uneven times.
+        Warnings and errors are those of :meth:`chunks`, except for uneven times.
         """
         import cv2
 
@@ -227,7 +226,7 @@ class VideoReader:
         self._keep_times(torch.tensor(times_s, dtype=torch.float64))
 
     def _decoded(self) -> Generator[tuple[float, float, np.ndarray], None, None]:
-        """Time of each frame that is kept, the same as the file has it, in seconds, and the frame (H, W, 3) BGR."""
+        """For each kept frame: its time, its time in the file, both in seconds, and the frame (H, W, 3) BGR."""
         import cv2
 
         shape = self.height, self.width, 3
@@ -251,7 +250,7 @@ class VideoReader:
                 index += 1
         if self._announced is not None and not ended:
             expected = self._stop(self._announced)
-            # Containers count by duration and are often a frame or two off.
+            # Frame counts in containers come from the duration and are often a frame or two off.
             if expected - index > max(2, 0.02 * expected):
                 warnings.warn(
                     f"{self.path}: got {index} frames, expected {expected} as the file states: "
@@ -261,7 +260,7 @@ class VideoReader:
                 )
 
     def _keep_times(self, times_s: Tensor) -> None:
-        """Keep the times of frames that are not evenly spaced, and warn."""
+        """Store the times of unevenly spaced frames, and warn about them."""
         late_s = unevenness_s(times_s, self.fps) if self._own_times else 0.0
         self.uneven_times_s = times_s if late_s else None
         if late_s:
@@ -273,7 +272,7 @@ class VideoReader:
             )
 
     def _times_in_file(self, start_s: float) -> Tensor:
-        """Times (n,) of the frames of the cut in seconds as the file has them, ascending; nothing is decoded."""
+        """Ascending times (n,) in seconds, as in the file, of the frames to keep (stride aside), without decoding."""
         import cv2
 
         times_s: list[float] = []
@@ -281,7 +280,7 @@ class VideoReader:
             capture.set(cv2.CAP_PROP_FORMAT, -1)
             while capture.grab():
                 times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-                # Frames that are decoded later may be shown earlier, by less than a second.
+                # Frames decoded later may be shown earlier, by less than a second.
                 if times_s[-1] - times_s[0] > self._end_s + 1:
                     break
         times = torch.tensor(sorted(times_s), dtype=torch.float64)
@@ -289,13 +288,13 @@ class VideoReader:
         return times[(since >= start_s) & (since < self._end_s)]
 
     def _stop(self, announced: int) -> int:
-        """The frame after the last one of the cut, if frames are evenly spaced."""
+        """Index after the last frame to keep, if frames are evenly spaced."""
         if self._end_s == math.inf:
             return announced
         return min(announced, math.ceil(self._end_s * self._film_fps - 1e-6))
 
     def _clock(self) -> FilmClock:
-        """A new clock; it counts frames where a frame rate was given in place of the file's."""
+        """A new clock; it only counts frames if a frame rate was given in place of the file's."""
         return FilmClock(self._film_fps, self._own_times)
 
     def _is_after(self, time_s: float) -> bool:
@@ -317,7 +316,7 @@ class VideoReader:
 
 
 def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: int) -> None:
-    """Refuse arguments of a reader that are out of range."""
+    """Refuse reader arguments that are out of range."""
     if fps is not None:
         check_positive(fps, "fps")
         check_range(fps, "frame rate", "fps")
@@ -330,7 +329,7 @@ def _check_cut(fps: float | None, start_s: float, end_s: float | None, stride: i
 
 
 def _check_is_film(path: Path) -> None:
-    """Refuse a path that is not a file, and a file that does not begin like a film."""
+    """Refuse a path that is not a file, and a file that does not begin like a video."""
     check_name(path, "path")
     if not path.exists():
         raise TensorsimError(f"{path}: no such file, expected a video")
@@ -341,14 +340,14 @@ def _check_is_film(path: Path) -> None:
 
 
 def _begins_with(path: Path, marks: Iterable[tuple[int, bytes]]) -> bool:
-    """Whether some of these bytes are at their place in a file."""
+    """Whether any of these byte sequences is at its offset in a file."""
     with path.open("rb") as file:
         head = file.read(16)
     return any(head[at : at + len(kind)] == kind for at, kind in marks)
 
 
 def properties(capture: Any) -> tuple[float, int | None]:
-    """Frames per second and number of frames that a file announces (None if it does not)."""
+    """Frames per second and number of frames stated by a file (None if not stated)."""
     import cv2
 
     count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -356,7 +355,7 @@ def properties(capture: Any) -> tuple[float, int | None]:
 
 
 def _first_from(capture: Any, clock: FilmClock, start_s: float) -> tuple[int, float | None]:
-    """Decode up to the first frame from ``start_s`` on: its number and time; the number of frames and None if none is.
+    """Advance to the first frame at or after ``start_s``; returns its index and time, or the frame count and None.
 
     The frame is grabbed, not retrieved.
     """
@@ -374,7 +373,7 @@ def _first_from(capture: Any, clock: FilmClock, start_s: float) -> tuple[int, fl
 @shared
 @contextmanager
 def silent_log() -> Iterator[None]:
-    """Let OpenCV log nothing."""
+    """Silence OpenCV's log."""
     from cv2.utils import logging
 
     level = logging.getLogLevel()
@@ -388,11 +387,11 @@ def silent_log() -> Iterator[None]:
 @shared
 @contextmanager
 def opening() -> Iterator[None]:
-    """Open films without OpenCV's and FFmpeg's log on stderr, and without FFmpeg's protocols but files."""
-    # FFmpeg's level is read once, by the first film of the process.
+    """Open videos without OpenCV's and FFmpeg's log on stderr, and with FFmpeg limited to the file protocol."""
+    # FFmpeg's log level is read once, when the process opens its first video.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     options = os.environ.get("OPENCV_FFMPEG_CAPTURE_OPTIONS")
-    # Whatever a file names, FFmpeg opens local files only.
+    # Whatever a file refers to, FFmpeg opens only local files.
     os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "protocol_whitelist;file"
     try:
         with silent_log():

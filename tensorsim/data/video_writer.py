@@ -1,4 +1,4 @@
-"""Video files out, through OpenCV, frame by frame."""
+"""Write video files through OpenCV, frame by frame."""
 
 import os
 import tempfile
@@ -16,12 +16,12 @@ from tensorsim.threads import shared
 
 
 class VideoWriter:
-    """A film that is written frame by frame; the file appears when it is complete, or not at all.
+    """Writes a video frame by frame; the file appears when it is complete, or not at all.
 
     Args:
         path: ending in ``.mp4`` (MPEG-4), ``.webm`` (VP8, which browsers play) or another container that OpenCV writes
-            with MPEG-4. An odd height or width gets its last row or column twice, because the codecs halve the
-            colours.
+            with MPEG-4. For an odd height or width the last row or column is repeated, because the codecs halve the
+            colour resolution.
         fps: frames per second.
 
     Example:
@@ -30,8 +30,7 @@ class VideoWriter:
         ...         film.add(np.full((48, 64, 3), 128, np.uint8))
 
     Raises:
-        TensorsimError: no frames, frames of another kind or of several sizes, or a file that OpenCV cannot
-            write.
+        TensorsimError: no frames, frames of the wrong type or of different sizes, or a file that OpenCV cannot write.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float) -> None:
@@ -54,7 +53,7 @@ class VideoWriter:
         return self
 
     def add(self, frame: np.ndarray) -> None:
-        """Append a frame (H, W, 3) uint8 RGB, of the size of the first."""
+        """Append a frame (H, W, 3) uint8 RGB, of the same size as the first."""
         import cv2
 
         is_image = frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3
@@ -70,8 +69,8 @@ class VideoWriter:
         bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
         if height % 2 or width % 2:
             bgr = cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-        self.count += 1  # an interrupt, which comes after the write, must not leave the frame uncounted
-        with silent_log():  # a full disk shows at the end
+        self.count += 1  # an interrupt after the write must not leave the frame uncounted
+        with silent_log():  # a full disk is noticed at the end
             self._writer.write(bgr)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -81,7 +80,7 @@ class VideoWriter:
                 return
             if self.count == 0:
                 raise TensorsimError(f"{self.path}: got no frames, expected at least one")
-            # OpenCV says nothing of writes that fail, as on a full disk; what is missing shows when it is read.
+            # OpenCV does not report failed writes, as on a full disk; missing frames are noticed on reading.
             if _frames_in(self._partial) != self.count:
                 raise NotWrittenError(self.path, "the film is not whole; is the disk full?")
             with writing(self.path):
@@ -89,14 +88,14 @@ class VideoWriter:
 
 
 def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write a film of frames (H, W, 3) uint8 RGB: see :class:`VideoWriter` for arguments and errors."""
+    """Write frames (H, W, 3) uint8 RGB as a video: see :class:`VideoWriter` for arguments and errors."""
     with VideoWriter(path, fps) as film:
         for frame in frames:
             film.add(frame)
 
 
 def _frames_in(path: Path) -> int | None:
-    """Number of frames that a complete file announces; None of a file that is not complete."""
+    """Number of frames stated by a complete file; None for an incomplete one."""
     import cv2
 
     with opening():
@@ -111,7 +110,7 @@ def _open_writer(writer: Any, path: Path, fps: float, size: tuple[int, int]) -> 
     import cv2
 
     codec = "VP80" if path.suffix.lower() == ".webm" else "mp4v"
-    # OpenCV remarks that WebM has another tag for its own codec, and takes that.
+    # OpenCV warns that WebM uses another tag for its own codec, and takes that one.
     with opening(), _silent_stderr():
         opened = writer.open(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
     if not opened:
@@ -124,7 +123,7 @@ def _open_writer(writer: Any, path: Path, fps: float, size: tuple[int, int]) -> 
 @shared
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Drop what libraries print to the standard error of the process."""
+    """Discard what libraries print to the standard error of the process."""
     kept = os.dup(2)
     try:
         with open(os.devnull, "wb") as nowhere:
