@@ -15,7 +15,7 @@ from tensorsim.files import complete_file
 from tensorsim.radar.processing.doppler import coherent_sum
 from tensorsim.radar.simulator import RadarSimulator
 
-#: Range of the highest Doppler frequency for which sound is unscaled; otherwise it is scaled to ``_TOP_HZ``.
+#: If the highest Doppler frequency is in this range it is played unchanged; otherwise it is scaled to ``_TOP_HZ``.
 _UNCHANGED_HZ = (1000.0, 8000.0)
 _TOP_HZ = 4000.0
 #: Window of the time stretching in seconds: shorter than a step, about as long as a kick.
@@ -48,11 +48,11 @@ def slow_time_signal(
         pulses: number of pulses of the scene.
 
     Returns:
-        (M,) complex, conjugated so that positive frequencies approach, as in the Doppler-time map; a two-pulse
-        canceller leaves one pulse fewer than ``pulses``.
+        (M,) complex, conjugated so that positive frequencies mean approaching, as in the Doppler-time map; a
+        two-pulse canceller leaves one pulse fewer than ``pulses``.
 
     Raises:
-        TensorsimError: fewer pulses than the moving target indicator needs. What the source gives is not checked.
+        TensorsimError: fewer pulses than the moving target indicator needs. The source's output is not checked.
     """
     samples, bins = simulator.radar.samples_per_chirp, simulator.range_profile.range_m.shape[0]
     parts = []

@@ -1,4 +1,4 @@
-"""Motion while somebody is not in the scene."""
+"""Motion of people while they are absent from the scene."""
 
 import torch
 from torch import Tensor
@@ -8,18 +8,18 @@ from tensorsim.vision.smoothing.along_time import seen_beside
 
 
 def continued(joints: Tensor, valid: Tensor) -> Tensor:
-    """Joints of frames in which somebody is absent, replaced by motion without jumps.
+    """Replace the joints in frames in which a person is absent by motion without jumps.
 
-    A spline through all frames bends for whatever stands beside it: a jump where somebody leaves would be heard while
-    that person is still there. Here motion goes on at the velocity of the last two frames, ever more slowly, and
-    changes over in a gap to that which leads into the next run in the same way.
+    A spline is affected by neighbouring frames: a jump where somebody leaves would show in the echo while that person
+    is still there. Here motion continues with the velocity of the last two frames, slowing down, and within a gap it
+    blends into the motion that leads into the next run in the same way.
 
     Args:
-        joints: (..., T, J, 3); what stands in frames that are not valid does not matter.
+        joints: (..., T, J, 3); values in frames that are not valid do not matter.
         valid: (..., T) bool.
 
     Returns:
-        (..., T, J, 3), equal to ``joints`` where valid; zeros for people that are never there.
+        (..., T, J, 3), equal to ``joints`` where valid; zeros for people who are never there.
 
     Raises:
         TensorsimError: wrong shapes, or valid not boolean.
@@ -42,7 +42,7 @@ def continued(joints: Tensor, valid: Tensor) -> Tensor:
 
 
 def _beyond(joints: Tensor, valid: Tensor, edge: Tensor, sense: int) -> Tensor:
-    """Motion that goes on beyond the frames ``edge`` (..., T), forwards (``sense`` 1) or backwards (-1) in time."""
+    """Motion extrapolated beyond the frames ``edge`` (..., T), forwards (``sense`` 1) or backwards (-1) in time."""
     frames = valid.shape[-1]
     last = edge.clamp(0, frames - 1)
     previous = (last - sense).clamp(0, frames - 1)

@@ -1,6 +1,6 @@
-"""A movement at given times, and the building blocks of the scripts of activities.
+"""A movement at given times, and the building blocks of activity scripts.
 
-Everybody is right-handed here, starts at the origin and faces +y; times in seconds, angles in degrees.
+Here everybody is right-handed, starts at the origin and faces +y; times are in seconds, angles in degrees.
 """
 
 import math
@@ -17,14 +17,14 @@ from tensorsim.motion.people import People
 _DEGREE = math.pi / 180
 Pair = tuple[Tensor | float, Tensor | float]
 
-#: Slightly bent legs of quiet standing.
+#: Slightly bent hips and knees of quiet standing.
 REST_HIP, REST_KNEE = 7.0, 14.0
-#: How far walking lowers the hips so that both legs reach, in leg lengths, and how much more for every leg length a
-#: second beyond a speed.
+#: How far walking lowers the hips so that both legs reach the floor, in leg lengths, and how much more per leg length
+#: per second above a certain speed.
 _WALKING_DROP, _FAST_DROP, _FAST = 0.018, 0.08, 2.2
-#: Phase at which the body is over the standing foot.
+#: Gait phase at which the body is over the standing foot.
 STANDING = 0.24
-#: Body heights that a swinging foot is kept clear of the floor.
+#: Clearance of a swinging foot above the floor, in body heights.
 SWING_LIFT = 0.03
 
 
@@ -33,18 +33,18 @@ class Act(NamedTuple):
 
     Attributes:
         pose: angles of the body.
-        stance: angles that carry the body: its ankles, weighted by ``support``, stay at the origin.
+        stance: angles that support the body: its ankles, weighted by ``support``, stay at the origin.
         support: (B, T, 2) weight on the right and left ankle, sum 1.
-        offset: (B, T, 3) m of the hips on top of that: right, forward, up.
+        offset: (B, T, 3) m, further displacement of the hips: right, forward, up.
         path: (B, T) m walked.
         hold: (B, T, 2) weight with which each foot is fixed to the floor, 0 to 1.
-        moment: (B, K, 2) times at which the feet are at their fixed places, step by step.
-        step: (B, T, 2) int64, the step of each time.
+        moment: (B, K, 2) times that define where the feet are held, step by step.
+        step: (B, T, 2) int64, index of the step at each time.
         other: (B, T, 2) int64, the step that the foot comes from or goes to.
-        progress: (B, T, 2) towards that one, as a share of the way; None for feet that do not walk.
-        lift: (B, T, 2) body heights by which a foot on its way to another place is raised at the floor, less
+        progress: (B, T, 2) towards that step, as a fraction of the way; None for feet that do not walk.
+        lift: (B, T, 2) body heights by which a foot moving to another place is raised at the floor, less when it is
             higher up.
-        level: (B, T, 2) 1 where a foot that is held stands on the floor, 0 where the body lies or the foot kicks.
+        level: (B, T, 2) 1 if a held foot stands on the floor, 0 if the body lies or the foot kicks.
     """
 
     pose: BodyPose
@@ -62,7 +62,7 @@ class Act(NamedTuple):
 
 
 class Vary:
-    """Numbers of a script, each with the person's own deviation, as columns (B, 1)."""
+    """Varies the numbers of a script, each with its own deviation per person, as columns (B, 1)."""
 
     def __init__(self, who: People) -> None:
         self.factor, self.used = who.factor, 0
@@ -74,7 +74,7 @@ class Vary:
 
 
 def share_of(who: People, factor: float) -> Tensor:
-    """A number (B, 1) in [0, 1) of each person's own, another one for another ``factor``."""
+    """A pseudo-random number (B, 1) in [0, 1) for each person; different for each ``factor``."""
     return torch.remainder(who.gait_phase * factor, 1.0)[:, None]
 
 
@@ -95,7 +95,7 @@ def make_pose(
     inward: Pair = (15.0, 15.0),
     elbow: Pair = (12.0, 12.0),
 ) -> BodyPose:
-    """Angles in degrees to a pose (B, T); the chest breathes by half a degree."""
+    """A pose (B, T) from angles in degrees; breathing moves the trunk by half a degree."""
 
     def angle(value: Tensor | float) -> Tensor:
         return torch.as_tensor(value, dtype=time.dtype).expand(time.shape) * _DEGREE
@@ -140,22 +140,22 @@ def on_the_spot(time: Tensor, pose: BodyPose) -> Act:
 
 
 def upright_for(act: Act, share: Tensor) -> Act:
-    """A movement whose feet carry only as far as ``share`` (B, T) is 1: the rest of the time the body lies."""
+    """A movement whose feet carry the body only as far as ``share`` (B, T) is 1; otherwise the body lies."""
     feet = share[..., None]
     return act._replace(hold=act.hold * feet, lift=act.lift * feet, level=act.level * feet)
 
 
 def tip_over(pose: BodyPose, tilt: Tensor, way: Tensor) -> BodyPose:
-    """A pose tilted as a whole about its feet, without a turn about its own long axis.
+    """A pose tilted as a whole about its feet, without rotation about its long axis.
 
     Args:
-        pose: of a body that is upright and faces +y.
+        pose: pose of an upright body facing +y.
         tilt: (B, T) degrees from the vertical.
         way: direction of the tilt in radians, broadcastable to it: 0 ahead, a quarter turn to the right.
     """
     tilt = torch.deg2rad(tilt)
     right, ahead = torch.sin(way), torch.cos(way)
-    # Rodrigues' rotation about the horizontal axis at right angles to the way, as heading, roll and lean.
+    # Rodrigues' rotation about the horizontal axis perpendicular to ``way``, as heading, roll and lean.
     back = 1 - torch.cos(tilt)
     return pose._replace(
         heading=torch.atan2(-back * right * ahead, 1 - back * right.square()),
@@ -167,12 +167,12 @@ def tip_over(pose: BodyPose, tilt: Tensor, way: Tensor) -> BodyPose:
 def arms_on_floor(
     way: Tensor, spread: Tensor, overhead: Tensor | bool = False
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Flexion and abduction in degrees of arms in the plane of the floor, of a body tipped over by a right angle.
+    """Flexion and abduction in degrees that put the arms in the plane of the floor when the body has tipped over by 90.
 
     Args:
-        way: as of :func:`tip_over`.
+        way: as in :func:`tip_over`.
         spread: degrees between an arm and the long axis of the body.
-        overhead: bool, whether the arms are stretched out over the head, and not beside the body.
+        overhead: bool, whether the arms are stretched out over the head instead of beside the body.
     """
     spread = torch.deg2rad(spread) * torch.where(torch.cos(way) < 0, -1.0, 1.0)
     across = torch.atan2(torch.sin(way) * torch.sin(spread), torch.cos(spread))
@@ -184,7 +184,7 @@ def arms_on_floor(
 
 
 def _reach_ahead(who: People, gait: Gait) -> Tensor:
-    """How far the ankles (B, T, 2) are ahead of a hip that moves evenly, in leg lengths."""
+    """How far the ankles (B, T, 2) are ahead of a hip moving at constant speed, in leg lengths."""
     sizes = who.proportions
     thigh = torch.as_tensor(sizes.thigh / (sizes.thigh + sizes.shank))[:, None, None]
     leg = thigh * torch.sin(gait.hip) + (1 - thigh) * torch.sin(gait.hip - gait.knee)
@@ -192,7 +192,7 @@ def _reach_ahead(who: People, gait: Gait) -> Tensor:
 
 
 def with_gait(time: Tensor, who: People, base: BodyPose, pace: Tensor, path: Tensor) -> Act:
-    """Walking added to the other movement, ``pace`` (B, T) of it between 0 and 1."""
+    """Add walking to another movement, with weight ``pace`` (B, T) between 0 and 1."""
     leg = (who.proportions.thigh + who.proportions.shank) * who.height_m
     relative_speed = who.speed_m_s / leg
     cycle = cycle_s(relative_speed)[:, None]
@@ -217,7 +217,7 @@ def with_gait(time: Tensor, who: People, base: BodyPose, pace: Tensor, path: Ten
     drop = (_WALKING_DROP + further) * torch.tensor([0.0, 0.0, 1.0], dtype=time.dtype)
     # A foot is flat on the floor from 0.09 to 0.39 of its cycle; then the heel rises.
     steps = tread(time, cycle[:, 0], who.gait_phase, STANDING, 0.30, 0.17)
-    # Between two steps it goes on as in steady walking: with the hips, and ahead of or behind them.
+    # Between two steps the foot moves as in steady walking: with the hips, and ahead of or behind them.
     ahead = _reach_ahead(who, gait)
     still = boulic_gait(relative_speed, torch.full_like(time[:, :1], STANDING))
     ahead_still = _reach_ahead(who, still)[:, :, :1]

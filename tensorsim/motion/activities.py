@@ -20,25 +20,25 @@ from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.resample import evaluate_cubic, natural_spline_curvature
 from tensorsim.motion.scripts import SCRIPTS
 
-#: Joints are worked out at this rate and interpolated by a C2 spline: bones keep their length to micrometres.
+#: Joints are computed at this rate and interpolated by a C2 spline: bone lengths are kept to micrometres.
 _KNOT_HZ = 240.0
-#: Knots beyond both ends of a clip, where the spline's free ends fade away.
+#: Extra knots beyond both ends of a clip, so that the spline's end conditions have no effect.
 _MARGIN = 12
-#: Softness of the contact with the floor, 1/m: bodies sink or float by less than a centimetre.
+#: Sharpness of the contact with the floor, 1/m: bodies sink or float by less than a centimetre.
 _FLOOR_SHARPNESS = 150.0
-#: Feet that swing sink into it by no more than this.
+#: Swinging feet sink into the floor by no more than this.
 _SINK_M = 0.003
 
 
 class GeneratedMotion(NamedTuple):
-    """People who act.
+    """Generated people in motion.
 
     Attributes:
         joints: (B, T, 14, 3) float64 world metres (x right, y away from the radar, z up), order of
-            ``tensorsim.JOINTS``. Where nobody is (S1 Empty), somebody standing still who does not count.
+            ``tensorsim.JOINTS``. If nobody is there (S1 Empty), a placeholder that stands still.
         valid: (B, T) bool, whether somebody is there.
         activity: (B,) int64 index into ``tensorsim.ACTIVITIES``.
-        people: who acted, to do it again.
+        people: the people, to reproduce the motion.
     """
 
     joints: Tensor
@@ -48,7 +48,7 @@ class GeneratedMotion(NamedTuple):
 
 
 def activity_index(name: str) -> int:
-    """Index of a class by its full name, or by the words without the number, in any case.
+    """Index of a class by its full name, its number ("S8") or its words alone, in any case.
 
     Raises:
         TensorsimError: no such class; the message lists them.
@@ -66,7 +66,7 @@ def activity_index(name: str) -> int:
 
 
 def _carried(act: Act, who: People) -> Tensor:
-    """Joints (B, T, 14, 3) of bodies that rest on the floor, before their feet are held fast."""
+    """Joints (B, T, 14, 3) of bodies resting on the floor, before their feet are fixed in place."""
     height = who.height_m[:, None]
     sizes = Proportions(*(torch.as_tensor(p)[:, None] for p in who.proportions))
     standing = forward_kinematics(act.stance, height, sizes)
@@ -86,18 +86,18 @@ def _carried(act: Act, who: People) -> Tensor:
 
 
 def _of_step(spots: Tensor, step: Tensor) -> Tensor:
-    """Spots (B, K, 3) of the steps (B, T) of each time."""
+    """Pick from the spots (B, K, 3) the one for the step (B, T) at each time."""
     return spots.gather(1, step[..., None].expand(-1, -1, 3))
 
 
 def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) -> Tensor:
     """Joints of people who follow a script, at the origin and facing +y, with feet that do not slide.
 
-    Where a script says that a foot is held, its ankle is moved to where the script has it at the middle of
-    standing, on the floor, and the leg is bent to reach it.
+    While a script holds a foot, its ankle is moved to its position at the middle of the stance phase, on the floor,
+    and the leg bends to reach it.
 
     Args:
-        script: one of ``SCRIPTS``.
+        script: such as one of ``SCRIPTS``.
         time: (B, T) s.
         who: B people.
 
@@ -125,7 +125,7 @@ def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) 
             steps_out = 1 - torch.exp(-(((other - held)[..., :2] / 0.1).square().sum(dim=-1)))
             near_floor = torch.exp((floor - swung[..., 2]) / (0.04 * height))
             lift = act.lift[..., side] * height * steps_out * near_floor
-        # Nor does a foot that swings go through the floor.
+        # A swinging foot does not go through the floor either.
         above = floor + torch.nn.functional.celu(swung[..., 2] + lift - floor, alpha=_SINK_M)
         swung = torch.cat([place, above[..., None]], dim=-1)
         places.append(torch.lerp(swung, held, act.hold[..., side, None]))
@@ -136,13 +136,13 @@ def perform(script: Callable[[Tensor, People], Act], time: Tensor, who: People) 
 
 
 class ActivityGenerator:
-    """Makes people who do one of the twelve activities.
+    """Generates people who do one of the twelve activities.
 
-    A source of data, not a stage: it draws at random, computes in float64 on the CPU, and does not script. The
+    A data source, not a stage: it draws at random, computes in float64 on the CPU, and cannot be scripted. The
     same seed gives the same people and motion, whatever the rate.
 
-    Movements happen at the seconds of a clip of 4 s; in longer ones walking, punching, kicking, grabbing and
-    rotating go on, and those that end stay as they ended.
+    Movements are timed for a clip of 4 s. In longer clips walking, punching, kicking, grabbing and rotating continue;
+    in the other activities people stay as they ended.
 
     Args:
         people: the distributions to draw from.
@@ -169,16 +169,16 @@ class ActivityGenerator:
 
         Args:
             activity: name ("S8 Walking", "walking", "S8") or index of a class for all, or one index per person,
-                an integer tensor (B,), which then is the batch.
-            batch: number of people, 1 if neither ``activity`` is a tensor nor ``people`` given.
-            seed: of the draw, or a generator to go on with.
+                an integer tensor (B,), which then sets the batch.
+            batch: number of people; default 1 unless ``activity`` is a tensor or ``people`` is given.
+            seed: random seed, or a generator to draw from.
             duration_s: length of the clip.
-            rate_hz: frame k is at ``k / rate_hz``; there are ``round(duration_s * rate_hz)``.
-            people: these instead of drawn ones.
+            rate_hz: frame k is at ``k / rate_hz``; there are ``round(duration_s * rate_hz)`` frames.
+            people: people to use instead of drawing them.
 
         Raises:
-            TensorsimError: an unknown activity, a number that is not positive, a clip without a frame, people,
-                activities and ``batch`` of different number, or a speed beyond 3 leg lengths per second.
+            TensorsimError: an unknown activity, a number that is not positive, a clip without a frame, different
+                numbers of people, activities and ``batch``, or a speed beyond 3 leg lengths per second.
         """
         check_positive(duration_s, "duration_s")
         check_positive(rate_hz, "rate_hz")
@@ -233,7 +233,7 @@ class ActivityGenerator:
         return activity.to(torch.int64).cpu()
 
     def _placed(self, joints: Tensor, people: People) -> Tensor:
-        """Mirrored, turned and set down in the world."""
+        """Mirror left-handed people, then turn and place everybody in the world."""
         joints = torch.where(people.left_handed[:, None, None, None], mirror(joints), joints)
         turn = rotation(2, people.heading_rad)[:, None, None]
         joints = (turn @ joints[..., None])[..., 0]

@@ -12,8 +12,8 @@ class Node(NamedTuple):
     """A point of the body.
 
     Attributes:
-        name: of the node.
-        parent: the parent node; None is the root.
+        name: name of the node.
+        parent: the parent node; None for the root.
         rcs_m2: radar cross section in m^2.
         joints: names of ``tensorsim.JOINTS`` with their weights (sum 1); the node is their weighted mean.
     """
@@ -24,8 +24,8 @@ class Node(NamedTuple):
     joints: dict[str, float]
 
 
-#: Tree and cross sections of the author's open 13-scatterer walker. Its torso lies 0.3 above the hip and 0.2
-#: below the shoulders (in units of 1 / 1.8 of the body height), its hip is a single node.
+#: Tree and cross sections of the author's open 13-scatterer walker. Its torso node is 0.3 above the hip and 0.2
+#: below the shoulders (in units of 1 / 1.8 of the body height), and its hip is a single node.
 NODES = (
     Node("torso", None, 1.0, {"neck": 0.6, "right_hip": 0.2, "left_hip": 0.2}),
     Node("head", "torso", 0.5, {"head": 1.0}),
@@ -47,7 +47,7 @@ class Body13Scatterers(nn.Module):
     """13 point scatterers per person, placed by the 14 joints: see :data:`NODES`.
 
     Args:
-        learnable: whether the cross sections are a parameter, see
+        learnable: whether the cross sections are parameters, see
             :class:`~tensorsim.motion.scatterers.JointScatterers`.
 
     Example:
@@ -70,7 +70,7 @@ class Body13Scatterers(nn.Module):
         Any range of pulses; P may be 0. Differentiable.
 
         Raises:
-            TensorsimError: wrong ranks or dtypes, or shapes that do not go together.
+            TensorsimError: wrong ranks or dtypes, or shapes that do not match.
         """
         check_people(positions, fade, self.nodes.shape[1])
         scene, rcs = self.points(self.nodes.to(positions.dtype) @ positions, fade)

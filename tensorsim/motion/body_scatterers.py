@@ -1,4 +1,4 @@
-"""The body as a rough surface: a torso of many points, limbs of a few, as bright as measured ones."""
+"""The body as a rough surface: a torso of many points and limbs of a few, as strong as measured ones."""
 
 import math
 
@@ -13,31 +13,32 @@ from tensorsim.motion.rough_surface import cylinder_rcs, patch_rcs, skin_reflect
 from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
 from tensorsim.ops import unit
 
-#: The torso is an elliptical cylinder: semi-axes to the right and forward, in body heights, from the neck to this
-#: many lengths of the line to the middle of the hips.
+#: The torso is an elliptical cylinder: semi-axes to the right and forward in body heights, and its length down from
+#: the neck as a multiple of the distance to the middle of the hips.
 TORSO_RIGHT, TORSO_FORWARD, TORSO_LENGTH = 0.095, 0.077, 1.2
-#: Rows and columns of its points. Columns are as far apart as the reflection of a patch is wide.
+#: Rows and columns of its points. The spacing of columns matches the angular width of a patch's reflection.
 ROWS, COLUMNS = 2, 14
-#: Root mean square slope of its surface, and of that of the limbs, whose sleeves and trousers hang in folds.
+#: Root mean square slope of its surface, and of the limbs' surface, where sleeves and trousers hang in folds.
 TORSO_ROUGHNESS, LIMB_ROUGHNESS = 0.2, 0.35
-#: Cross sections over those of the bare cylinders: shoulders, hips, hands and double reflections between the parts, set
-#: by the measured cross section of a man at 4.8 and 9.4 GHz.
+#: Ratio of cross sections to those of the bare cylinders, for shoulders, hips, hands and double reflections between
+#: parts; set by the measured cross section of a man at 4.8 and 9.4 GHz.
 WHOLE_BODY = 1.4
-#: What is left of the cross section of limbs at 77 GHz, and by how much it is more at 24 GHz and below, fitted to
-#: measured walks: see the class.
+#: Remaining fraction of the limbs' cross section at 77 GHz, and the increase at 24 GHz and below, fitted to measured
+#: walks: see the class.
 LIMB_SHARES = {"upper_arm": 0.67, "forearm": 0.2, "thigh": 0.285, "shank": 0.19, "foot": 0.085}
 LIMBS_AT_24_GHZ = 1.3
 
 
 def torso_columns(right: float, forward: float, columns: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Columns of an elliptical cylinder whose normals are equal angles apart.
+    """Columns of an elliptical cylinder whose normals are equally spaced in angle.
 
     Args:
         right, forward: semi-axes in metres.
-        columns: how many, around the whole circumference.
+        columns: number of columns around the whole circumference.
 
     Returns:
-        Places (columns, 2) and unit normals (columns, 2), to the right and forward, and widths (columns,) in metres.
+        Positions (columns, 2) in metres and unit normals (columns, 2), to the right and forward, and widths
+        (columns,) in metres.
     """
     fine = 64
     angle = 2 * math.pi * (torch.arange(columns * fine, dtype=torch.float64) + 0.5) / (columns * fine)
@@ -50,7 +51,7 @@ def torso_columns(right: float, forward: float, columns: int) -> tuple[Tensor, T
 
 
 def _line_across(share: float) -> dict[str, float]:
-    """Weights of joints for a line to the right, that of the shoulders for a share of 0, of the hips for 1."""
+    """Joint weights for a line to the right: that of the shoulders at a share of 0, that of the hips at 1."""
     return {
         "right_shoulder": 1 - share,
         "left_shoulder": share - 1,
@@ -60,7 +61,7 @@ def _line_across(share: float) -> dict[str, float]:
 
 
 def limb_gain(carrier_hz: float) -> float:
-    """Factor on the cross sections of limbs: 1 from 77 GHz on, ``LIMBS_AT_24_GHZ`` up to 24 GHz, in dB over log f."""
+    """Factor on limb cross sections: ``LIMBS_AT_24_GHZ`` up to 24 GHz, 1 from 77 GHz, linear in dB over log f."""
     below = math.log(77e9 / carrier_hz) / math.log(77 / 24)
     return LIMBS_AT_24_GHZ ** min(1.0, max(0.0, below))
 
@@ -68,28 +69,28 @@ def limb_gain(carrier_hz: float) -> float:
 class BodyScatterers(nn.Module):
     """An extended torso and limbs, with cross sections that follow aspect and carrier.
 
-    The torso is an elliptical cylinder, twisted between shoulders and hips, with points all over it, which shine where
-    they face the bisector of transmitter and receiver; a limb is a cylinder of ``per_segment`` points, bright broadside
-    and dim end on; the head is a sphere. All are rough (:mod:`~tensorsim.motion.rough_surface`) and of skin, so that a
-    body reflects a third of what metal would at 77 GHz and half of it at 5.8 GHz. Points are many wavelengths apart:
-    echoes add with whatever phase they have, and the sum fluctuates from pulse to pulse as a measured one does.
+    The torso is an elliptical cylinder, twisted between shoulders and hips and covered with points, which reflect where
+    they face the bisector of transmitter and receiver; a limb is a cylinder of ``per_segment`` points, strong broadside
+    and weak end-on; the head is a sphere. All are rough (:mod:`~tensorsim.motion.rough_surface`) and made of skin, so
+    that a body reflects a third of what metal would at 77 GHz and half at 5.8 GHz. Points are many wavelengths apart:
+    their echoes add with arbitrary phases, and the sum fluctuates from pulse to pulse as in measurements.
 
-    A walking person sums to 0.4 m^2 at 77 GHz and 0.6 m^2 at 5.8 GHz; published are 0.37 to 1.9 m^2 at 4.8 GHz and 0.5
+    A walking person totals 0.4 m^2 at 77 GHz and 0.6 m^2 at 5.8 GHz; published: 0.37 to 1.9 m^2 at 4.8 GHz and 0.5
     to 1.2 m^2 at 9.4 GHz for a man of 91 kg (Schultz, Burgener and King, Proc. IRE 46, 1958), and averages at 24 and 77
     GHz that are very close to each other (Fortuny-Guasch and Chareau, JRC report EUR 25762, 2013). The scale is set by
     the former, :data:`WHOLE_BODY`.
 
     Limbs are fitted: cylinders of their size would put two to three times more power above 1.5 times the speed of the
     torso than is measured at 24 and 77 GHz. :data:`LIMB_SHARES` bring that to within a quarter, and the speed below
-    which 95 % of the power lies to within 6 % (``python -m tests.benchmarks.eval_bodies`` prints both). So does the
-    power above 2 times at 77 GHz; at 24 GHz two measured sets differ there by a factor of four, and this is between
-    them. What the shares stand for is limbs that hide each other, antennas that look at the chest, and more.
+    which 95 % of the power lies to within 6 % (``python -m tests.benchmarks.eval_bodies`` prints both). The power
+    above 2 times at 77 GHz fits as well; at 24 GHz two measured sets differ there by a factor of four, and this model
+    lies between them. The shares account for limbs that hide each other, antennas aimed at the chest, and more.
 
     Args:
-        tx_m, rx_m: transmitter and receiver in metres (of an array: its middle).
+        tx_m, rx_m: transmitter and receiver in metres (for an array, its centre).
         carrier_hz: sets the reflectivity of skin and the share of the limbs.
-        per_segment: points of a limb segment.
-        height_m: body height, which sets the sizes of cross sections.
+        per_segment: points per limb segment.
+        height_m: body height, which scales the cross sections.
 
     Example:
         >>> positions, fade = torch.randn(3, 100, 14, 3), torch.ones(3, 100)  # 3 people, 100 pulses
@@ -179,7 +180,7 @@ class BodyScatterers(nn.Module):
             Positions (..., M, K P, 3) m and cross sections (..., M, K P) m^2, K = ``points_per_person``.
 
         Raises:
-            TensorsimError: wrong ranks or dtypes, or shapes that do not go together.
+            TensorsimError: wrong ranks or dtypes, or shapes that do not match.
         """
         check_people(positions, fade, 14)
         right = self.right.to(positions.dtype) @ positions

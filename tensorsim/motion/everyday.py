@@ -1,6 +1,6 @@
-"""Movements of everyday people that count as one of the twelve activities: falls any way, walks that end, balls kicked.
+"""Everyday variants of the twelve activities: falls in any direction, walks that come to a stop, kicks of a ball.
 
-Scripts as in :mod:`.scripts`. Each happens from time 0 on; before it the person stands, or walks up.
+Scripts as in :mod:`.scripts`. Each begins at time 0; before that the person stands or walks up.
 """
 
 import math
@@ -29,10 +29,10 @@ from tensorsim.motion.timing import GRAVITY, bell, landing, minimum_jerk, segmen
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
-    """Gives way and topples like a rod about the feet in any direction; stays down.
+    """Collapses and topples like a rod about the feet in any direction; stays down.
 
-    Some sink first, with the knees far bent, and some fall stiff; some stretch their arms out, and some keep them at
-    their sides.
+    Some sink first, with the knees strongly bent, and some fall stiffly; some stretch out their arms, and some keep
+    them at their sides.
     """
     v = Vary(who)
     tempo = fall_tempo(who)
@@ -43,7 +43,7 @@ def fall_any_way(time: Tensor, who: People) -> Act:
     give = bell(time, 0.0 * v(1.0), v(1.3) / tempo)
     overhead = (share_of(who, 29.0) < 0.6) & (torch.cos(way) > 0)
     flexion, abduction = arms_on_floor(way, v(30.0), overhead)
-    # People that lie on their back have the knees up and the arms folded.
+    # People lying on their back have their knees up and their arms bent.
     supine = 0.5 * (1 - torch.cos(way))
     fold = v(50.0) * supine.square()
     bent = v(35.0) * supine * down
@@ -71,7 +71,7 @@ def fall_on_knees(time: Tensor, who: People) -> Act:
     drop, wait, over = v(0.55) / tempo, v(0.25), v(0.7) / tempo
     kneel = landing(time / drop)
     prone = minimum_jerk(((time - 1.2 * drop - wait) / over).clamp(0.0, 1.0))
-    # On hands and knees, or flat.
+    # Ends on hands and knees, or flat.
     on_hands = share_of(who, 13.0) < 0.3
     lean, bent, knees, arms, elbows = (
         torch.where(on_hands, one, other)
@@ -98,9 +98,9 @@ def fall_on_knees(time: Tensor, who: People) -> Act:
 
 
 def fall_onto_seat(time: Tensor, who: People) -> Act:
-    """The knees give way, the person lands on the seat and rolls onto the back, some to a side; stays down.
+    """The knees buckle; the person lands on the bottom and rolls onto the back, some to a side; stays down.
 
-    So people fall who know the mat behind them.
+    This is how people fall when they know that there is a mat behind them.
     """
     v = Vary(who)
     tempo = fall_tempo(who)
@@ -130,7 +130,7 @@ def fall_onto_seat(time: Tensor, who: People) -> Act:
 
 
 def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
-    """Walks up, loses hold at time 0 and falls forward or to a side; stays down."""
+    """Walks up, loses balance at time 0 and falls forward or to a side; stays down."""
     v = Vary(who)
     tempo = fall_tempo(who)
     tilt = toppling(tempo * time, who.height_m)
@@ -157,9 +157,9 @@ def walk_and_fall_any_way(time: Tensor, who: People) -> Act:
 
 
 def walk_and_slip(time: Tensor, who: People) -> Act:
-    """Walks up, slips at time 0: the feet slide ahead and up, the person lands on the seat and then on the back.
+    """Walks up and slips at time 0: the feet slide ahead and up; the person lands on the bottom, then on the back.
 
-    The arms are flung up; whoever falls keeps a part of the speed of the walk for a moment.
+    The arms are flung up; the body keeps part of its walking speed for a moment.
     """
     v = Vary(who)
     tempo = fall_tempo(who)
@@ -192,14 +192,14 @@ def walk_and_slip(time: Tensor, who: People) -> Act:
     pace = 1 - segment(time, start, 0.3 + 0.0 * tempo)
     path = who.speed_m_s[:, None] * (time - travel(time, start, 0.7 + 0.0 * tempo))
     act = with_gait(time, who, tip_over(base, 45 * seated + 43 * lying, way), pace, path)
-    # The hips come down about where they were: the feet, about which the body leans, slide ahead.
+    # The hips come down about where they were: the feet, the pivot of the lean, slide ahead.
     slide = (0.35 + 0.25 * share_of(who, 29.0)) * who.height_m[:, None] * seated
     act = act._replace(offset=act.offset + torch.nn.functional.pad(slide[..., None], (1, 1)))
     return upright_for(act, 1 - segment(time, 0.0 * tempo, 0.25 + 0.0 * tempo))
 
 
 def walk_and_stop(time: Tensor, who: People) -> Act:
-    """Walks up, comes to a halt from time 0 on, within 0.7 to 1.5 s, and stands."""
+    """Walks up, comes to a halt within 0.7 to 1.5 s from time 0, and stands."""
     start = torch.zeros_like(who.tempo[:, None])
     halt = 0.7 + 0.8 * share_of(who, 17.0)
     pace = 1 - segment(time, start, halt)
@@ -208,7 +208,7 @@ def walk_and_stop(time: Tensor, who: People) -> Act:
 
 
 def walk_with_still_arms(time: Tensor, who: People) -> Act:
-    """Walks without a swing of the arms: they hang, are folded, or hold something."""
+    """Walks without swinging the arms: they hang, are folded, or hold something."""
     up, bent = 25.0 * share_of(who, 19.0), 110.0 * share_of(who, 23.0)
     base = make_pose(time, who, flexion=(up, up), abduction=(12.0, 12.0), elbow=(bent, 0.9 * bent))
     path = who.speed_m_s[:, None] * time
@@ -219,16 +219,17 @@ def walk_with_still_arms(time: Tensor, who: People) -> Act:
 def kick_ball(time: Tensor, who: People) -> Act:
     """Walks or runs up to a ball, kicks it at time 0 with a straight swing of the leg, and stops or runs on a little.
 
-    In captured kicks of a ball people run up for one to two seconds, the hips at 2 to 3.5 m/s at the kick, the
-    foot at 10 m/s, and come to rest within a second. At a lower ``tempo`` the leg swings less far in the same time.
+    In captured ball kicks people run up for one to two seconds; at the kick the hips move at 2 to 3.5 m/s and the
+    foot at 10 m/s, and people come to rest within a second. At a lower ``tempo`` the leg swings less far in the same
+    time.
     """
     v = Vary(who)
     far = who.tempo[:, None].clamp(max=1.0)
     leg_m = (who.proportions.thigh + who.proportions.shank) * who.height_m
-    # The gait is known up to 3 leg lengths a second.
+    # The gait model is valid up to 3 leg lengths per second.
     quick = torch.minimum(who.speed_m_s * (1.1 + share_of(who, 29.0)[:, 0]), 2.9 * leg_m)
     cycle = cycle_s(quick / leg_m)[:, None]
-    # The left foot is planted beside the ball; half a cycle before it the right one stood.
+    # The left foot is planted beside the ball; half a cycle earlier the right one stood.
     planted = 0.06
     runner = who._replace(speed_m_s=quick, gait_phase=STANDING - 0.5 - planted / cycle[:, 0])
     lifted, back, through = planted - 0.35 * cycle, -v(0.08), v(0.22)
@@ -257,13 +258,13 @@ def kick_ball(time: Tensor, who: People) -> Act:
     act = with_gait(time, runner, base, pace, quick[:, None] * gone_s)
     aloft = segment(time, lifted, lifted + 0.1) - segment(time, landed - 0.1, landed)
     free = torch.stack([1 - aloft, torch.ones_like(aloft)], dim=-1)
-    # The foot that kicks steps where it comes down.
+    # The kicking foot makes its step where it comes down.
     kicks = (act.moment > planted) & (act.moment < landed[..., None]) & torch.tensor([True, False])
     return act._replace(
         hold=act.hold * free,
         lift=act.lift * free,
         level=free,
         moment=torch.where(kicks, landed[..., None], act.moment),
-        # The standing leg carries the body, not the one that kicks.
+        # The standing leg carries the body, not the kicking one.
         support=torch.tensor([0.0, 1.0], dtype=time.dtype).expand_as(act.support),
     )

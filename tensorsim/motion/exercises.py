@@ -1,7 +1,7 @@
-"""More movements than the twelve activities: everyday ones, ways of going, and gymnastics.
+"""Movements beyond the twelve activities: everyday ones, kinds of gait, and gymnastics.
 
-Scripts as in :mod:`.scripts`: joint angles over time, one function per movement. They take any times: those that
-happen once begin at 0 and stay as they ended, the others go on for as long as they are asked.
+Scripts as in :mod:`.scripts`: joint angles over time, one function per movement. They accept any times: movements
+that happen once begin at 0 and stay as they ended; the others continue indefinitely.
 """
 
 import math
@@ -22,13 +22,13 @@ _HEEL_M = 0.015
 
 
 def _there_and_back(time: Tensor, out: Tensor, hold: Tensor, back: Tensor) -> Tensor:
-    """From 0 to 1 in ``out`` seconds from time 0, there for ``hold``, and back in ``back``."""
+    """From 0 to 1 in ``out`` seconds from time 0, held for ``hold``, and back to 0 in ``back``."""
     zero = torch.zeros_like(out)
     return segment(time, zero, out) - segment(time, out + hold, out + hold + back)
 
 
 def _cycle_share(time: Tensor, period: Tensor, who: People) -> Tensor:
-    """Where in a movement that repeats a person is, in [0, 1)."""
+    """A person's phase in a repeating movement, in [0, 1)."""
     return torch.remainder(time / period + who.gait_phase[:, None], 1.0)
 
 
@@ -38,7 +38,7 @@ def pick_up(time: Tensor, who: People) -> Act:
     down = _there_and_back(time, v(1.1), v(0.3), v(1.2))
     squat = (0.5 + (v(1.0) - 1) / 0.25).clamp(0.0, 1.0)
     knee = REST_KNEE + (v(50.0) + 75 * squat - REST_KNEE) * down
-    # The hips go back as the trunk bows, so that the body stays over the feet.
+    # The hips move back as the trunk bends forward, so that the body stays over the feet.
     hip = 0.5 * knee + (12 + 8 * squat) * down
     bow = v(100.0) - 38 * squat
     pose = make_pose(
@@ -55,7 +55,7 @@ def pick_up(time: Tensor, who: People) -> Act:
 
 
 def drink(time: Tensor, who: People) -> Act:
-    """Lifts a cup to the mouth, tips head and cup back, and puts the hand down again."""
+    """Lifts a cup to the mouth, tips head and cup back, and lowers the hand again."""
     v = Vary(who)
     out, hold, back = v(1.0), v(1.2), v(1.0)
     up = _there_and_back(time, out, hold, back)
@@ -75,7 +75,7 @@ def drink(time: Tensor, who: People) -> Act:
 
 
 def fall_down(time: Tensor, who: People) -> Act:
-    """Gives way at the knees and topples forward like a rod about the feet, from standing; stays down."""
+    """Falls from standing: the knees buckle and the body topples forward like a rod about the feet; stays down."""
     v = Vary(who)
     tempo = fall_tempo(who)
     down = toppling(tempo * time, who.height_m) / 88
@@ -96,18 +96,18 @@ def fall_down(time: Tensor, who: People) -> Act:
 
 
 def bend(time: Tensor, who: People) -> Act:
-    """Bends down with nearly straight legs, the hands at the shins, and comes up again."""
+    """Bends down with nearly straight legs, hands at the shins, and comes up again."""
     v = Vary(who)
     down = _there_and_back(time, v(1.0), v(0.4), v(1.0))
     arms = 2 + v(10.0) * down
-    # The hips go back, so that the body stays over the feet.
+    # The hips move back, so that the body stays over the feet.
     hip = REST_HIP + 10 * down
     pose = make_pose(time, who, pitch=v(82.0) * down, nod=-20 * down, hip=(hip, hip), flexion=(arms, arms))
     return on_the_spot(time, pose)
 
 
 def lie_down(time: Tensor, who: People) -> Act:
-    """Lies down over the knees and hands, and stays prone."""
+    """Lies down by way of the knees and hands, and stays prone."""
     v = Vary(who)
     end = v(2.4)
     pose = over_the_knees(time, who, v, segment(time, 0 * end, end), bell(time, 0 * end, end))
@@ -115,7 +115,7 @@ def lie_down(time: Tensor, who: People) -> Act:
 
 
 def get_up(time: Tensor, who: People) -> Act:
-    """Lies prone, gets up over the knees and stands."""
+    """Lies prone, gets up by way of the knees and stands."""
     v = Vary(who)
     end = v(2.0)
     pose = over_the_knees(time, who, v, 1 - segment(time, 0 * end, end), bell(time, 0 * end, end))
@@ -124,7 +124,7 @@ def get_up(time: Tensor, who: People) -> Act:
 
 
 def squat(time: Tensor, who: People) -> Act:
-    """Knee bends with the arms stretched forward, one after the other."""
+    """Repeated knee bends with the arms stretched forward."""
     v = Vary(who)
     down = torch.sin(math.pi * _cycle_share(time, v(2.9), who)).square()
     knee, hip = REST_KNEE + v(85.0) * down, REST_HIP + v(62.0) * down
@@ -148,11 +148,11 @@ def _leg_angles(ahead: Tensor, down: Tensor, thigh: Tensor, shank: Tensor) -> tu
 
 
 def _hopped(since: Tensor, period: Tensor, flight: Tensor) -> Tensor:
-    """Metres of the hips over where they take off: a parabola, and on the floor a dip after landing and one before it.
+    """Height of the hips in m above take-off: a parabola, and on the floor a dip after landing and before take-off.
 
     Args:
         since: (B, T) s since take-off, within the period.
-        period, flight: (B, 1) s from one take-off to the next, and in the air.
+        period, flight: (B, 1) s from one take-off to the next, and spent in the air.
     """
     speed = GRAVITY * flight / 2
     half = (period - flight) / 2
@@ -162,9 +162,9 @@ def _hopped(since: Tensor, period: Tensor, flight: Tensor) -> Tensor:
 
 
 def _hop(time: Tensor, who: People, height_m: Tensor, pose: BodyPose, widest: Tensor) -> Act:
-    """A pose whose hips rise and sink by ``height_m`` (B, T): the knees bend, the heels rise as the floor is left.
+    """A pose whose hips rise and sink by ``height_m`` (B, T): the knees bend, and the heels rise as the feet take off.
 
-    The hips are as high as legs reach that are ``widest`` (B, 1) radians abducted.
+    The hips are only as high as legs abducted by ``widest`` (B, 1) radians reach.
     """
     thigh, shank = (torch.as_tensor(x)[:, None] * who.height_m[:, None] for x in who.proportions[1::-1])
     standing = (thigh + shank) * math.cos(math.radians(REST_KNEE / 2)) * torch.cos(widest)
@@ -182,7 +182,7 @@ def _hop(time: Tensor, who: People, height_m: Tensor, pose: BodyPose, widest: Te
 
 
 def jump(time: Tensor, who: People) -> Act:
-    """Jumps on the spot, one after the other: bends the knees, takes off, lands."""
+    """Repeated jumps on the spot: bends the knees, takes off, lands."""
     v = Vary(who)
     flight = (8 * v(0.1) / GRAVITY).sqrt()
     period = v(0.95)
@@ -195,13 +195,13 @@ def jump(time: Tensor, who: People) -> Act:
 
 
 def jumping_jack(time: Tensor, who: People) -> Act:
-    """Jumps with arms and legs apart and together, the arms meeting over the head."""
+    """Jumping jacks: arms and legs go apart and together, the arms meeting over the head."""
     v = Vary(who)
     period = v(1.05)
     flight = (8 * v(0.04) / GRAVITY).sqrt()
     since = period * _cycle_share(time, period, who)
     arms = 8 + v(140.0) * torch.sin(math.pi * since / period).square()
-    # The legs change their place in the air.
+    # The legs move apart and together while in the air.
     apart = segment(since, 0 * flight, flight) - segment(since, period / 2, period / 2 + flight)
     widest = torch.deg2rad(v(19.0))
     pose = make_pose(time, who, abduction=(arms, arms), inward=(0.0, 0.0), elbow=(18.0, 18.0))
@@ -211,7 +211,7 @@ def jumping_jack(time: Tensor, who: People) -> Act:
 
 
 def box(time: Tensor, who: People) -> Act:
-    """Boxes: straight punches right and left in turn out of a low stance, the trunk turning and swaying along."""
+    """Boxes: alternating straight right and left punches from a low stance, the trunk turning and swaying along."""
     v = Vary(who)
     every = v(0.55) / who.tempo[:, None]
     beat = torch.remainder(time + 2 * every * who.gait_phase[:, None], 2 * every)
@@ -244,10 +244,10 @@ def box(time: Tensor, who: People) -> Act:
 
 
 def _stepped(at: Tensor, stance: float) -> Tensor:
-    """How far a foot is ahead, from 1 to -1 half steps, at places of its cycle from 0, where it comes down.
+    """How far a foot is ahead of the hips, from 1 to -1 half steps, by phase of its cycle, which begins at touch-down.
 
-    It goes evenly back while it stands; in the rest of the cycle it comes forward on the cubic that goes on with that
-    speed at both ends.
+    It moves back at constant speed while it stands; in the rest of the cycle it comes forward along a cubic that
+    matches that speed at both ends.
     """
     swung = ((at - stance) / (1 - stance)).clamp(min=0.0)
     slope = -2 * (1 - stance) / stance
@@ -269,18 +269,19 @@ def _step_out(
 ) -> Act:
     """A gait along +y at the person's speed.
 
-    A foot that stands stays where it is. The hips are highest over it, except in a gait with flights, where they fly on
-    a parabola and dip as a half sine that meets it with the same speed. The legs reach from the hips to the feet.
+    A standing foot stays where it is. The hips are highest over it, except in a gait with flight phases, where they
+    follow a parabola in the air and a half-sine dip on the ground that joins it at the same speed. The legs reach from
+    the hips to the feet.
 
     Args:
         time: (B, T) s.
         who: B people.
-        cycle_s: (B, 1) length of a cycle, two steps; less where legs do not reach so far.
+        cycle_s: (B, 1) length of a cycle, two steps; shortened if the legs do not reach that far.
         lift: (B, 1) body heights by which the swinging foot is raised.
-        bent: (B, 1) degrees of the knees as a foot comes down.
-        arms: (B, 1) degrees to which the upper arms swing to either side.
+        bent: (B, 1) knee angle in degrees as a foot comes down.
+        arms: (B, 1) degrees by which the upper arms swing forward and back.
         elbow, pitch: (B, 1) degrees.
-        stance: the part of a cycle that a foot stands; below one half there are flights.
+        stance: fraction of a cycle for which a foot stands; below one half there are flight phases.
     """
     height, speed = who.height_m[:, None], who.speed_m_s[:, None]
     thigh, shank = (torch.as_tensor(x)[:, None] * height for x in who.proportions[1::-1])
@@ -326,7 +327,7 @@ def _step_out(
 
 
 def run(time: Tensor, who: People) -> Act:
-    """Runs: short contact with the floor, folded swinging legs, bent elbows."""
+    """Runs: short ground contact, swinging legs strongly bent, elbows bent."""
     v = Vary(who)
     return _step_out(
         time, who, v(0.72), lift=v(0.16), bent=v(24.0), arms=v(30.0), elbow=v(85.0), pitch=v(9.0), stance=0.36
@@ -334,7 +335,7 @@ def run(time: Tensor, who: People) -> Act:
 
 
 def stride(time: Tensor, who: People) -> Act:
-    """Strides: long, brisk steps with arms that swing far."""
+    """Strides: long, brisk steps with widely swinging arms."""
     v = Vary(who)
     cycle = v(1.1) * (1.7 / who.speed_m_s[:, None]).clamp(0.7, 1.3)
     return _step_out(
@@ -343,7 +344,7 @@ def stride(time: Tensor, who: People) -> Act:
 
 
 def creep(time: Tensor, who: People) -> Act:
-    """Sneaks on foot: short slow steps on bent knees, bowed, the arms still."""
+    """Sneaks: short, slow steps on bent knees, leaning forward, arms still."""
     v = Vary(who)
     cycle = v(1.15) * (0.75 / who.speed_m_s[:, None]).clamp(0.7, 1.4)
     return _step_out(
@@ -352,10 +353,10 @@ def creep(time: Tensor, who: People) -> Act:
 
 
 def crawl(time: Tensor, who: People) -> Act:
-    """Goes on hands and knees, a hand with the knee of the other side."""
+    """Crawls on hands and knees, each hand moving with the opposite knee."""
     v = Vary(who)
     swing, stance = v(18.0), 0.6
-    # The knee that carries stays where it is while the hips pass over it; the other one is lifted to the side.
+    # The supporting knee stays where it is while the hips pass over it; the other one is lifted to the side.
     reach_m = (
         torch.as_tensor(who.proportions.thigh)[:, None]
         * who.height_m[:, None]
@@ -380,14 +381,14 @@ def crawl(time: Tensor, who: People) -> Act:
     aside = torch.deg2rad(v(28.0))[..., None] * lifted
     pose = pose._replace(hip=torch.stack([pose.hip[..., 0], aside], dim=-1))
     zero = torch.zeros_like(time)
-    # The body is carried by the middle of the ankles, which do not go evenly.
+    # The body is positioned by the midpoint of the ankles, which do not move at constant speed.
     return upright_for(on_the_spot(time, pose), zero)._replace(
         path=who.speed_m_s[:, None] * time,
         offset=torch.stack([zero, reach_m * knee.mean(dim=-1), zero], dim=-1),
     )
 
 
-#: The movements of this file by name.
+#: The movements in this file, by name.
 EXERCISES: dict[str, Callable[[Tensor, People], Act]] = {
     "picking up": pick_up,
     "drinking": drink,

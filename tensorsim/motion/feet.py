@@ -10,24 +10,24 @@ from tensorsim.motion.timing import minimum_jerk
 
 RIGHT_LEG, LEFT_LEG = JOINTS.index("right_hip"), JOINTS.index("left_hip")
 
-#: A leg bent to this share of its length, and more, reaches exactly; from there it straightens ever more slowly,
-#: where the knee of exact geometry would snap, and never beyond the sum of both numbers.
+#: Up to the first fraction of its length a leg reaches exactly. Beyond it the leg straightens ever more slowly, since
+#: with exact geometry the knee would snap, and never further than the sum of both numbers.
 _EXACT_REACH, _LAST_STRETCH = 0.985, 0.0125
 
 
 def soft_reach(wanted: Tensor, length: Tensor) -> Tensor:
-    """Distance in m from the hip to the ankle of a leg of this length whose ankle is wanted at a distance."""
+    """Actual hip-to-ankle distance in m of a leg of this length, for a wanted distance."""
     excess = (wanted / length - _EXACT_REACH).clamp(min=0.0)
     stretch = _LAST_STRETCH * torch.tanh(excess / _LAST_STRETCH)
     return torch.minimum(wanted, _EXACT_REACH * length) + length * stretch
 
 
 def two_bone_leg(hip: Tensor, ankle: Tensor, towards: Tensor, thigh: Tensor, shank: Tensor) -> Tensor:
-    """A leg from the hip to an ankle (two circles meet: the law of cosines).
+    """A leg from the hip to an ankle (intersection of two circles, law of cosines).
 
     Args:
-        hip, ankle: (..., 3) m; an ankle that is out of reach is approached on the straight line.
-        towards: (..., 3) direction to which the knee points.
+        hip, ankle: (..., 3) m; an ankle out of reach is approached along the straight line.
+        towards: (..., 3) direction in which the knee points.
         thigh, shank: (...) m.
 
     Returns:
@@ -48,7 +48,7 @@ def two_bone_leg(hip: Tensor, ankle: Tensor, towards: Tensor, thigh: Tensor, sha
 def place_ankles(joints: Tensor, ankles: Tensor, forward: Tensor, thigh: Tensor, shank: Tensor) -> Tensor:
     """Bend the legs of bodies (..., 14, 3) so that their ankles are at ``ankles`` (..., 2, 3), right and left.
 
-    Knees keep pointing where they do; straight legs bend ``forward`` (..., 3).
+    Knees keep their direction; straight legs bend ``forward`` (..., 3).
     """
     legs = []
     for side, first in ((0, RIGHT_LEG), (1, LEFT_LEG)):
@@ -63,10 +63,10 @@ class Tread(NamedTuple):
 
     Attributes:
         hold: (B, T, 2) in [0, 1], weight with which a foot is fixed to the floor.
-        since: (B, T, 2) cycles since (or, negative, until) the nearest middle of standing.
-        step: (B, T, 2) int64, the number of that step.
-        other: (B, T, 2) int64, the number of the step after it or, until its middle, before it.
-        moment: (B, K, 2) time of the middle of each step; one more at either end than occur.
+        since: (B, T, 2) cycles since (or, if negative, until) the nearest middle of a stance phase.
+        step: (B, T, 2) int64, number of that step.
+        other: (B, T, 2) int64, number of the step after it or, before its middle, of the step before it.
+        moment: (B, K, 2) time of the middle of each step, with one extra step at either end.
     """
 
     hold: Tensor
@@ -77,14 +77,14 @@ class Tread(NamedTuple):
 
 
 def tread(time: Tensor, cycle_s: Tensor, phase: Tensor, middle: float, hold: float, blend: float) -> Tread:
-    """When the feet of a periodic gait stand.
+    """Stance times of the feet in a periodic gait.
 
     Args:
         time: (B, T) s.
         cycle_s: (B,) length of a cycle.
-        phase: (B,) cycles of the right leg at time 0; the left leg is half a cycle apart.
-        middle: phase of the middle of standing.
-        hold, blend: parts of a cycle for which the foot is fixed, and over which its weight rises and
+        phase: (B,) phase in cycles of the right leg at time 0; the left leg is half a cycle apart.
+        middle: phase of the middle of stance.
+        hold, blend: fractions of a cycle for which the foot is fixed, and over which its weight rises and
             falls; ``hold + 2 blend <= 1``.
     """
     begin = phase[:, None] + torch.tensor([0.0, 0.5], dtype=time.dtype) - middle  # (B, 2) at time 0

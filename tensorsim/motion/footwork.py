@@ -1,4 +1,4 @@
-"""Steps that somebody takes while doing something on the spot: a lunge into a punch, a step back after a kick."""
+"""Steps taken during a movement on the spot: a lunge into a punch, a step back after a kick."""
 
 import torch
 from torch import Tensor
@@ -6,22 +6,22 @@ from torch import Tensor
 from tensorsim.motion.feet import LEFT_LEG, RIGHT_LEG, place_ankles
 from tensorsim.motion.timing import bell, segment
 
-#: The first foot moves in this first part of a step, the second in as long a last part.
+#: Fraction of a step in which each foot moves: the first foot at its beginning, the second at its end.
 _ONE_FOOT = 0.65
-#: How far a foot is lifted and the hips sink in the middle of a step, as a share of its length.
+#: How far a foot is lifted and the hips sink in the middle of a step, as fractions of its length.
 _LIFT, _SINK = 0.15, 0.12
 
 
 def step_about(joints: Tensor, time: Tensor, start_s: Tensor, lasts_s: Tensor, way_m: Tensor) -> Tensor:
-    """Bodies that take steps on top of what they do: the hips go along, one foot first and then the other.
+    """Add steps to the motion of bodies: the hips move along, one foot first and then the other.
 
     Bones keep their lengths; the legs bend to reach the feet (:func:`~tensorsim.motion.feet.place_ankles`).
 
     Args:
         joints: (N, K, 14, 3) m, z up from the floor.
-        time: (N, K) s of the frames.
-        start_s, lasts_s: (N, S) of each step, s.
-        way_m: (N, S, 2) from where it begins to where it ends, x and y in m.
+        time: (N, K) times of the frames in s.
+        start_s, lasts_s: (N, S) start and duration of each step in s.
+        way_m: (N, S, 2) displacement of each step, x and y in m.
 
     Returns:
         (N, K, 14, 3) m.

@@ -1,6 +1,6 @@
-"""Scatterers along the segments of the body, with the radar cross section of ellipsoids by aspect.
+"""Scatterers along the body segments, with the aspect-dependent radar cross section of ellipsoids.
 
-Segment lengths are those of Winter, *Biomechanics and Motor Control of Human Movement* (after Drillis and
+Segment lengths are from Winter, *Biomechanics and Motor Control of Human Movement* (after Drillis and
 Contini), thicknesses those of typical adults, all as fractions of the body height.
 """
 
@@ -16,9 +16,9 @@ from tensorsim.errors import TensorsimError, check_count, check_positive
 from tensorsim.motion.scatterers import RIGHTWARD, check_antenna, check_people, one_scene, weights
 from tensorsim.ops import unit
 
-#: From the ankle forward to the toes (a foot is 0.152 long).
+#: Distance from the ankle forward to the toes (a foot is 0.152 long).
 TOES = 0.12
-#: Points of a body that segments run between: the joints, and what is made of them.
+#: Points that segments run between: the joints, and points derived from them.
 POINTS = (*JOINTS, "right_toes", "left_toes")
 
 
@@ -26,10 +26,10 @@ class Segment(NamedTuple):
     """An ellipsoid of the body. Lengths are fractions of the body height.
 
     Attributes:
-        name: of the segment.
+        name: name of the segment.
         start, end: weighted means of :data:`POINTS` between which its scatterers lie.
         semi_axes: to the right of the body, forward, and along the segment; the first two are equal for limbs,
-            whose twist about their own axis cannot be told from joints.
+            whose rotation about their own axis cannot be known from joints.
     """
 
     name: str
@@ -52,7 +52,7 @@ def _limbs(side: str) -> tuple[Segment, ...]:
 
 
 SEGMENTS = (
-    # The joint called head is the nose, about the middle of the head in height.
+    # The joint called head is the nose, at about mid-height of the head.
     Segment("head", {"neck": 0.4, "head": 0.6}, {"neck": -0.4, "head": 1.4}, (0.05, 0.05, 0.066)),
     Segment("torso", {"neck": 1.0}, {"right_hip": 0.5, "left_hip": 0.5}, (0.092, 0.067, TRUNK / 2)),
     *_limbs("right"),
@@ -61,7 +61,7 @@ SEGMENTS = (
 
 
 def toes_of(knee: Tensor, ankle: Tensor, right: Tensor, toes_m: float, sole_m: float) -> Tensor:
-    """Toes (..., 2, 3) m of feet at right angles to the shanks and to ``right`` (..., 1, 3), the right of the body."""
+    """Toes (..., 2, 3) m of feet perpendicular to the shanks and to ``right`` (..., 1, 3), the body's right."""
     shank = unit(ankle - knee)
     forward = unit(torch.cross(right.expand_as(shank), shank, dim=-1))
     return ankle + toes_m * forward + sole_m * shank
@@ -77,7 +77,7 @@ def bisector(points: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
 
 
 def ellipsoid_rcs(semi_axes: Tensor, cosines_squared: Tensor) -> Tensor:
-    """Radar cross section of a conducting ellipsoid, large against the wavelength.
+    """Radar cross section of a conducting ellipsoid, large compared with the wavelength.
 
     ``sigma = pi a^2 b^2 c^2 / (a^2 sin^2 th cos^2 ph + b^2 sin^2 th sin^2 ph + c^2 cos^2 th)^2``
     (Trott, IEEE Trans. Antennas Propag. 55, 2007).
@@ -97,20 +97,20 @@ def ellipsoid_rcs(semi_axes: Tensor, cosines_squared: Tensor) -> Tensor:
 class LimbScatterers(nn.Module):
     """Scatterers along head, torso, arms, legs and feet whose cross section follows the aspect.
 
-    Each of the 12 :data:`SEGMENTS` is an ellipsoid of a body of ``height_m``; joints say where it is and how
-    it lies. Its cross section, seen from the bisector of transmitter and receiver, is shared in equal energy
-    by ``per_segment`` points along it. The ellipsoid is conducting; skin reflects a part of that power. A walking
-    body sums to -4 to -8 dBsm from all sides. The closed form is geometrical optics: at 2 GHz, where limbs are
-    as thick as the wave is long, it is a guide at most.
-    A foot is perpendicular to its shank and to the line of hips and shoulders, as 14 joints do not show it.
+    Each of the 12 :data:`SEGMENTS` is an ellipsoid of a body of ``height_m``, positioned and oriented by the joints.
+    Its cross section, seen from the bisector of transmitter and receiver, is divided equally in energy among
+    ``per_segment`` points along it. The ellipsoid is conducting; skin reflects part of that power. A walking body
+    totals -4 to -8 dBsm from all sides. The closed form is geometrical optics: at 2 GHz, where limbs are as thick
+    as the wavelength, it is only a rough guide.
+    Feet are taken as perpendicular to the shank and to the line of hips and shoulders: the 14 joints do not show them.
 
     Args:
-        tx_m, rx_m: transmitter and receiver in metres (of an array: its middle).
-        per_segment: points of a segment.
+        tx_m, rx_m: transmitter and receiver in metres (for an array, its centre).
+        per_segment: points per segment.
         height_m: body height.
-        reflectivity: power reflection of the skin; 0.34 is that of dry skin at normal incidence at 77 GHz
-            (relative permittivity about 6.6 - 9.0j, Gabriel et al., Phys. Med. Biol. 41, 1996), and it is more
-            at lower frequencies.
+        reflectivity: power reflectivity of skin; 0.34 is that of dry skin at normal incidence at 77 GHz
+            (relative permittivity about 6.6 - 9.0j, Gabriel et al., Phys. Med. Biol. 41, 1996); it is higher at
+            lower frequencies.
 
     Example:
         >>> positions, fade = torch.randn(3, 100, 14, 3), torch.ones(3, 100)  # 3 people, 100 pulses
@@ -176,7 +176,7 @@ class LimbScatterers(nn.Module):
             Positions (..., M, 12 n P, 3) m and cross sections (..., M, 12 n P) m^2 with n = ``per_segment``.
 
         Raises:
-            TensorsimError: wrong ranks or dtypes, or shapes that do not go together.
+            TensorsimError: wrong ranks or dtypes, or shapes that do not match.
         """
         check_people(positions, fade, 14)
         right = self.right.to(positions.dtype) @ positions

@@ -1,6 +1,6 @@
-"""Punches and kicks of people who train them: fists swung, single blows with a step, round kicks.
+"""Punches and kicks of trained people: swung fists, single blows with a step, roundhouse kicks.
 
-Scripts as in :mod:`.scripts`. The first blow begins at time 0; before it the person stands, or is on guard.
+Scripts as in :mod:`.scripts`. The first blow begins at time 0; before that the person stands or is on guard.
 """
 
 import math
@@ -14,16 +14,16 @@ from tensorsim.motion.timing import bell, segment
 
 
 def _seldom(time: Tensor, who: People, shortest_s: float) -> Tensor:
-    """Seconds since the latest blow, from -0.5 on where another is to come: half of the people do it only once."""
+    """Seconds since the latest blow, from -0.5 before a repeated one; half of the people strike only once."""
     period = shortest_s * (1 + 1.5 * share_of(who, 17.0)) / who.tempo[:, None]
     again = torch.where(time < 0, time, torch.remainder(time + 0.5, period) - 0.5)
     return torch.where(share_of(who, 31.0) < 0.5, time, again)
 
 
 def swing_fist(time: Tensor, who: People) -> Act:
-    """Swings one fist out sideways (a backfist) or round to the front (a hook), the trunk turning along, and back.
+    """Swings a fist out sideways (backfist) or round to the front (hook), the trunk turning along, and back.
 
-    Some do it with one arm all the time and some with both in turn.
+    Some use one arm all the time and some alternate.
     """
     v = Vary(who)
     every = v(1.5) / who.tempo[:, None]
@@ -60,9 +60,9 @@ def swing_fist(time: Tensor, who: People) -> Act:
 
 
 def punch_once(time: Tensor, who: People) -> Act:
-    """A single straight blow of the right fist with the whole body behind it, and back; some from hanging arms.
+    """A single straight blow of the right fist with the whole body behind it, and back; some start with hanging arms.
 
-    The feet stay here; steps are added by :func:`~tensorsim.motion.footwork.step_about`.
+    The feet stay in place here; steps are added by :func:`~tensorsim.motion.footwork.step_about`.
     """
     v = Vary(who)
     tempo = who.tempo[:, None]
@@ -94,7 +94,7 @@ def punch_once(time: Tensor, who: People) -> Act:
 
 
 def kick_round(time: Tensor, who: People) -> Act:
-    """Turns on the standing leg and snaps the other in an arc from the side, knee high; sets it down again."""
+    """Turns on the standing leg, snaps the other one round in an arc with a high knee, and sets it down again."""
     v = Vary(who)
     tempo = who.tempo[:, None]
     since = _seldom(time, who, 2.2)
@@ -120,7 +120,7 @@ def kick_round(time: Tensor, who: People) -> Act:
     )
     side = torch.stack([v(45.0) * up, 0 * up], dim=-1) * (math.pi / 180)
     away = math.pi / 180 * v(22.0) * poised
-    # The trunk leans away from the leg, over the foot that stands.
+    # The trunk leans away from the kicking leg, over the standing foot.
     pose = pose._replace(
         hip=torch.stack([pose.hip[..., 0], pose.hip[..., 1] + side], dim=-1),
         trunk=pose.trunk - torch.stack([0 * away, away, 0 * away], dim=-1),

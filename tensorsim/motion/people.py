@@ -1,4 +1,4 @@
-"""People: bodies and manners of moving, drawn at random from the distributions of a frozen config."""
+"""People: bodies and ways of moving, drawn at random from the distributions of a frozen config."""
 
 import math
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from tensorsim.body.proportions import Proportions
 from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_count, check_interval, check_positive
 
-#: Numbers of a movement (angles, moments) that vary from person to person, at most.
+#: Largest count of numbers of a movement (angles, times) that vary from person to person.
 VARIED_NUMBERS = 24
 
-#: Largest distance at which people start or are kept.
+#: Largest distance that start and keep ranges may have.
 FARTHEST_M = 1e6
 
 Range = tuple[float, float]
@@ -26,25 +26,25 @@ class PeopleConfig:
 
     Attributes:
         height_m: body height.
-        body_mass_index: mean and standard deviation in kg/m^2, cut at 3 deviations; times height^2 is the mass.
+        body_mass_index: mean and standard deviation in kg/m^2, cut at 3 deviations; times height^2 gives the mass.
         female_share: probability of a female body: shoulders 4 % narrower and hips 4 % wider than the mean
             (male: the reverse).
-        limb_deviation: standard deviation of the length of each segment, as a share of it, cut at 2 deviations.
-        speed_m_s: mean speed of walking.
-        heading_rad: largest turn from the line of sight, to either side.
+        limb_deviation: standard deviation of each segment length, relative to it, cut at 2 deviations.
+        speed_m_s: mean walking speed.
+        heading_rad: largest deviation of the heading from the line of sight, to either side.
         facing_radar_share: probability of heading towards the radar rather than away from it.
         start_range_m: distance y of the body at the start.
-        keep_range_m: nearest and farthest y of the hips; paths are moved along y as far as it takes to stay inside.
-        start_side_m: largest x of the middle of the path.
+        keep_range_m: nearest and farthest y of the hips; paths are shifted along y to stay inside (near limit first).
+        start_side_m: largest absolute x of the middle of the path.
         left_handed_share: probability of the mirrored movement.
-        variation: largest relative deviation of each angle and moment of a movement.
-        tempo: speed of punches, kicks and falls: 1 is that of trained strikes and of a fall without resistance,
-            whose ankles, fists and heads reach 8, 5 and 6 m/s; less for people who act them out in a room. Nobody falls
+        variation: largest relative deviation of each angle and time of a movement.
+        tempo: speed of punches, kicks and falls: 1 means trained strikes and a fall without resistance, in which
+            ankles, fists and heads reach 8, 5 and 6 m/s; lower for people who act them out in a room. Nobody falls
             faster than at 1.
 
     Raises:
-        TensorsimError: a range that is not ascending and finite, a share outside of [0, 1], a number that is not
-            finite, or sizes that no body has.
+        TensorsimError: a range that is not ascending and finite, a share outside [0, 1], a number that is not
+            finite, or impossible body sizes.
     """
 
     height_m: Range = (1.55, 1.90)
@@ -94,17 +94,17 @@ class PeopleConfig:
 
 
 class People(NamedTuple):
-    """Drawn bodies and manners of moving; every field has one entry per person.
+    """Drawn bodies and ways of moving; every field has one entry per person.
 
     Attributes:
         height_m, mass_kg: (B,).
         female, left_handed: (B,) bool.
         proportions: segments as fractions of the height, each (B,).
-        speed_m_s: (B,) mean speed of walking.
+        speed_m_s: (B,) mean walking speed.
         heading_rad: (B,) direction of the body at the start, 0 = +y (away from the radar), counter-clockwise.
-        start_m: (B, 2) middle of the path in x, and y at the start, before the path is moved to stay in range.
-        gait_phase: (B,) cycles at time 0.
-        factor: (B, VARIED_NUMBERS) around 1, one for each varying number of a movement.
+        start_m: (B, 2) middle of the path in x, and y at the start, before the path is shifted to stay in range.
+        gait_phase: (B,) gait phase in cycles at time 0.
+        factor: (B, VARIED_NUMBERS) factors around 1, one for each varying number of a movement.
         tempo: (B,) speed of punches, kicks and falls.
     """
 
@@ -121,7 +121,7 @@ class People(NamedTuple):
     tempo: Tensor
 
     def take(self, index: Tensor) -> "People":
-        """Some of these people: index (N,)."""
+        """The people with these indices (N,)."""
         fields = self._asdict()
         fields["proportions"] = Proportions(*(torch.as_tensor(p)[index] for p in self.proportions))
         return People(**{k: v if k == "proportions" else v[index] for k, v in fields.items()})
@@ -138,7 +138,7 @@ class People(NamedTuple):
 
 
 def nominal_people(count: int, height_m: float = 1.75, speed_m_s: float = 1.1) -> People:
-    """The mean body without individual deviations: facing the radar from 4 m, right-handed.
+    """Mean bodies without individual deviations: right-handed, facing the radar from 4 m.
 
     Raises:
         TensorsimError: a count below 1, a height or a speed that is not positive.
@@ -206,6 +206,6 @@ def draw_people(count: int, config: PeopleConfig, generator: torch.Generator) ->
         ),
         gait_phase=uniform(0, 1),
         factor=1 + uniform(-config.variation, config.variation, VARIED_NUMBERS),
-        # One tempo for all is not drawn: the generator stays where it was for the next draw.
+        # A fixed tempo is not drawn, so that the generator's state does not change.
         tempo=uniform(slowest, fastest) if slowest < fastest else torch.full_like(height, slowest),
     )

@@ -1,6 +1,6 @@
-"""A seeded sampler of human poses of activity videos, family by family.
+"""A seeded sampler of human poses as in activity videos, family by family.
 
-The shipped pose library is made of it and of the activities (``tensorsim library build --generate N``).
+The shipped pose library is built from it and from the activities (``tensorsim library build --generate N``).
 """
 
 import math
@@ -42,7 +42,7 @@ class _Draw:
         return standard * z.clamp(-2, 2)
 
     def stack(self, *ranges: tuple[float, float], tail: tuple[int, ...] = ()) -> Tensor:
-        """Angles (count, *tail, len(ranges)), one range each."""
+        """Angles (count, *tail, len(ranges)), each from its own range."""
         return torch.stack([self.angle(low, high, *tail) for low, high in ranges], dim=-1)
 
 
@@ -60,7 +60,7 @@ def _gait(
     def bump(centre: float, sharpness: float) -> Tensor:
         return torch.exp(sharpness * (torch.cos(2 * math.pi * (phase - centre)) - 1))
 
-    # Phase 0 is heel strike: the thigh is in front, the knee gives a little, then folds to swing through.
+    # Phase 0 is heel strike: the thigh is in front, the knee flexes a little, then bends to swing through.
     swing = torch.cos(2 * math.pi * (phase - 0.95))
     hip = stride[:, None] * (0.2 + swing)
     knee = 4 * _DEGREE + 0.25 * swing_knee[:, None] * bump(0.14, 6.0) + swing_knee[:, None] * bump(0.73, 3.0)
@@ -90,7 +90,7 @@ def _run(draw: _Draw) -> BodyPose:
 
 
 def _any_arms(draw: _Draw) -> tuple[Tensor, Tensor]:
-    """Shoulders (count, 2, 3) and elbows (count, 2) over the whole reach, low and folded ones more often."""
+    """Shoulders (count, 2, 3) and elbows (count, 2) over the whole range, low and bent ones more often."""
     flexion = draw.angle(-45, 175, 2) * draw.number(0, 1, 2).sqrt()
     abduction = draw.angle(0, 110, 2) * draw.number(0, 1, 2)
     return torch.stack([flexion, abduction, draw.angle(-30, 80, 2)], dim=-1), draw.angle(0, 140, 2)
@@ -257,7 +257,7 @@ def sample_poses(count: int, seed: int = 0, limb_deviation: float = 0.0) -> Tens
     Args:
         count: number of poses, at least one per family (13).
         seed: the same seed gives the same poses.
-        limb_deviation: standard deviation of the length of each segment, as a share of it, cut at 2 deviations.
+        limb_deviation: standard deviation of each segment length, relative to it, cut at 2 deviations.
 
     Returns:
         (count, 14, 3) float64 in body heights of the mean body, facing +y, relative to the middle of the hips.
@@ -280,6 +280,6 @@ def sample_poses(count: int, seed: int = 0, limb_deviation: float = 0.0) -> Tens
 
 
 def mirrored_half(joints: Tensor) -> Tensor:
-    """Every second pose of (L, 14, 3) replaced by its mirror image: neither hand is preferred."""
+    """Replace every second pose of (L, 14, 3) by its mirror image, so that neither hand is preferred."""
     odd = torch.arange(joints.shape[0], device=joints.device)[:, None, None] % 2 == 1
     return torch.where(odd, mirror(joints), joints)

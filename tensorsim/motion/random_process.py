@@ -1,6 +1,6 @@
 """Stationary random motion as a function of time: a sum of sinusoids with the power of a given spectrum.
 
-The value at a time does not depend on the times that are asked for before, so a long clip can be made in pieces.
+The value at a time does not depend on earlier queries, so a long clip can be generated in pieces.
 Shinozuka and Deodatis, *Simulation of stochastic processes by spectral representation*, Appl. Mech. Rev. 44, 1991.
 """
 
@@ -25,20 +25,20 @@ def sinusoids(time_s: Tensor, frequency_hz: Tensor, amplitude: Tensor, phase: Te
     Returns:
         (..., C) in the unit of the amplitude and the dtype of the time.
     """
-    # Whole turns are taken off in float64: hours of float32 phase would be noise.
+    # Whole turns are removed in float64: after hours a float32 phase would be noise.
     turns = time_s.double()[..., None, None] * frequency_hz
     angle = 2 * math.pi * (turns - turns.detach().floor()) + phase
     return (amplitude * torch.cos(angle)).sum(-1).to(time_s.dtype)
 
 
 def times_and_processes(joints: Tensor, rate_hz: float, start: int, people: int) -> tuple[Tensor, Tensor]:
-    """Times of the frames of joints (..., P, T, 14, 3), and which of ``people`` processes each person has.
+    """Frame times of joints (..., P, T, 14, 3), and which of ``people`` processes each person uses.
 
     Args:
         joints: their first frame is number ``start`` of a clip.
         rate_hz: frames per second.
         start: number of the first frame.
-        people: number of processes; person p has ``p % people``.
+        people: number of processes; person p uses number ``p % people``.
 
     Returns:
         (T,) float64 seconds and (P,) indices.
@@ -52,15 +52,15 @@ class RandomProcess(nn.Module):
     """Independent Gaussian processes with one power spectrum.
 
     Args:
-        spectrum: one-sided power density by frequency in Hz, in any unit: only its form counts.
+        spectrum: one-sided power density over frequency in Hz, in any unit: only its shape matters.
         band_hz: lowest and highest frequency; the band is cut into cells of equal ratio, and each process has
             one sinusoid at a random place in every cell.
         rms: root mean square of each process.
-        copies: how many processes.
-        seed: of frequencies and phases.
-        count: sinusoids of a process.
+        copies: number of processes.
+        seed: for frequencies and phases.
+        count: sinusoids per process.
 
-    Shapes: seconds (...) and how many of the copies (the default is all) -> (..., copies). Differentiable.
+    Shapes: seconds (...) and the number of copies (default all) -> (..., copies). Differentiable.
 
     Raises:
         TensorsimError: a band that is not ascending and positive, an rms below 0, counts below 1, a time that is

@@ -23,7 +23,7 @@ from tensorsim.errors import (
 
 
 def natural_spline_curvature(y: Tensor, interval: float) -> Tensor:
-    """Second derivatives, at its knots, of the natural cubic spline through equidistant knots.
+    """Second derivatives at the knots of the natural cubic spline through equidistant knots.
 
     They solve ``m[k-1] + 4 m[k] + m[k+1] = 6 (y[k-1] - 2 y[k] + y[k+1]) / interval^2`` with ``m = 0`` at both
     ends. Extended as an odd function beyond the ends the system is circulant: the FFT solves it without a
@@ -31,10 +31,10 @@ def natural_spline_curvature(y: Tensor, interval: float) -> Tensor:
 
     Args:
         y: (..., T, J, 3) values at the knots, T >= 2.
-        interval: distance of the knots.
+        interval: distance between knots.
 
     Returns:
-        Tensor of the shape of ``y``.
+        Tensor of the same shape as ``y``.
     """
     if y.numel() == 0:
         return torch.zeros_like(y)
@@ -56,7 +56,7 @@ def evaluate_cubic(y: Tensor, curvature: Tensor, interval: float, times: Tensor)
 
     Args:
         y, curvature: (..., T, J, 3), T >= 2.
-        interval: distance of the knots.
+        interval: distance between knots.
         times: (M,) >= 0, in intervals: knot k is at time k.
 
     Returns:
@@ -97,7 +97,7 @@ class PoseResampler(nn.Module):
         >>> whole.shape
         torch.Size([2, 8192, 14, 3])
 
-        The same in pieces, for clips whose pulses do not fit the memory:
+        The same in pieces, for clips whose pulses do not fit in memory:
 
         >>> coefficients = resampler.coefficients(joints, 30.0)
         >>> piece = resampler.evaluate(coefficients, 30.0, 1000, 1100)
@@ -116,7 +116,7 @@ class PoseResampler(nn.Module):
         self.method = method
 
     def forward(self, joints: Tensor, fps: float) -> Tensor:
-        """Resample joints (..., T, J, 3) of ``fps`` frames per second to (..., M, J, 3) float64.
+        """Resample joints (..., T, J, 3) at ``fps`` frames per second to (..., M, J, 3) float64.
 
         Raises:
             TensorsimError: wrong shape, fewer than 2 frames, NaN, fps not positive, or a clip shorter than a
@@ -185,7 +185,7 @@ class PoseResampler(nn.Module):
             )
         times = torch.arange(start, stop, dtype=torch.float64, device=coefficients.device) * fps / self.prf_hz
         positions, accelerations = coefficients.unbind(-4)
-        # In pieces that fit the cache of the processor: several times faster than all pulses at once.
+        # In pieces that fit into the processor's cache: several times faster than all pulses at once.
         per_pulse = max(1, positions.numel() // positions.shape[-3])
         pieces = times.split(max(1, 131072 // per_pulse))
         return torch.cat(

@@ -1,6 +1,6 @@
-"""Radar cross sections of skin and clothes: rough surfaces, large against the wavelength.
+"""Radar cross sections of skin and clothes: rough surfaces, large compared with the wavelength.
 
-A surface whose slopes are Gaussian reflects from wherever a facet happens to face the radar (Barrick, *Rough surface
+A surface with Gaussian slopes reflects wherever a facet happens to face the radar (Barrick, *Rough surface
 scattering based on the specular point theory*, IEEE Trans. Antennas Propag. 16, 1968). Facets are many wavelengths
 apart, so that powers add.
 """
@@ -25,7 +25,7 @@ def skin_permittivity(frequency_hz: float) -> complex:
 
 
 def skin_reflectivity(frequency_hz: float) -> float:
-    """Power that skin reflects at normal incidence: 0.34 at 77 GHz, 0.52 at 5.8 GHz."""
+    """Power reflectivity of skin at normal incidence: 0.34 at 77 GHz, 0.52 at 5.8 GHz."""
     index = skin_permittivity(frequency_hz) ** 0.5
     return abs((1 - index) / (1 + index)) ** 2
 
@@ -33,13 +33,13 @@ def skin_reflectivity(frequency_hz: float) -> float:
 def patch_rcs(area: Tensor, cosine: Tensor, roughness: float) -> Tensor:
     """Cross section of flat patches of a perfectly reflecting rough surface.
 
-    ``sigma = A / (2 s^2) sec^4 th exp(-tan^2 th / (2 s^2))``, which over a large sphere of radius r sums to
-    ``pi r^2 (1 + s^2)`` nearly, and for s -> 0 over any smooth body to ``pi R1 R2`` of geometrical optics.
+    ``sigma = A / (2 s^2) sec^4 th exp(-tan^2 th / (2 s^2))``, which sums to nearly ``pi r^2 (1 + s^2)`` over a
+    large sphere of radius r and, for s -> 0 over any smooth body, to ``pi R1 R2`` of geometrical optics.
 
     Args:
         area: (...) m^2.
-        cosine: (...) between the normal and the direction to the radar; patches that face away reflect nothing.
-        roughness: s, root mean square of the slopes along each axis; small against 1.
+        cosine: (...) of the angle between normal and direction to the radar; patches that face away reflect nothing.
+        roughness: s, root mean square slope along each axis; much less than 1.
 
     Returns:
         (...) m^2, smooth in the cosine.
@@ -51,13 +51,13 @@ def patch_rcs(area: Tensor, cosine: Tensor, roughness: float) -> Tensor:
 def cylinder_rcs(area: Tensor, sine_squared: Tensor, roughness: float) -> Tensor:
     """Cross section of rough cylinders: :func:`patch_rcs` integrated around the circumference.
 
-    ``sigma = a l sqrt(pi / 2) / s sec^3 th (1 + s^2 cos^2 th) exp(-tan^2 th / (2 s^2))``, th the tilt of the axis
-    out of the plane that the radar sees broadside.
+    ``sigma = a l sqrt(pi / 2) / s sec^3 th (1 + s^2 cos^2 th) exp(-tan^2 th / (2 s^2))``, th being the tilt of
+    the axis out of the plane that the radar sees broadside.
 
     Args:
         area: (...) radius times length a l, m^2.
-        sine_squared: (...) of the tilt.
-        roughness: as of patches.
+        sine_squared: (...) squared sine of the tilt.
+        roughness: as for patches.
 
     Returns:
         (...) m^2.

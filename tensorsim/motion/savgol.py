@@ -26,17 +26,17 @@ def polynomial_basis(window: int, order: int) -> Tensor:
 
 
 def savitzky_golay(x: Tensor, basis: Tensor, dim: int, direct_window: int = 64) -> Tensor:
-    """The centre of the least-squares polynomial of each window; at the ends, all of the last polynomial.
+    """The centre value of each window's least-squares polynomial; at the ends, the whole first or last polynomial.
 
     Args:
         x: real tensor with at least ``window`` samples along ``dim``.
         basis: (window, order + 1) float64, see :func:`polynomial_basis`; the window is odd.
         dim: the time axis.
-        direct_window: windows up to this length are summed sample by sample, longer ones go through the FFT;
-            memory stays a small multiple of x either way.
+        direct_window: windows up to this length are summed sample by sample, longer ones use the FFT; memory stays
+            a small multiple of x either way.
 
     Returns:
-        Tensor of the shape and dtype of ``x``; computed in float64.
+        Tensor of the same shape and dtype as ``x``; computed in float64.
     """
     window = basis.shape[0]
     half = window // 2
@@ -48,7 +48,7 @@ def savitzky_golay(x: Tensor, basis: Tensor, dim: int, direct_window: int = 64) 
         for k in range(window):
             middle.addcmul_(signal.narrow(dim, k, frames - 2 * half), kernel[k])
     else:
-        # Circular over the whole signal: the wrapped samples are those that the ends replace.
+        # Circular over the whole signal: the samples that wrap around are replaced at the ends.
         response = torch.fft.rfft(kernel, n=frames).conj()
         spectrum = torch.fft.rfft(signal.movedim(dim, -1)) * response
         middle = torch.fft.irfft(spectrum, n=frames)[..., : frames - 2 * half].movedim(-1, dim)
@@ -64,7 +64,7 @@ class SavitzkyGolay(nn.Module):
 
     Args:
         window: odd number of samples.
-        order: of the polynomial, below ``window``.
+        order: order of the polynomial, below ``window``.
         dim: the time axis; the default is that of joints (..., T, J, 3).
 
     Example:

@@ -14,24 +14,24 @@ from tensorsim.errors import TensorsimError, check_min_rank, check_positive, che
 def visibility_fade(
     valid: Tensor, fps: float, prf_hz: float, start: int, stop: int, fade_s: float = 0.1
 ) -> Tensor:
-    """Amplitude of people who enter and leave, at pulses ``start`` to ``stop`` (excluded), free of steps.
+    """Amplitude of people who enter and leave, at pulses ``start`` to ``stop`` (excluded), without steps.
 
-    An echo that is switched on within one pulse splashes over all Doppler bins. Here the amplitude rises as a
+    An echo switched on within one pulse would spread over all Doppler bins. Here the amplitude rises as a
     raised cosine over ``fade_s`` after the first valid frame of a run and falls likewise before its last one;
-    it is zero between. A run that reaches the first or last frame of the clip is not faded there: the person
+    between runs it is zero. A run that reaches the first or last frame of the clip is not faded there: the person
     is in the scene before and after.
 
     Args:
         valid: (..., T) bool at video rate, frame k at ``k / fps``.
         fps, prf_hz: rates of frames and pulses.
         start, stop: pulses, ``0 <= start <= stop``.
-        fade_s: length of a flank in seconds.
+        fade_s: length of a rise or fall in seconds.
 
     Returns:
         (..., stop - start) float64 in [0, 1].
 
     Raises:
-        TensorsimError: valid not boolean or without frames, or a rate, range or flank that is not possible.
+        TensorsimError: valid not boolean or without frames, or an impossible rate, range or ``fade_s``.
     """
     if valid.dtype != torch.bool:
         raise TensorsimError(f"valid: got dtype {valid.dtype}, expected bool")
@@ -47,7 +47,7 @@ def visibility_fade(
     if not 0 <= start <= stop:
         raise TensorsimError(f"visibility_fade: got pulses {start} to {stop}, expected 0 <= start <= stop")
 
-    # Frame T, the end of the clip, goes on like the last one.
+    # Frame T, the end of the clip, is like the last frame.
     present = torch.cat([valid, valid[..., -1:]], dim=-1)
     frame = torch.arange(frames + 1, dtype=torch.float64, device=valid.device)
     ever = torch.full_like(frame, float("inf"))
@@ -79,18 +79,18 @@ def one_scene(points: Tensor, rcs: Tensor, fade: Tensor) -> tuple[Tensor, Tensor
 
     Args:
         points: (..., P, M, K, 3) metres, K scatterers per person.
-        rcs: (..., P, M, K) or what broadcasts to it, m^2.
+        rcs: (..., P, M, K) or broadcastable to it, m^2.
         fade: (..., P, M) amplitude of each person.
 
     Returns:
         Positions (..., M, P * K, 3) and cross sections (..., M, P * K), both in the dtype of the points.
-        Amplitude goes with the square root of the cross section, so a person counts ``fade ** 2`` times.
+        Amplitude is proportional to the square root of the cross section, so cross sections scale with ``fade ** 2``.
     """
     shown = (fade.square().unsqueeze(-1) * rcs).to(points.dtype)
     return points.transpose(-4, -3).flatten(-3, -2), shown.transpose(-3, -2).flatten(-2)
 
 
-#: Weights of the joints whose sum points to the right of the body.
+#: Joint weights whose weighted sum points to the right of the body.
 RIGHTWARD = {"right_shoulder": 0.5, "right_hip": 0.5, "left_shoulder": -0.5, "left_hip": -0.5}
 
 
@@ -101,7 +101,7 @@ def check_antenna(name: str, position: Vector) -> None:
 
 
 def weights(names: Sequence[str], *points: dict[str, float]) -> Tensor:
-    """Points that are weighted sums of named ones, as a matrix (points, names) float64."""
+    """Weights of points that are weighted sums of named ones, as a matrix (points, names) float64."""
     return torch.tensor([[point.get(name, 0.0) for name in names] for point in points], dtype=torch.float64)
 
 
@@ -109,9 +109,9 @@ class JointScatterers(nn.Module):
     """One point scatterer per joint; the people of a clip become one scene.
 
     Args:
-        rcs_m2: radar cross section of each joint in m^2; the default is the original's panel.
-        learnable: whether the table is a parameter, to be fitted to an echo from ``rcs_m2`` on. What is learned
-            is its logarithm ``log_rcs_m2``, so that it stays positive and a step is a step in dB.
+        rcs_m2: radar cross section of each joint in m^2; the default is that of the original's panel.
+        learnable: whether the table is a parameter, to be fitted to an echo starting from ``rcs_m2``. The learned
+            parameter is its logarithm ``log_rcs_m2``, so that it stays positive and steps are in dB.
 
     Example:
         >>> positions, fade = torch.randn(2, 3, 100, 14, 3), torch.ones(2, 3, 100)  # 2 scenes, 3 people, 100 pulses
@@ -142,7 +142,7 @@ class JointScatterers(nn.Module):
         self.register_parameter("log_rcs_m2", nn.Parameter(table.log()) if learnable else None)
 
     def table(self) -> Tensor:
-        """The cross sections (J,) in m^2 as they are now; differentiable by ``log_rcs_m2`` if learnable."""
+        """The current cross sections (J,) in m^2; differentiable with respect to ``log_rcs_m2`` if learnable."""
         log_rcs_m2 = self.log_rcs_m2
         return self.rcs_m2 if log_rcs_m2 is None else log_rcs_m2.exp()
 
@@ -158,8 +158,7 @@ class JointScatterers(nn.Module):
             and in the dtype of the positions, see :func:`one_scene`.
 
         Raises:
-            TensorsimError: wrong ranks or dtypes, another number of joints, or shapes that do not go
-                together.
+            TensorsimError: wrong ranks or dtypes, another number of joints, or shapes that do not match.
         """
         check_people(positions, fade, self.rcs_m2.shape[0])
         return one_scene(positions, self.table().to(positions.dtype), fade)

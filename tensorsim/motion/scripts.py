@@ -24,7 +24,7 @@ from tensorsim.motion.timing import bell, minimum_jerk, segment, toppling_angles
 
 
 def _repeated(time: Tensor, start: Tensor, period: Tensor) -> Tensor:
-    """Seconds since the latest start of a movement that repeats; negative before the first."""
+    """Seconds since the latest start of a repeating movement; negative before the first."""
     since = time - start
     return torch.where(since < 0, since, torch.remainder(since, period))
 
@@ -35,7 +35,7 @@ def stand(time: Tensor, who: People) -> Act:
 
 
 def punch(time: Tensor, who: People) -> Act:
-    """Guard; right and left fists shoot out in turn, every 0.6 s."""
+    """On guard; right and left fists shoot out alternately, every 0.6 s."""
     v = Vary(who)
     guard, fold, out, straight = v(35.0), v(115.0), v(85.0), v(10.0)
     turn, extend, back, every, first = v(25.0), v(0.16), v(0.28), v(0.6), v(0.4)
@@ -92,7 +92,7 @@ def kick(time: Tensor, who: People) -> Act:
     aloft = segment(since, 0.0 * t1, 0.5 * t1) - segment(since, t4 - 0.5 * lower, t4)
     hold = torch.stack([1 - aloft, torch.ones_like(time)], dim=-1)
     support = torch.stack([0 * time, 0 * time + 1], dim=-1)
-    # The hips sway over the standing foot.
+    # The hips shift over the standing foot.
     width = (who.proportions.half_hips * who.height_m)[:, None]
     zero = torch.zeros_like(time)
     offset = torch.stack([-0.7 * width * poised, zero, zero], dim=-1)
@@ -100,7 +100,7 @@ def kick(time: Tensor, who: People) -> Act:
 
 
 def grab(time: Tensor, who: People) -> Act:
-    """Bows and reaches forward, holds, and draws the hands back with bent elbows."""
+    """Leans and reaches forward, holds, and draws the hands back with bent elbows."""
     v = Vary(who)
     reach, hold, back, start = v(0.9), v(0.35), v(1.0), v(0.3)
     since = _repeated(time, start, reach + hold + back + v(0.3))
@@ -126,7 +126,7 @@ def grab(time: Tensor, who: People) -> Act:
 
 
 def _seat(time: Tensor, who: People, v: Vary, seated: Tensor, bow: Tensor) -> BodyPose:
-    """Between standing (``seated`` 0) and sitting (1), with the trunk bowing on the way."""
+    """Between standing (``seated`` 0) and sitting (1), the trunk leaning forward on the way."""
     passing = 4 * seated * (1 - seated)
     hip = REST_HIP + (90 - REST_HIP) * seated
     knee = REST_KNEE + (90 - REST_KNEE) * seated + v(16.0) * passing
@@ -152,7 +152,7 @@ def sit_down(time: Tensor, who: People) -> Act:
 
 
 def stand_up(time: Tensor, who: People) -> Act:
-    """Stands up in 1.7 s; the trunk bows 0.3 s ahead of the legs."""
+    """Stands up in 1.7 s; the trunk leans forward 0.3 s before the legs move."""
     v = Vary(who)
     start = v(1.0)
     end, lead = start + v(1.7), v(0.3)
@@ -161,7 +161,7 @@ def stand_up(time: Tensor, who: People) -> Act:
 
 
 def rotate(time: Tensor, who: People) -> Act:
-    """A full turn in 4 s, stepping on the spot, then the next."""
+    """Full turns of 4 s each, stepping on the spot."""
     v = Vary(who)
     last, step = v(4.0), v(1 / 0.9)
     turns = time / last
@@ -219,9 +219,9 @@ def walk_to_sit(time: Tensor, who: People) -> Act:
 
 
 def over_the_knees(time: Tensor, who: People, v: Vary, down: Tensor, kneel: Tensor) -> BodyPose:
-    """Between standing (``down`` 0) and lying prone (1), over the knees and hands where ``kneel`` is 1."""
+    """Between standing (``down`` 0) and lying prone (1), by way of the knees and hands where ``kneel`` is 1."""
     arms = 2 + 170 * down - 60 * kneel
-    rest = 1 - 0.4 * down  # legs straighten when they carry nothing
+    rest = 1 - 0.4 * down  # unloaded legs straighten
     return make_pose(
         time,
         who,
@@ -236,7 +236,7 @@ def over_the_knees(time: Tensor, who: People, v: Vary, down: Tensor, kneel: Tens
 
 
 def fall_to_walk(time: Tensor, who: People) -> Act:
-    """Lies prone, gets up over the knees and walks off."""
+    """Lies prone, gets up by way of the knees and walks off."""
     v = Vary(who)
     start = v(0.25)
     end = start + v(1.6)
@@ -254,7 +254,7 @@ _TOPPLING = toppling_angles(_TOPPLING_STEP_S, smooth_s=0.125)
 
 
 def toppling(since: Tensor, height_m: Tensor) -> Tensor:
-    """Degrees from the vertical, ``since`` seconds (B, T) after the fall of bodies of a height (B,) begins."""
+    """Degrees from the vertical, ``since`` seconds (B, T) after the start of a fall, for body heights (B,)."""
     at = since / (height_m[:, None] / 1.75).sqrt() / _TOPPLING_STEP_S
     at = at.clamp(0.0, len(_TOPPLING) - 1.001)
     before = torch.floor(at).long()
@@ -262,7 +262,7 @@ def toppling(since: Tensor, height_m: Tensor) -> Tensor:
 
 
 def fall_tempo(who: People) -> Tensor:
-    """Tempo (B, 1) of falls: none is faster than one without resistance."""
+    """Tempo (B, 1) of falls, limited to that of a fall without resistance."""
     return who.tempo[:, None].clamp(max=1.0)
 
 

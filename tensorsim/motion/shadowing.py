@@ -1,4 +1,4 @@
-"""People who stand in front of others."""
+"""Shadowing of people by others in front of them."""
 
 import math
 
@@ -14,7 +14,7 @@ def segment_distance(origin: Tensor, ends: Tensor, start: Tensor, stop: Tensor) 
     """Shortest distance from segments ``origin`` - ``ends`` to segments ``start`` - ``stop``.
 
     The minimum of a quadratic over two parameters in [0, 1] (Ericson, *Real-Time Collision Detection*, 5.1.9),
-    written in scalar products alone, so that no vector per pair is kept.
+    written with scalar products only, so that no vector per pair is stored.
 
     Args:
         origin: (3,) common end of the first segments, metres.
@@ -50,18 +50,18 @@ class Shadowing(nn.Module):
 
     The torso of a person is a capsule about the line from the neck to the middle of the hips. A leg (from the
     transmitter to a scatterer, or back to the receiver) that comes closer to the axis of somebody else's torso
-    than ``radius_m`` loses ``attenuation_db``, both legs twice that; several people in the way add up. Nobody
-    shadows themselves, and a person who fades in or out of the scene shadows as much as is seen of them.
-    Waves do not bend around the capsule, and scatterers inside it (an embrace) are shadowed.
+    than ``radius_m`` loses ``attenuation_db``, both legs together twice that; losses of several people add up. Nobody
+    shadows themselves, and people who fade in or out cast a shadow in proportion to their visibility.
+    There is no diffraction around the capsule, and scatterers inside it (an embrace) are shadowed.
 
     Args:
-        scatterers: the model, joints -> scatterers of one scene, person after person, with an equal count each.
-        tx_m, rx_m: transmitter and receiver in metres (of an array: its middle).
+        scatterers: the model, joints -> scatterers of one scene, person after person, with the same number each.
+        tx_m, rx_m: transmitter and receiver in metres (for an array, its centre).
         attenuation_db: one-way loss of power behind a body; measured at 60 GHz: 20 dB and more (Collonge,
             Zaharia and El Zein, IEEE Trans. Wireless Commun. 3, 2004).
         radius_m: radius of the capsule.
-        edge_m: softness of its edge. At the edge the loss is half its dB, and falls from 9/10 to 1/10 within
-            4.4 times this; the default is about a Fresnel zone at 77 GHz and 3 m. 0 is a hard edge, whose
+        edge_m: softness of its edge. At the edge the loss in dB is half, and falls from 9/10 to 1/10 within 4.4
+            times this; the default is about a Fresnel zone at 77 GHz and 3 m. 0 is a hard edge, whose
             position has no gradient.
 
     Example:
@@ -111,7 +111,7 @@ class Shadowing(nn.Module):
         Any range of pulses; P may be 0. Differentiable.
 
         Raises:
-            TensorsimError: wrong ranks or dtypes, or shapes that do not go together.
+            TensorsimError: wrong ranks or dtypes, or shapes that do not match.
         """
         check_people(positions, fade, 14)
         scene, rcs = self.scatterers(positions, fade)
@@ -129,7 +129,7 @@ class Shadowing(nn.Module):
         return scene, rcs * 10 ** (-loss_db / 10)
 
     def _blocked(self, antenna: Tensor, scene: Tensor, neck: Tensor, hips: Tensor) -> Tensor:
-        """How much of legs from (3,) to (..., S, 3) torsos (..., Q, 3) block: (..., S, Q) in [0, 1]."""
+        """How much the torsos (..., Q, 3) block the legs from (3,) to (..., S, 3): (..., S, Q) in [0, 1]."""
         inside = self.radius_m - segment_distance(antenna, scene, neck, hips)
         if self.edge_m == 0.0:
             return (inside > 0).to(inside.dtype)

@@ -1,4 +1,4 @@
-"""Postural sway: nobody stands still."""
+"""Postural sway: nobody stands perfectly still."""
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +11,7 @@ from tensorsim.motion.random_process import RandomProcess, times_and_processes
 from tensorsim.motion.scatterers import RIGHTWARD, weights
 from tensorsim.ops import unit
 
-#: Height of the centre of mass over the ankles, of a body of 1.75 m; sway is quoted there.
+#: Height of the centre of mass above the ankles, for a body of 1.75 m; sway amplitudes refer to it.
 MASS_HEIGHT_M = (SHANK + THIGH + 0.03) * 1.75
 #: Frequencies of quiet standing in Hz.
 BAND_HZ = (0.03, 4.0)
@@ -20,28 +20,28 @@ CORNER_HZ = 0.3
 
 
 def sway_spectrum(frequency_hz: Tensor) -> Tensor:
-    """Form of the power density of sway: flat at first, with the inverse square from 0.3 Hz on."""
+    """Shape of the power density of sway: flat up to about 0.3 Hz, then falling with the square of the frequency."""
     return 1 / (1 + (frequency_hz / CORNER_HZ).square())
 
 
 class PosturalSway(nn.Module):
-    """Lets bodies sway over their ankles, each person like an inverted pendulum of its own.
+    """Makes bodies sway over their ankles, each person as an independent inverted pendulum.
 
-    A joint moves horizontally in proportion to its height over the lower ankle: standing bodies sway, lying ones do
-    not. Forward and sideways sway are independent. Root mean squares of the centre of mass of young adults with open
+    A joint moves horizontally in proportion to its height above the lower ankle: standing bodies sway, lying ones do
+    not. Forward and sideways sway are independent. Rms values at the centre of mass of young adults with open
     eyes are 3 to 6 mm forward and 2 to 4 mm sideways (Prieto et al., *Measures of postural steadiness*, IEEE Trans.
-    Biomed. Eng. 43, 1996); above about 0.3 Hz the power falls with the square of the frequency, as that of a random
+    Biomed. Eng. 43, 1996); above about 0.3 Hz the power falls with the square of the frequency, as for a random
     walk (Collins and De Luca, *Open-loop and closed-loop control of posture*, Exp. Brain Res. 95, 1993).
 
-    Sway is a function of time alone: pieces of a clip give what the whole clip gives.
+    Sway is a function of time alone: processing a clip in pieces gives the same result as the whole clip.
 
     Args:
-        rate_hz: rate of the joints, video's or the pulses'.
-        forward_rms_m, sideways_rms_m: at the height of the centre of mass, 0.91 m over the ankles.
-        people: persons with a sway of their own; person p has that of ``p % people``.
-        seed: of the sway.
+        rate_hz: rate of the joints, that of the video or of the pulses.
+        forward_rms_m, sideways_rms_m: at the height of the centre of mass, 0.91 m above the ankles.
+        people: number of independent sways; person p uses number ``p % people``.
+        seed: for the sway.
 
-    Shapes: joints (..., P, T, 14, 3) metres -> likewise. Differentiable.
+    Shapes: joints (..., P, T, 14, 3) metres -> the same. Differentiable.
 
     Raises:
         TensorsimError: a rate that is not positive, an rms below 0, ``people`` below 1, joints of another shape.

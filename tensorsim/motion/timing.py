@@ -1,4 +1,4 @@
-"""Time courses of movements: from rest to rest, there and back, accelerating, falling over."""
+"""Time profiles of movements: from rest to rest, there and back, accelerating, falling over."""
 
 import math
 
@@ -20,23 +20,23 @@ def segment(time: Tensor, start: Tensor, end: Tensor) -> Tensor:
 
 
 def bell(time: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    """``sin^2`` from 0 at ``start`` over 1 in the middle to 0 at ``end``; 0 outside."""
+    """``sin^2`` that is 0 at ``start``, 1 in the middle and 0 at ``end``; 0 outside."""
     share = ((time - start) / (end - start)).clamp(0.0, 1.0)
     return torch.sin(math.pi * share).square()
 
 
 def travel(time: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    """Seconds walked at full speed, for a speed that rises by :func:`minimum_jerk` from start to end."""
+    """Equivalent seconds at full speed, for a speed that rises by :func:`minimum_jerk` from start to end."""
     span = end - start
     share = ((time - start) / span).clamp(0.0, 1.0)
     return span * share**4 * (2.5 + share * (share - 3)) + (time - end).clamp(min=0.0)
 
 
 def landing(share: Tensor, brake: float = 0.2) -> Tensor:
-    """``s^2``, a fall from rest, braked: 0 until ``s`` is 0, 1 from ``1 + brake`` on, without a step in speed.
+    """``s^2``, a fall from rest, with braking: 0 up to ``s = 0``, 1 from ``1 + brake`` on, without a jump in speed.
 
-    It is the square stopped at 1, smoothed by a triangle of that length, in closed form: the second difference of the
-    square's second integral.
+    It is the square, stopped at 1 and smoothed by a triangle of length ``brake``, in closed form: the second difference
+    of its second integral.
     """
     half = brake / 2
 
@@ -49,7 +49,7 @@ def landing(share: Tensor, brake: float = 0.2) -> Tensor:
 
 
 def toppling_angles(step_s: float, smooth_s: float) -> Tensor:
-    """Fall of a rod of 1.75 m about its foot: angles from the vertical in degrees, every ``step_s`` seconds.
+    """Fall of a 1.75 m rod about its foot: angles from the vertical in degrees, every ``step_s`` seconds.
 
     ``theta'' = (1.5 g / 0.95 H) sin(theta) - 0.25 theta'`` from 4 degrees and 0.6 rad/s to a stop at 88 degrees,
     smoothed by a Hann window of ``smooth_s``, from rest.
@@ -66,7 +66,7 @@ def toppling_angles(step_s: float, smooth_s: float) -> Tensor:
         middle = angle + step_s / 2 * speed
         angle += step_s * half
         speed += step_s * (pull * math.sin(middle) - 0.25 * half)
-    lead = round(0.25 / step_s)  # standing tips over to 4 degrees at 0.6 rad/s before gravity takes it
+    lead = round(0.25 / step_s)  # tips from standing to 4 degrees at 0.6 rad/s before gravity takes over
     s = torch.arange(lead, dtype=torch.float64) / lead
     first, rate = angles[0], 0.6 * lead * step_s
     # The quintic from rest at 0 to this angle and speed with the rod's acceleration.

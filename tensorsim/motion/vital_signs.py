@@ -18,7 +18,7 @@ from tensorsim.motion.scatterers import RIGHTWARD, weights
 from tensorsim.ops import unit
 
 Range = tuple[float, float]
-#: Deviation of the instant of a breath or beat from an even rhythm, in cycles, and how fast it changes in Hz.
+#: Deviation of a breath's or beat's timing from an even rhythm, in cycles, and how fast it changes, in Hz.
 WANDER_CYCLES = 0.15
 WANDER_HZ = (0.01, 0.1)
 
@@ -26,21 +26,21 @@ WANDER_HZ = (0.01, 0.1)
 class VitalSigns(nn.Module):
     """Moves the chest: breathing of 4 to 12 mm at 0.2 to 0.4 Hz, heartbeat of 0.2 to 0.5 mm at 1 to 1.7 Hz.
 
-    Peak-to-peak numbers of adults at rest (DeGroote et al., *Chest wall motion during tidal breathing*, J. Appl.
+    Peak-to-peak values for adults at rest (DeGroote et al., *Chest wall motion during tidal breathing*, J. Appl.
     Physiol. 83, 1997; Ramachandran and Singh, *Three-dimensional reconstruction of cardiac displacement patterns on
-    the chest wall*, Med. Biol. Eng. Comput. 27, 1989). The neck moves forward and back, at right angles to the
-    trunk, and the trunk's upper end with it; hips and all other joints stay. Both rhythms wander a little.
+    the chest wall*, Med. Biol. Eng. Comput. 27, 1989). The neck moves forward and back, perpendicular to the
+    trunk, and the trunk's upper end with it; hips and all other joints stay. Both rhythms vary a little.
 
-    The motion is a function of time alone: pieces of a clip give what the whole clip gives.
+    The motion is a function of time alone: processing a clip in pieces gives the same result as the whole clip.
 
     Args:
-        rate_hz: rate of the joints, video's or the pulses'.
+        rate_hz: rate of the joints, that of the video or of the pulses.
         breath_m, breath_hz: ranges from which each person's depth (peak to peak) and rate are drawn, uniformly.
-        heart_m, heart_hz: likewise of the heartbeat.
-        people: persons with a rhythm of their own; person p has that of ``p % people``.
-        seed: of the draw.
+        heart_m, heart_hz: likewise for the heartbeat.
+        people: number of independent rhythms; person p uses number ``p % people``.
+        seed: for the draw.
 
-    Shapes: joints (..., P, T, 14, 3) metres -> likewise. Differentiable.
+    Shapes: joints (..., P, T, 14, 3) metres -> the same. Differentiable.
 
     Raises:
         TensorsimError: a rate that is not positive, a range that does not ascend from 0 or more, ``people`` below 1,
@@ -88,7 +88,7 @@ class VitalSigns(nn.Module):
     def displacement_m(self, time_s: Tensor, people: int | None = None) -> Tensor:
         """Chest displacement (..., people) in metres, forward positive, at times (...) in seconds.
 
-        Those of the first ``people``; the default is all.
+        For the first ``people``; default all.
         """
         check_floating(time_s, "time_s")
         own = self.people if people is None else min(people, self.people)
