@@ -1,6 +1,6 @@
-"""A body of round volumes on the 14 joints: what is rigid at each, and the COCO keypoints that it carries.
+"""A body of rounded volumes around the 14 joints, and its COCO keypoints.
 
-Sizes are metres on a body 1.75 m tall and scale with the height; they are those of adults (Gordon et al., *ANSUR*,
+Sizes are in metres for a body 1.75 m tall and scale with the height; they are those of adults (Gordon et al., *ANSUR*,
 medians of both sexes), joined so that silhouettes have no gaps.
 """
 
@@ -16,27 +16,27 @@ from tensorsim.body.skeleton import body_height, body_to_coco, mid_hips
 from tensorsim.render.cast import Volumes
 
 REFERENCE_HEIGHT_M = 1.75
-#: The nose before the middle of the head, and the place of the head over the middle of the shoulders.
+#: Position of the nose relative to the centre of the head: forward and up.
 NOSE_FORWARD, NOSE_UP = 0.102, -0.005
-#: Angle from upright to the direction of the nose from the middle of the shoulders, of a body that looks ahead.
+#: Angle between upright and the direction from mid-shoulders to the nose, for a body that looks straight ahead.
 NOSE_TILT = math.atan2(proportions.NOSE_FORWARD, proportions.NOSE_UP)
 
-#: Eyes and ears from the middle of the head, (right, front, up), right side.
+#: Positions of eyes and ears relative to the centre of the head, (right, front, up), right side.
 EYE = (0.032, 0.086, 0.028)
 EAR = (0.076, -0.005, 0.012)
 
-#: Parts of the body by what covers them; the index is the ``part`` of a volume.
+#: Body parts, by what covers them; the index is the ``part`` of a volume.
 PARTS = ("head", "neck", "trunk", "hips", "upper_arm", "forearm", "hand", "thigh", "shank", "shoe")
 
 
 class Body(NamedTuple):
-    """Volumes of one person over time, and what they are.
+    """Volumes of one person over time, and the parts they belong to.
 
     Attributes:
         volumes: :class:`Volumes` with leading (T, S).
         part: (S,) int64 index into PARTS.
         keypoints: (T, 17, 3) COCO keypoints in the world.
-        height_m: standing height, the median over time of that from the lengths of bones.
+        height_m: standing height, computed from bone lengths, median over time.
     """
 
     volumes: Volumes
@@ -46,7 +46,7 @@ class Body(NamedTuple):
 
 
 def frame(up: Tensor, right: Tensor) -> Tensor:
-    """Rows right, front, up (..., 3, 3) of the frame with this up and, as far as it allows, this right."""
+    """Rows right, front, up (..., 3, 3) of the frame with this up vector and, as nearly as possible, this right."""
     up = F.normalize(up, dim=-1)
     right = F.normalize(right - (right * up).sum(-1, keepdim=True) * up, dim=-1)
     return torch.stack([right, torch.linalg.cross(up, right), up], dim=-2)
@@ -57,7 +57,7 @@ class _Builder:
 
     Args:
         girth: factor on all radii.
-        scale: of the body over the reference height.
+        scale: height of the body relative to the reference height.
     """
 
     def __init__(self, girth: float, scale: float) -> None:
@@ -76,7 +76,7 @@ class _Builder:
         depth: float = 1.0,
         length: Tensor | None = None,
     ) -> None:
-        """One tapered capsule between points of the world (tensors) or of the frame (tuples, reference metres)."""
+        """Add a tapered capsule between points in the world (tensors) or in the frame (tuples, reference metres)."""
 
         def place(point: Tensor | tuple[float, float, float]) -> Tensor:
             if isinstance(point, Tensor):
@@ -96,17 +96,17 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
     """A body on the joints of one person.
 
     The head faces the direction of the nose from the shoulders; the trunk twists with shoulders and hips; hands
-    continue the forearms and feet are at right angles to the shanks, but not below the floor.
+    continue the forearms, and feet are perpendicular to the shanks but not below the floor.
 
     Args:
         joints: (T, 14, 3) metres, order of ``tensorsim.JOINTS``.
-        girth: thickness of everything, 1 for the median adult.
+        girth: thickness of the body, 1 for the median adult.
         long_hair: hair down to the shoulders.
     """
     height = float(body_height(joints).median())
     scale = height / REFERENCE_HEIGHT_M
     build = _Builder(girth, scale)
-    head_build = _Builder(1.0, scale)  # the size of heads does not depend on the girth
+    head_build = _Builder(1.0, scale)  # head size does not depend on girth
     up = joints[:, 1] - mid_hips(joints)
     chest = frame(up, joints[:, 2] - joints[:, 5])
     _add_trunk(build, joints, chest)
@@ -120,7 +120,7 @@ def build_body(joints: Tensor, girth: float = 1.0, long_hair: bool = False) -> B
 
 
 def _add_trunk(build: _Builder, joints: Tensor, chest: Tensor) -> None:
-    """Hips, waist and chest. Lengths along the trunk follow the skeleton, so they are given in the world."""
+    """Hips, waist and chest. Lengths along the trunk follow the skeleton, so they are given in world coordinates."""
     s, neck, hips = build.scale, joints[:, 1], mid_hips(joints)
     shoulder_line, hip_line = joints[:, 2] - joints[:, 5], joints[:, 8] - joints[:, 11]
     pelvis = frame(neck - hips, hip_line)
@@ -149,8 +149,8 @@ def _add_trunk(build: _Builder, joints: Tensor, chest: Tensor) -> None:
 def _head_frame(joints: Tensor, chest: Tensor, scale: float) -> tuple[Tensor, Tensor]:
     """Frame (T, 3, 3) and centre (T, 3) of the head.
 
-    The nose alone gives the orientation, so half of its pitch is used. The head stays upright as long as the trunk
-    nearly is, and over the neck: in some skeletons the joint is its centre.
+    Only the nose indicates the orientation, so half of its pitch is used. The head stays upright while the trunk is
+    nearly upright, and over the neck: in some skeletons the joint is the centre of the head.
     """
     neck = joints[:, 1]
     nose = joints[:, 0] - neck
@@ -170,7 +170,7 @@ def _head_frame(joints: Tensor, chest: Tensor, scale: float) -> tuple[Tensor, Te
 def _add_head(
     build: _Builder, head_build: _Builder, joints: Tensor, chest: Tensor, long_hair: bool
 ) -> Tensor:
-    """Head and neck; the keypoints of the face (T, 5, 3): nose, eyes and ears."""
+    """Add head and neck; returns the face keypoints (T, 5, 3): nose, eyes and ears."""
     s = build.scale
     head, center = _head_frame(joints, chest, s)
 
@@ -239,12 +239,12 @@ def _add_legs(build: _Builder, joints: Tensor) -> None:
 
 
 def _level_foot(shank: Tensor, ankle: Tensor, ground: Tensor, scale: float) -> Tensor:
-    """Frame of a foot at right angles to the shank (T, 3, 3), its toes not below the floor."""
+    """Frame (T, 3, 3) of a foot perpendicular to the shank, its toes not below the floor."""
     toe = ankle + scale * 0.165 * shank[:, 1]
     clearance = ankle[:, 2] - ground  # 0 on the floor
     lowest = (ground - 0.01 * scale + 0.4 * clearance.clamp(min=0)).minimum(ankle[:, 2])
     short = (lowest - toe[:, 2]).clamp(min=0)
-    # Only feet near the floor stand on it; those in the air and of lying bodies keep their orientation.
+    # Only feet near the floor stand on it; feet in the air or of lying bodies keep their orientation.
     lift = short * (clearance < 0.25 * scale)
     forward = F.normalize(toe + F.pad(lift[:, None], (2, 0)) - ankle, dim=-1)
     up = torch.linalg.cross(shank[:, 0], forward)

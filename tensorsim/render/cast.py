@@ -1,8 +1,8 @@
-"""Ray casting of round volumes: tapered capsules, made elliptical by squashing, with a depth buffer.
+"""Ray casting of rounded volumes: tapered capsules, made elliptical by squashing, with a depth buffer.
 
-A tapered capsule is the union of the spheres whose centre runs from a to b while the radius goes linearly from
-ra to rb. Intersections with rays have a closed form; for a squashed one space is stretched so that it becomes round,
-which keeps the ray parameter.
+A tapered capsule is the union of spheres whose centre runs from a to b while the radius changes linearly from
+ra to rb. Intersections with rays have a closed form; for a squashed capsule, space is stretched so that it becomes
+round, which preserves the ray parameter.
 """
 
 import math
@@ -16,7 +16,7 @@ from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, pri
 
 
 class Volumes(NamedTuple):
-    """S tapered capsules of some people.
+    """S tapered capsules of one or more people.
 
     Attributes:
         start: (..., S, 3) world metres, centre of the first sphere.
@@ -24,9 +24,9 @@ class Volumes(NamedTuple):
         start_radius: (..., S) metres.
         end_radius: (..., S) metres.
         axes: (..., S, 3, 3) rows right, front, up of the body part, in the world.
-        origin: (..., S, 3) where the part's own coordinates (right, front, up) are zero.
-        depth: (..., S) extent along front over that along right, 1 for a round one.
-        length: (..., S) metres of the whole limb, or of the trunk, that the part belongs to.
+        origin: (..., S, 3) origin of the part's own coordinates (right, front, up).
+        depth: (..., S) ratio of the extent along front to that along right, 1 for a round one.
+        length: (..., S) length in metres of the whole limb or trunk that the part belongs to.
     """
 
     start: Tensor
@@ -40,17 +40,17 @@ class Volumes(NamedTuple):
 
     @property
     def radius(self) -> Tensor:
-        """(..., S) metres, of a sphere at both ends that holds the squashed spheres there."""
+        """(..., S) metres: radius of spheres at both ends that enclose the squashed ones."""
         return torch.maximum(self.start_radius, self.end_radius) * self.depth.clamp(min=1.0)
 
 
 class Hits(NamedTuple):
-    """The first intersections of the rays of a picture.
+    """First intersections of the rays of an image.
 
     Attributes:
         depth: (H * W,) ray parameter; infinite without an intersection.
         volume: (H * W,) int64 index of the volume; -1 without one.
-        normal: (H * W, 3) unit vectors out of the body, smooth from one volume of a person to the next.
+        normal: (H * W, 3) unit vectors pointing out of the body, smooth across the volumes of a person.
     """
 
     depth: Tensor
@@ -59,13 +59,13 @@ class Hits(NamedTuple):
 
 
 class View(NamedTuple):
-    """The rays of a picture and where points land in it: a pinhole camera, or parallel rays for a light.
+    """The rays of an image and the projection of points into it: a pinhole camera, or parallel rays for a light.
 
     Attributes:
         origins: (H * W, 3) world metres where rays start (or (1, 3), one point for all).
-        directions: (H * W, 3) one unit of depth along each ray (or (1, 3)).
+        directions: (H * W, 3) vectors of one unit of depth along each ray (or (1, 3)).
         axes: (3, 3) rows right, down, forward.
-        position: (3,) the camera; for parallel rays the world point in the middle of the picture.
+        position: (3,) the camera; for parallel rays the world point at the centre of the image.
         scale: focal length in pixels; for parallel rays pixels per metre.
         center: (u, v) principal point.
         size: (height, width).
@@ -92,7 +92,7 @@ class View(NamedTuple):
 
     @classmethod
     def of_light(cls, towards: Tensor, middle: Tensor, side_m: float, pixels: int) -> "View":
-        """Parallel rays from a far light in the direction ``towards`` (3,), a square about ``middle`` (3,)."""
+        """Parallel rays from a distant light in the direction ``towards`` (3,), in a square around ``middle`` (3,)."""
         forward = -towards
         right = torch.linalg.cross(forward, forward.new_tensor([0.0, 0.0, 1.0]))
         right = right / right.norm()
@@ -110,7 +110,7 @@ class View(NamedTuple):
         return local[..., :2] * self.scale + local.new_tensor(self.center), local[..., 2]
 
     def windows(self, volumes: Volumes) -> Tensor:
-        """Pixels that may see each of (S) volumes: (S, 4) int64 left, top, right, bottom, the last two
+        """Pixels that may see each of the S volumes: (S, 4) int64 left, top, right, bottom, the last two
         exclusive. Empty for volumes that reach behind the camera."""
         height, width = self.size
         lows, highs, front = [], [], torch.ones_like(volumes.start_radius, dtype=torch.bool)
@@ -119,7 +119,7 @@ class View(NamedTuple):
             pixel, depth = self.project(point)
             extent = self.scale * radius
             if self.pinhole:
-                # The image of a sphere off the axis is longer than f r / z: by the secant of its angle, bounded.
+                # Off the axis the image of a sphere is longer than f r / z, by the secant of its angle; this bounds it.
                 slant = (pixel - pixel.new_tensor(self.center)).abs().amax(dim=-1) / self.scale
                 extent = extent / (depth - radius).clamp(min=NEAR_M) * (1 + slant)
                 front = front & (depth - radius > NEAR_M)
@@ -132,20 +132,20 @@ class View(NamedTuple):
 
 
 def _grid(height: int, width: int, center: tuple[float, float], like: Tensor) -> Tensor:
-    """Pixels from the principal point, (H * W, 2)."""
+    """Pixel coordinates relative to the principal point, (H * W, 2)."""
     u = torch.arange(width, dtype=like.dtype, device=like.device) - center[0]
     v = torch.arange(height, dtype=like.dtype, device=like.device) - center[1]
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1).reshape(-1, 2)
 
 
 def cast(volumes: Volumes, owner: Tensor, view: View, blend_m: float = 0.015) -> Hits:
-    """First hits of the rays of a picture with S volumes.
+    """First hits of the rays of an image with S volumes.
 
-    Where volumes of one person meet, their normals are averaged with weights ``exp(-depth / blend_m)`` beyond
-    the nearest, which shades the transition smoothly.
+    Where volumes of one person meet, their normals are averaged with weights ``exp(-depth / blend_m)``, with depth
+    behind the nearest one, so that the transition is shaded smoothly.
 
     Args:
-        volumes: (S, ...) of one instant.
+        volumes: (S, ...) at one instant.
         owner: (S,) int64, the person each volume belongs to.
         view: the rays.
         blend_m: length over which volumes blend.
@@ -175,16 +175,16 @@ def cast(volumes: Volumes, owner: Tensor, view: View, blend_m: float = 0.015) ->
 
 
 def _enter(volumes: Volumes, volume: Tensor, view: View, pixel: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter volumes, pair by pair: ray parameter (K,), infinite for a miss, and normals (K, 3).
+    """Where rays enter volumes, for K pairs: ray parameter (K,), infinite for a miss, and normals (K, 3).
 
-    With b - a = h, a ray q(t) = o + t d from a, and r = ra - rb, the mantle is
+    With b - a = h, a ray q(t) = o + t d relative to a, and r = ra - rb, the mantle is
     ``(|h|^2 - r^2) |q|^2 = (h.q)^2 - 2 ra r (h.q) + |h|^2 ra^2``, valid where the tangent sphere lies between
     the ends, ``0 < h.q - ra r < |h|^2 - r^2``.
     """
     front, stretch = volumes.axes[:, 1], 1 / volumes.depth - 1
 
     def squash(vectors: Tensor, of: Tensor) -> Tensor:
-        """Stretch along the part's front so that it becomes round."""
+        """Stretch along the part's front axis so that the volume becomes round."""
         return vectors + front[of] * (stretch[of] * (vectors * front[of]).sum(-1))[:, None]
 
     everyone = torch.arange(volumes.start.shape[0], device=volume.device)
@@ -218,8 +218,8 @@ def _enter(volumes: Volumes, volume: Tensor, view: View, pixel: Tensor) -> tuple
     # o - h starts at b
     t_end = root(dd, od - hd, oo - 2 * ho + hh - rb * rb)
     t = torch.minimum(torch.minimum(t_side, t_start), t_end)
-    t = torch.where(mantle > 0, t, torch.where(ra >= rb, t_start, t_end))  # one sphere holds the other
-    # Outwards is away from the centre of the tangent sphere.
+    t = torch.where(mantle > 0, t, torch.where(ra >= rb, t_start, t_end))  # one sphere contains the other
+    # The normal points away from the centre of the tangent sphere.
     share = torch.where(t == t_side, along / mantle, (t == t_end).to(t.dtype))
     outward = o + torch.where(torch.isfinite(t), t, 0.0)[:, None] * d - h * share.nan_to_num()[:, None]
     return t, torch.nn.functional.normalize(squash(outward, volume), dim=-1)

@@ -1,4 +1,4 @@
-"""Crops of rendered people, as pose networks get them: pictures to look at where there are no films."""
+"""Crops of rendered people, as input for pose networks when there are no videos."""
 
 import torch
 from torch import Tensor
@@ -17,9 +17,9 @@ def rendered_crops(size: tuple[int, int], people: int = 12, poses: int = 2, seed
 
     Args:
         size: (H, W).
-        people: each of another look, in another room, in another activity.
-        poses: of each, a second apart.
-        seed: of all that is random.
+        people: number of people, each with a different look, room and activity.
+        poses: poses of each person, a second apart.
+        seed: for everything that is random.
     """
     generator = ActivityGenerator(PeopleConfig(start_range_m=(2.5, 5.0), keep_range_m=(2.5, 5.0)))
     crops = []

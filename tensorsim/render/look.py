@@ -1,4 +1,4 @@
-"""Appearance of people: skin, hair and clothes with patterns, as colours of points on the body."""
+"""Appearance of people: skin, hair and patterned clothes, as colours of points on the body."""
 
 from typing import NamedTuple
 
@@ -38,18 +38,18 @@ class Look(NamedTuple):
     """Appearance of one person; colours are (3,) sRGB in [0, 1].
 
     Attributes:
-        skin: tone of the skin.
-        hair: colour of the hair.
+        skin: skin tone.
+        hair: hair colour.
         shirt: main colour above the belt.
-        accent: the other colour of the pattern.
+        accent: second colour of the pattern.
         trousers: colour below the belt.
         shoes: colour of the shoes.
         pattern: index into PATTERNS.
-        sleeve: share of the arm that sleeves cover: up to 1 the upper arm, up to 2 the forearm.
-        leg: share of the leg that trousers cover, likewise.
+        sleeve: how far sleeves reach: 0 to 1 along the upper arm, 1 to 2 along the forearm.
+        leg: how far trousers reach along the leg, likewise.
         girth: thickness of the body, 1 for the median adult.
         long_hair: whether hair falls to the shoulders.
-        folds: (4, 3) wave vectors of folds in the cloth, radians per metre.
+        folds: (4, 3) wave vectors of folds in the cloth, in radians per metre.
     """
 
     skin: Tensor
@@ -98,11 +98,11 @@ class Surface(NamedTuple):
     """Visible points of one body.
 
     Attributes:
-        point: (K, 3) metres from the origin of their part along its right, front and up.
+        point: (K, 3) metres from the origin of its part along right, front and up.
         normal: (K, 3) in the same axes.
         part: (K,) int64 index into PARTS.
-        share: (K,) place along the limb from its upper joint, or up the trunk from the hips, 0 to 1.
-        scale: height of the body over the reference height.
+        share: (K,) position along the limb from its upper joint, or up the trunk from the hips, 0 to 1.
+        scale: height of the body relative to the reference height.
     """
 
     point: Tensor
@@ -113,7 +113,7 @@ class Surface(NamedTuple):
 
 
 class Paint(NamedTuple):
-    """Albedo (K, 3) sRGB, gloss (K,) and how far folds turn the normal (K, 3, in axes of the part)."""
+    """Albedo (K, 3) sRGB, gloss (K,) and how folds tilt the normal (K, 3, in the part's axes)."""
 
     albedo: Tensor
     gloss: Tensor
@@ -153,7 +153,7 @@ def paint(look: Look, surface: Surface) -> Paint:
     put(shoe, torch.where((z < -0.062)[:, None], 0.5 + 0.4 * look.shoes.to(like), look.shoes.to(like)))
     cloth = shirt | trousers
 
-    # Folds run along the limbs: waves that modulate the phases of one another.
+    # Folds run along the limbs: waves that modulate each other's phases.
     phase = surface.point @ look.folds.to(like).mT
     phase = phase + 0.8 * torch.sin(0.5 * phase.roll(1, dims=-1))
     amount = torch.where(cloth, 0.10, 0.0)[:, None]
@@ -207,7 +207,7 @@ def _face(look: Look, x: Tensor, y: Tensor, z: Tensor, skin: Tensor) -> Tensor:
     face = torch.where(ellipse(0.0, -0.055, 0.026, 0.009)[:, None], 0.5 * (red + skin * 0.7), face)
     face = torch.where(ellipse(0.008, -0.018, 0.006, 0.004)[:, None], skin * 0.5, face)
     hair = 0.175 * (z - 0.068) > 0.14 * (y - 0.085) + 0.0010 * torch.sin(60 * x)
-    hair = hair & ~((side > 0.070) & (z < 0.035) & (y > -0.03))  # ears stay free
+    hair = hair & ~((side > 0.070) & (z < 0.035) & (y > -0.03))  # ears stay uncovered
     if look.long_hair:
         hair = hair | (y < -0.03)
     strands = 0.92 + 0.16 * torch.sin(150 * x + 60 * torch.sin(25 * y + 15 * z)).square()[:, None]

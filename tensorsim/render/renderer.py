@@ -1,6 +1,6 @@
-"""People rendered from their joints: video of known motion with exact labels.
+"""Render people from their joints: video of known motion with exact labels.
 
-Ray-cast bodies of round volumes stand in a lit room and cast shadows; lens blur, sensor noise and compression follow.
+Ray-cast bodies of rounded volumes stand in a lit room and cast shadows; lens blur, sensor noise and compression follow.
 """
 
 import math
@@ -26,18 +26,18 @@ FLESH_M = (0.05, 0.04, 0.04, 0.05, 0.05) + (0.12,) * 2 + (0.09,) * 4 + (0.18,) *
 
 
 class RenderedVideo(NamedTuple):
-    """A film of P people and the truth about it.
+    """A video of P people and its ground truth.
 
     Attributes:
         frames: (T, 3, H, W) uint8 RGB.
-        boxes: (P, T, 4) ``xyxy`` pixels around what is seen of each person; zeros where nothing is.
+        boxes: (P, T, 4) ``xyxy`` pixels around the visible part of each person; zeros if nothing is visible.
         masks: (P, T, H, W) bool, the pixels that show each person.
         keypoints: (P, T, 17, 2) COCO keypoints in pixels, visible or not.
-        visibility: (P, T, 17) int64, as in COCO: 0 outside of the picture or absent, 1 hidden, 2 visible.
-        keypoints_m: (P, T, 17, 3) the same in world metres.
+        visibility: (P, T, 17) int64, as in COCO: 0 outside the image or absent, 1 hidden, 2 visible.
+        keypoints_m: (P, T, 17, 3) the same keypoints in world metres.
         joints: (P, T, 14, 3) world metres, order of ``tensorsim.JOINTS``: the input.
         valid: (P, T) bool, whether the person is in the picture.
-        camera: the camera, focal length and principal point filled in.
+        camera: the camera, with focal length and principal point filled in.
     """
 
     frames: Tensor
@@ -52,17 +52,17 @@ class RenderedVideo(NamedTuple):
 
 
 class PersonRenderer:
-    """Films people whose joints are known.
+    """Renders video of people from their joints.
 
     Appearance, light, room and noise are drawn from the seed of the call.
 
     Args:
         camera: pinhole camera; None is the default one, at the radar, looking along +y.
-        height: of the picture in pixels.
-        width: of the picture in pixels.
+        height: height of the image in pixels.
+        width: width of the image in pixels.
         blur_px: standard deviation of the lens blur in pixels.
-        noise: standard deviation of the sensor noise at mid grey, of full scale; shadows have less.
-        jpeg_quality: 1 to 100, of the compression of each frame; None leaves it out.
+        noise: standard deviation of the sensor noise at mid grey, relative to full scale; lower in shadows.
+        jpeg_quality: 1 to 100, for the compression of each frame; None leaves it out.
         shadow_pixels: side of the square shadow map.
 
     Raises:
@@ -98,19 +98,20 @@ class PersonRenderer:
     def __call__(
         self, joints: Tensor, seed: int = 0, background: Tensor | None = None, valid: Tensor | None = None
     ) -> RenderedVideo:
-        """Joints of people to a film of them.
+        """Render a video of people from their joints.
 
         Args:
             joints: (T, 14, 3) of one person or (P, T, 14, 3), world metres, order of ``tensorsim.JOINTS``, the
                 floor at z = 0. On a CUDA device the bodies are cast there; frames come back on the CPU.
-            seed: the same seed gives the same film.
-            background: (3, H, W) picture, RGB uint8 or floating point in [0, 1], scaled to cover the frame; None
-                makes a room.
-            valid: (P, T) bool, in which frames each person is present; None is all. A film without people is empty.
+            seed: the same seed gives the same video.
+            background: (3, H, W) image, RGB uint8 or floating point in [0, 1], scaled to cover the frame; None
+                generates a room.
+            valid: (P, T) bool, frames in which each person is present; None means all. If nobody is ever present,
+                the video shows an empty scene.
 
         Returns:
-            :class:`RenderedVideo`: T frames (T, 3, H, W), and boxes, masks, key points and visibility of P people, with
-            the camera that took them.
+            :class:`RenderedVideo`: T frames (T, 3, H, W), and boxes, masks, keypoints and visibility of P people, with
+            the camera.
 
         Raises:
             TensorsimError: other shapes, no frames or people, NaN.
@@ -184,7 +185,7 @@ class PersonRenderer:
         light: Light,
         scene: Scene,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Linear RGB (H * W, 3), the person in each pixel (-1: nobody) and the depth of people there."""
+        """Linear RGB (H * W, 3), the person in each pixel (-1: nobody) and the depth of that person."""
         if not who:
             nobody = torch.full_like(scene.depth, -1, dtype=torch.int64)
             return scene.shade + scene.lamp, nobody, torch.full_like(scene.depth, math.inf)
@@ -234,24 +235,24 @@ class PersonRenderer:
 
 
 class Shadows(NamedTuple):
-    """A depth map of the people from the lamp."""
+    """A depth map of the people as seen from the lamp."""
 
     view: View
     depth: Tensor
 
     @classmethod
     def of(cls, volumes: Volumes, owner: Tensor, light: Light, pixels: int) -> "Shadows":
-        """Cast the volumes along the light into a square picture that just holds them."""
+        """Cast the volumes along the light into a square image that just encloses them."""
         ends = torch.cat([volumes.start, volumes.end])
         low, high = ends.amin(dim=0), ends.amax(dim=0)
         side = float((high - low).norm()) + 0.5
         view = View.of_light(light.towards.to(ends), (low + high) / 2, side, pixels)
-        # Depth counts from the plane through the middle of the bodies; rays start well in front of it.
+        # Depth is measured from the plane through the middle of the bodies; rays start well in front of it.
         view = view._replace(origins=view.origins - side * view.axes[2])
         return cls(view, cast(volumes, owner, view).depth - side)
 
     def reach(self, points: Tensor, bias_m: float = 0.04) -> Tensor:
-        """Share of the lamp (...) that reaches world points (..., 3); edges are soft."""
+        """Fraction (...) of the lamp's light that reaches world points (..., 3); edges are soft."""
         pixel, depth = self.view.project(points)
         size = self.view.size[0]
         margin = 2
@@ -290,7 +291,7 @@ def _shade(
 def _visibility(
     keypoints: Tensor, depth: Tensor, owner: Tensor, front: Tensor, size: tuple[int, int]
 ) -> Tensor:
-    """COCO flags (P, 17) from pixels (P, 17, 2), their depths and what each pixel of the picture shows."""
+    """COCO flags (P, 17) from pixels (P, 17, 2), their depths and what each pixel of the image shows."""
     height, width = size
     pixel = keypoints.round()
     limit = pixel.new_tensor([width, height])
@@ -299,13 +300,13 @@ def _visibility(
     index = row * width + column
     person = torch.arange(len(keypoints), device=owner.device)[:, None]
     flesh = depth.new_tensor(FLESH_M)
-    # A keypoint on the outline may round to the background beside it; it is visible.
+    # A keypoint on the outline may round to the background beside it; it still counts as visible.
     seen = ((owner[index] == person) | (owner[index] < 0)) & (depth - front[index] < flesh)
     return torch.where(inside, torch.where(seen, VISIBLE, HIDDEN), OUTSIDE)
 
 
 def _boxes(masks: Tensor) -> Tensor:
-    """Tight boxes (..., 4) of masks (..., H, W); pixels are squares about their centres."""
+    """Tight boxes (..., 4) of masks (..., H, W); pixels are squares around their centres."""
 
     def extent(line: Tensor) -> tuple[Tensor, Tensor]:
         first = line.int().argmax(dim=-1)

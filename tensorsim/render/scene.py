@@ -1,4 +1,4 @@
-"""Surroundings of rendered people: procedural rooms and background pictures, with geometry for shadows."""
+"""Surroundings of rendered people: procedural rooms and background images, with geometry for shadows."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tensorsim.render.cast import View
 
-#: Reflectances are multiplied in linear light; pictures are sRGB, here by the plain power law.
+#: Reflectances are multiplied in linear light; images are sRGB, approximated here by a plain power law.
 GAMMA = 2.2
 
 
@@ -18,8 +18,8 @@ class Light(NamedTuple):
 
     Attributes:
         towards: (3,) unit vector to the lamp.
-        key: (3,) its irradiance on a surface that faces it.
-        ambient: (3,) of a surface that faces up; one that faces down gets half.
+        key: (3,) irradiance from the lamp on a surface that faces it.
+        ambient: (3,) ambient irradiance on a surface that faces up; one that faces down gets half.
     """
 
     towards: Tensor
@@ -28,7 +28,7 @@ class Light(NamedTuple):
 
     @classmethod
     def draw(cls, yaw_rad: float, generator: torch.Generator) -> "Light":
-        """A lamp in the half space behind a camera of this yaw, 35 to 65 degrees up."""
+        """A lamp in the half space behind a camera with this yaw, 35 to 65 degrees up."""
         u = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
         azimuth = yaw_rad + math.pi + (u[0] - 0.5) * 2.2
         elevation = math.radians(35 + 30 * u[1])
@@ -40,7 +40,7 @@ class Light(NamedTuple):
         return cls(torch.tensor(towards), key, torch.tensor([1 - warmth, 1.0, 1 + warmth]) * fill)
 
     def irradiance(self, normal: Tensor, lit: Tensor) -> Tensor:
-        """Light (..., 3) on surfaces of this normal (..., 3), ``lit`` (...) of the lamp reaching them."""
+        """Light (..., 3) on surfaces with normals (..., 3) that a fraction ``lit`` (...) of the lamp reaches."""
         facing = (normal @ self.towards.to(normal)).clamp(min=0) * lit
         sky = 0.75 + 0.25 * normal[..., 2:]
         return facing[..., None] * self.key.to(normal) + sky * self.ambient.to(normal)
@@ -51,7 +51,7 @@ class Scene(NamedTuple):
 
     Attributes:
         shade: (H * W, 3) linear RGB under ambient light alone.
-        lamp: (H * W, 3) linear RGB that the lamp adds outside of shadows.
+        lamp: (H * W, 3) linear RGB that the lamp adds outside shadows.
         points: (H * W, 3) world metres of each pixel; not finite where it is infinitely far.
         depth: (H * W,) ray parameter; anything further away is hidden.
     """
@@ -63,9 +63,9 @@ class Scene(NamedTuple):
 
 
 def picture_scene(picture: Tensor, view: View, light: Light) -> Scene:
-    """A background picture (3, H, W) in [0, 1] behind people who stand on the floor z = 0 that it shows.
+    """A background image (3, H, W) in [0, 1] behind people who stand on the floor z = 0 that it shows.
 
-    The lamp lights the picture already, so a shadow takes away its share.
+    The image already includes the light of the lamp, so a shadow takes away its share.
     """
     colour = picture.flatten(1).T.clamp(0, 1) ** GAMMA
     up = view.directions[:, 2]
@@ -106,7 +106,7 @@ def _noise(a: Tensor, b: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _floor(a: Tensor, b: Tensor, draw: _Draw) -> Tensor:
-    """Planks, tiles or carpet on coordinates in metres: sRGB (K, 3)."""
+    """Planks, tiles or carpet at coordinates in metres: sRGB (K, 3)."""
     kind = draw.index(3)
     if kind == 0:
         wood = draw.number(0.35, 0.7) * torch.tensor([1.0, 0.78, 0.56]).to(a)
@@ -132,7 +132,7 @@ def _floor(a: Tensor, b: Tensor, draw: _Draw) -> Tensor:
 
 
 def _wall(a: Tensor, z: Tensor, draw: _Draw) -> Tensor:
-    """Paint, wallpaper or bricks on (along the wall, height) in metres: sRGB (K, 3)."""
+    """Paint, wallpaper or bricks at (along the wall, height) in metres: sRGB (K, 3)."""
     kind = draw.index(4)
     base = draw.colour(0.55, 0.9, 0.15).to(a)
     tone = 1 + 0.02 * _noise(a, z, draw.generator)
@@ -164,13 +164,13 @@ def _wall(a: Tensor, z: Tensor, draw: _Draw) -> Tensor:
 
 
 def room_scene(view: View, light: Light, low: Tensor, high: Tensor, generator: torch.Generator) -> Scene:
-    """A furnished room around the box ``low`` to ``high`` (3,) in which people and the camera move.
+    """A furnished room around the box from ``low`` to ``high`` (3,) that holds the people and the camera.
 
     Args:
         view: the camera's rays.
         light: the lamp.
-        low: (3,) metres; the floor is z = 0.
-        high: (3,) metres.
+        low: (3,) lower corner in metres; the floor is z = 0.
+        high: (3,) upper corner in metres.
         generator: draws sizes, textures and furniture.
     """
     draw = _Draw(generator)
@@ -193,7 +193,7 @@ def room_scene(view: View, light: Light, low: Tensor, high: Tensor, generator: t
         x, y, z = points[here].unbind(-1)
         if here.any():
             colour[here] = _floor(x, y, draw) if plane == 4 else _wall(y if plane < 2 else x, z, draw)
-    # Corners are darker: light comes from the room.
+    # Corners are darker: less light reaches them.
     gap = torch.minimum(points - bounds[0], bounds[1] - points)
     gap = torch.where(F.one_hot(axis, 3).bool(), math.inf, gap).amin(dim=-1)
     colour = colour * (1 - 0.25 * torch.exp(-gap / 0.25))[:, None]
@@ -211,7 +211,7 @@ def room_scene(view: View, light: Light, low: Tensor, high: Tensor, generator: t
         far = (corner + size - origin) / direction
         enter, leave = torch.minimum(near, far), torch.maximum(near, far)
         t, side = enter.max(dim=-1)
-        # The camera does not stand in furniture, nor do people: they keep the margin to the walls.
+        # Neither the camera nor people stand inside furniture: they keep a margin from the walls.
         hit = (t < leave.amin(dim=-1)) & (t > 0.3) & (t < depth)
         at = origin + t.nan_to_num(0.0, 0.0, 0.0)[:, None] * direction
         local = (at - corner) / size
