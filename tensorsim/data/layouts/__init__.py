@@ -1,1 +1,1 @@
-"""Layouts of public sets of films and captured motion: which files they have, and how people and labels are named."""
+"""Layouts of public data sets of videos and captured motion: their files, and how people and labels are named."""

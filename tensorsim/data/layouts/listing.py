@@ -1,4 +1,4 @@
-"""Lists of labelled clips: folders with a folder per class, tables, and the layouts of public sets.
+"""Lists of labelled clips: folders with one folder per class, tables, and the layouts of public data sets.
 
 Names of clips are relative to the folder, so that a data set does not depend on where the files are.
 """
@@ -36,7 +36,7 @@ def _some(clips: list[Clip], where: Path | str, expected: str) -> list[Clip]:
 
 
 def _of_classes(source: SourceConfig, suffixes: tuple[str, ...], expected: str) -> list[Clip]:
-    """Clips of a folder with a folder per class; everybody is somebody else, by file."""
+    """Clips in a folder with one folder per class; each file counts as a different person."""
     folder = _folder(source)
     clips = []
     for group in sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."):
@@ -58,7 +58,7 @@ def _of_classes(source: SourceConfig, suffixes: tuple[str, ...], expected: str) 
 
 
 def _keys(file: Path) -> list[str | None]:
-    """Motions of a file; a file that cannot be read has one, which fails with the reason when it is used."""
+    """Motions in a file; an unreadable file gets one, which fails with the reason when it is used."""
     try:
         return motion_keys(file)
     except TensorsimError:
@@ -69,13 +69,13 @@ def folder_of_films(source: SourceConfig) -> list[Clip]:
     """``CLASS/.../film.mp4``.
 
     Raises:
-        TensorsimError: no such folder, or no films in folders of classes.
+        TensorsimError: no such folder, or no videos in class folders.
     """
     return _of_classes(source, FILMS, f"films ({', '.join(FILMS)}) in a folder for each class")
 
 
 def folder_of_keypoints(source: SourceConfig) -> list[Clip]:
-    """``CLASS/.../film.json`` of COCO key points.
+    """``CLASS/.../film.json`` with COCO keypoints.
 
     Raises:
         TensorsimError: as :func:`folder_of_films`.
@@ -84,7 +84,7 @@ def folder_of_keypoints(source: SourceConfig) -> list[Clip]:
 
 
 def folder_of_motion(source: SourceConfig) -> list[Clip]:
-    """``CLASS/.../motion.bvh`` or ``.npz``; of a file with several motions each is a clip.
+    """``CLASS/.../motion.bvh`` or ``.npz``; each motion in a file is a clip.
 
     Raises:
         TensorsimError: as :func:`folder_of_films`.
@@ -120,13 +120,13 @@ def _columns(path: Path, rows: list[dict[str, Any]], names: Iterable[str]) -> No
 
 
 def _text(row: dict[str, Any], column: str) -> str:
-    """What a row says in a column that may be missing, "" where it says nothing; 0 is something."""
+    """The text of a row in a column that may be missing; "" if empty; 0 is not empty."""
     value = row.get(column)
     return "" if value is None else str(value)
 
 
 def _needed(row: dict[str, Any], column: str, where: str) -> str:
-    """What a row says in a column in which it has to say something."""
+    """The text of a row in a required column."""
     text = _text(row, column)
     if not text.strip():
         raise TensorsimError(f"{where}: got no {column}, expected one")
@@ -134,7 +134,7 @@ def _needed(row: dict[str, Any], column: str, where: str) -> str:
 
 
 def _seconds(value: Any, where: str) -> float | None:
-    """A number of seconds, None where there is none."""
+    """A number of seconds, or None if there is none."""
     if value is None or str(value).strip() == "":
         return None
     try:
@@ -147,12 +147,12 @@ def _seconds(value: Any, where: str) -> float | None:
 
 
 def table(source: SourceConfig) -> list[Clip]:
-    """A table with columns path and label, and if they are known start, end (s), person, key and split.
+    """A table with columns path and label, and optionally start, end (s), person, key and split.
 
-    Paths are relative to the table. Without a person, everybody is somebody else, by file.
+    Paths are relative to the table. Without a person, each file counts as a different person.
 
     Raises:
-        TensorsimError: no such table, columns that are missing, or a row without path or label.
+        TensorsimError: no such table, missing columns, or a row without path or label.
     """
     path = Path(source.path or "")
     rows = read_table(path)
@@ -175,7 +175,7 @@ def ntu(source: SourceConfig) -> list[Clip]:
     """NTU RGB+D: ``.skeleton`` files; classes A001 and on, people P001 and on.
 
     Raises:
-        TensorsimError: no such folder, no such files, or one with another name.
+        TensorsimError: no such folder, no such files, or a file with a name of another form.
     """
     folder = _folder(source)
     clips = []
@@ -187,7 +187,7 @@ def ntu(source: SourceConfig) -> list[Clip]:
 
 
 def _films(folder: Path) -> dict[str, Path]:
-    """The films of a folder and its folders by their name without suffix; of equal names the first in ``FILMS``."""
+    """Videos in a folder and its subfolders by name without suffix; of equal names, the first in order of ``FILMS``."""
     files = (path for pattern in ("*", "*/*") for path in folder.glob(pattern))
     films = [path for path in files if path.suffix.lower() in FILMS]
     films.sort(key=lambda path: (FILMS.index(path.suffix.lower()), len(path.parts), path))
@@ -195,12 +195,11 @@ def _films(folder: Path) -> dict[str, Path]:
 
 
 def kinetics(source: SourceConfig) -> list[Clip]:
-    """Kinetics: a CSV with label, youtube_id, time_start, time_end and split beside a folder of films.
+    """Kinetics: a CSV with label, youtube_id, time_start, time_end and split, plus a folder of videos.
 
-    Films are called ``ID_START_END`` (six digits each) if they are cut already, or ``ID``, of which the times are a
-    part; in the folder or in a folder of it. Clips are the same whichever of both is there, or neither. The person is
-    the id. Source: W. Kay et al., "The Kinetics Human Action
-    Video Dataset", 2017.
+    Videos, in the folder or a subfolder, are called ``ID_START_END`` (six digits each) if they are already cut, or
+    ``ID`` if the times are a section of them. Clips are the same whichever of the two exists, or neither. The person
+    is the id. Source: W. Kay et al., "The Kinetics Human Action Video Dataset", 2017.
 
     Raises:
         TensorsimError: no such folder or table, columns that are missing, or a row without id or label.
@@ -223,9 +222,9 @@ def kinetics(source: SourceConfig) -> list[Clip]:
 
 
 def charades(source: SourceConfig) -> list[Clip]:
-    """Charades: a CSV with id, subject and actions beside a folder of films ``ID.mp4``; a clip per action.
+    """Charades: a CSV with id, subject and actions, plus a folder of videos ``ID.mp4``; one clip per action.
 
-    ``actions`` are such as ``c092 11.90 21.20;c147 0.00 12.60``: class, start and end in seconds. Source: G. Sigurdsson
+    ``actions`` look like ``c092 11.90 21.20;c147 0.00 12.60``: class, start and end in seconds. Source: G. Sigurdsson
     et al., "Hollywood in Homes", ECCV 2016.
 
     Raises:
@@ -252,9 +251,9 @@ def charades(source: SourceConfig) -> list[Clip]:
 
 
 def movi(source: SourceConfig) -> list[Clip]:
-    """MoVi: ``F_amass_Subject_N.mat``; a clip per motion, its class the description.
+    """MoVi: ``F_amass_Subject_N.mat``; one clip per motion, its class the description.
 
-    With a ``table`` of the columns file and label: AMASS ``.npz`` files with joints, and their labels.
+    With a ``table`` that has the columns file and label: AMASS ``.npz`` files with joints, and their labels.
 
     Raises:
         TensorsimError: no such folder, no such files, columns that are missing, or a row without file or label.
@@ -290,10 +289,10 @@ def _subject(name: str) -> str:
 
 
 def h36m(source: SourceConfig) -> list[Clip]:
-    """Human3.6M as VideoPose3D publishes it, ``data_3d_h36m.npz``: classes are actions without their number.
+    """Human3.6M as published by VideoPose3D, ``data_3d_h36m.npz``: classes are actions without their number.
 
     Raises:
-        TensorsimError: no such file, or another one.
+        TensorsimError: no such file, or a different one.
     """
     path = Path(source.path or "")
     clips = []

@@ -40,7 +40,7 @@ def movi_descriptions(path: Path) -> list[str]:
     """What the subject does in each motion of a file.
 
     Raises:
-        TensorsimError: another file.
+        TensorsimError: not a MoVi file.
     """
     return [str(move.get("description", "")).strip() for move in _moves(path)]
 
@@ -49,7 +49,7 @@ def read_movi(path: Path, key: str) -> Motion:
     """Motion number ``key``, from 0 on.
 
     Raises:
-        TensorsimError: another file, or no such motion.
+        TensorsimError: not a MoVi file, or no such motion.
     """
     moves = _moves(path)
     if not (key.isdecimal() and int(key) < len(moves)):

@@ -26,7 +26,7 @@ _NAME = re.compile(r"S(\d{3})C(\d{3})P(\d{3})R(\d{3})A(\d{3})", re.IGNORECASE)
 
 
 class NtuName(NamedTuple):
-    """What a file name tells.
+    """The information in a file name.
 
     Attributes:
         setup, camera, performer, replication, action: numbers from 1 on.
@@ -43,7 +43,7 @@ def ntu_name(path: Path) -> NtuName:
     """The numbers in the name of a file.
 
     Raises:
-        TensorsimError: another name.
+        TensorsimError: a name of another form.
     """
     found = _NAME.match(path.stem)
     if found is None:
@@ -52,10 +52,10 @@ def ntu_name(path: Path) -> NtuName:
 
 
 def read_ntu(path: Path) -> Motion:
-    """The people of a ``.skeleton`` file in metres; x right, y away from the camera, z up.
+    """The people in a ``.skeleton`` file in metres; x right, y away from the camera, z up.
 
     Raises:
-        TensorsimError: a file that is damaged or cut off, has nobody, or other than 25 joints.
+        TensorsimError: a file that is damaged or truncated, has no people, or does not have 25 joints.
     """
     with reading(path, "NTU RGB+D skeletons"):
         check_range(path.stat().st_size, "size of a file", str(path))

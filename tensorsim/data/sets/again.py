@@ -1,4 +1,4 @@
-"""A stored sample, made again from its row of the manifest alone."""
+"""Recreate a stored sample from its manifest row alone."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from tensorsim.errors import TensorsimError
 
 
 def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample:
-    """The sample of this id, from the row and the recipe in ``manifest.parquet``; shards are not read.
+    """Recreate the sample with this id from its row and the recipe in ``manifest.parquet``; shards are not read.
 
-    Films and captured motion are needed where the recipe names them.
+    Videos and captured motion are needed if the recipe names them.
 
     Raises:
-        TensorsimError: no such data set or sample, sources with other clips, a radar or weights that have changed, or
-            arrays that differ from those that were stored: another version of tensorsim, torch or the films, or a
-            processor of another kind.
+        TensorsimError: no such data set or sample, sources with different clips, a changed radar or weights, or arrays
+            that differ from the stored ones: another version of tensorsim, torch or the videos, or another kind of
+            processor.
     """
     row = next(rows_of(folder, id=sample), None)
     if row is None:

@@ -28,19 +28,19 @@ from tensorsim.radar.recorder import Recorder
 from tensorsim.radar.synthesis.front_end import Levels
 from tensorsim.recognition.map_image import area_weights
 
-#: Pulses in the estimate of the powers that noise and converters refer to.
+#: Pulses used to estimate the powers that noise and converters refer to.
 _POWER_PULSES = 256
 
 
 def array_outputs(config: SimulationConfig, wanted: OutputConfig, scene: Scene) -> dict[str, Stored]:
-    """``range_doppler_angle`` and ``point_cloud`` as :class:`~tensorsim.data.sets.outputs.OutputConfig` says.
+    """``range_doppler_angle`` and ``point_cloud`` as described in :class:`~tensorsim.data.sets.outputs.OutputConfig`.
 
-    Each frame is a Doppler window of ``processing.window_s``; transmitters that fire in turn are aligned, echoes that
-    stand still are removed by the moving target indicator of the configuration. The powers that noise and converters
-    refer to are means over some of the pulses.
+    Each frame is a Doppler window of ``processing.window_s``; transmitters that fire in turn are aligned, and static
+    echoes are removed by the configured moving target indicator. The powers that noise and converters refer to are
+    means over a subset of the pulses.
 
     Raises:
-        TensorsimError: a point cloud of antennas that are no even row along x.
+        TensorsimError: a point cloud for antennas that are not evenly spaced along x.
     """
     radar, processing = config.scene.radar, config.processing
     profile = RangeProfile(radar, processing.range_window, _fixed(processing.range_gate_m))
@@ -72,7 +72,7 @@ def _cubes(
     profile: RangeProfile,
     frames: DopplerFrames,
 ) -> Iterator[Tensor]:
-    """Complex cubes (V, R, F) of the frames, Doppler ascending, positive = approaching."""
+    """Complex cubes (V, R, F), one per frame, Doppler ascending, positive = approaching."""
     radar = config.scene.radar
     pair = replace(radar, tx_m=radar.tx_positions_m[0], rx_m=radar.rx_positions_m[0])
     stage = PoseToDoppler.from_config(config.replace(scene__radar=pair, processing__near_bins=None))
@@ -101,7 +101,7 @@ def _cubes(
 
 
 def _beams(cube: Tensor, radar: RadarConfig, wanted: OutputConfig) -> Tensor:
-    """Power (R', F', D) of D beams in steps of equal sine, mean over cells of range and Doppler."""
+    """Power (R', F', D) of D beams equally spaced in sine, averaged over cells of range and Doppler."""
     sines = (torch.arange(wanted.beams, dtype=torch.float64) + 0.5) * (2 / wanted.beams) - 1
     cycles = steering_vectors(virtual_elements(radar), sines.asin(), 0.0, radar.doppler_wavelength_m)
     weights = torch.polar(torch.ones_like(cycles), 2 * torch.pi * cycles).to(cube.dtype) / cycles.shape[1]
@@ -118,7 +118,7 @@ def _beams(cube: Tensor, radar: RadarConfig, wanted: OutputConfig) -> Tensor:
 def _points(
     cubes: Tensor, radar: RadarConfig, profile: RangeProfile, frames: DopplerFrames, wanted: OutputConfig
 ) -> Stored:
-    """Points (frames, points, 4) of cubes (frames, V, R, F)."""
+    """Points (frames, points, 4) from cubes (frames, V, R, F)."""
     cfar = point_cfar(radar, frames)
     cloud = PointCloud(
         radar.range_resolution_m,

@@ -1,4 +1,4 @@
-"""Many samples in one pass of the radar chain, on any device; the same maps as one by one."""
+"""Process many samples in one pass of the radar chain, on any device; the maps are the same as one by one."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -32,9 +32,9 @@ def synthesize_batch(
 ) -> list[Arrays]:
     """The arrays of samples, as :func:`~tensorsim.data.sets.synthesis.synthesize` makes them one by one.
 
-    Samples share a pass where radar, surroundings, scatterers and numbers of people are the same; their
-    signal-to-noise ratios may differ. Noise is drawn on the CPU, so that every device has the same. What acts on the
-    samples of the intermediate frequency, and outputs that are no maps, are computed on the CPU, one by one.
+    Samples share a pass if radar, surroundings, scatterers and number of people are the same; their
+    signal-to-noise ratios may differ. Noise is drawn on the CPU, so that it is the same on every device. Effects on
+    samples of the intermediate frequency, and outputs that are not maps, are computed on the CPU, one by one.
 
     Raises:
         TensorsimError: motion that a radar cannot follow, in any of the samples.
@@ -55,7 +55,7 @@ def synthesize_batch(
 
 
 def _shared_by(view: View) -> object:
-    """What samples of one pass have in common: all but noise and the range bins that people reach."""
+    """What the samples of one pass have in common: everything but noise and the range bins that people reach."""
     scene = view.config.scene
     seeded = scene.sway or scene.vital_signs or scene.clutter is not None
     gate = view.config.processing.range_gate_m
@@ -92,7 +92,7 @@ def _outputs(recipe: DatasetRecipe, views: Sequence[View], device: torch.device)
 
 
 def _config_of_all(views: Sequence[View]) -> SimulationConfig:
-    """The configuration of the first sample with the range bins of all."""
+    """The configuration of the first sample, with the range bins of all samples."""
     gates = [view.config.processing.range_gate_m for view in views]
     fixed = [gate for gate in gates if isinstance(gate, tuple)]  # all or none
     if not fixed:
@@ -102,7 +102,7 @@ def _config_of_all(views: Sequence[View]) -> SimulationConfig:
 
 
 def _profiles(simulator: RadarSimulator, points: Tensor, rcs: Tensor, views: Sequence[View]) -> Tensor:
-    """Profiles (B, M, R) with the noise of each sample: its own range bins, then 0 where others have more."""
+    """Profiles (B, M, R) with the noise of each sample: its own range bins, then zeros if others have more."""
     recorder = simulator.recorder
     echoes, levels = recorder.echoes(points, rcs, simulator.span(points))
     clean = torch.cat([echo.mT for echo in echoes], -1)

@@ -1,4 +1,4 @@
-"""Building a data set: what is missing is made, shard by shard, and at the end listed in the manifest."""
+"""Build a data set: missing shards are made one by one, and at the end everything is listed in the manifest."""
 
 import json
 import os
@@ -20,23 +20,23 @@ from tensorsim.data.sets.shards import write_shard
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.files import LOCK, NotWrittenError, locked, reading, shown_name, write_json
 
-#: The folder of finished shards' rows, in it the file that is written first: the recipe, the listing of the clips,
-#: and what the radars and weights that the recipe names hold.
+#: The folder with the rows of finished shards, and the file in it that is written first: the recipe, the digest of
+#: the clips, and the contents of the radars and weights that the recipe names.
 ROWS, BEGUN = ".rows", "begun.json"
-#: The recipe for people to read, and the file that is written last.
+#: The human-readable recipe, and the file that is written last.
 RECIPE, DONE = "recipe.yaml", "dataset.json"
 
 
 class Job(NamedTuple):
-    """What a worker needs to know: plain values, so that it travels to any process.
+    """What a worker needs to know, as plain values, so that it can be sent to any process.
 
     Attributes:
         recipe: as JSON.
         out: folder of the data set.
-        cache: folder of the people found in films.
-        number: of the shard, or of the clip to prepare.
+        cache: folder of the people found in videos.
+        number: number of the shard, or of the clip to prepare.
         strict: whether the first failure ends the work.
-        again: whether films are searched again in which nobody was found before.
+        again: whether to search again in videos in which nobody was found before.
     """
 
     recipe: str
@@ -48,12 +48,12 @@ class Job(NamedTuple):
 
 
 class Built(NamedTuple):
-    """What a call of :func:`build_dataset` leaves.
+    """Result of :func:`build_dataset`.
 
     Attributes:
         samples: number of samples stored.
-        failures: number of clips of which some or all samples failed.
-        made: number of samples that this call made.
+        failures: number of clips with failed samples.
+        made: number of samples made by this call.
     """
 
     samples: int
@@ -63,12 +63,12 @@ class Built(NamedTuple):
 
 @lru_cache(maxsize=2)
 def plan_of(recipe: str, cache: str) -> Plan:
-    """The plan of a recipe as JSON; kept, since a worker does many shards of one recipe."""
+    """The plan of a recipe given as JSON; cached, since a worker makes many shards of one recipe."""
     return Plan(DatasetRecipe.from_document(json.loads(recipe)), cache)
 
 
 def prepare_clip(job: Job) -> int:
-    """Find the people of one clip's film, for all samples of it. Failures are met again by its samples."""
+    """Find the people in one clip's video, for all its samples. Failures recur when its samples are made."""
     plan = plan_of(job.recipe, job.cache)
     source, clip = plan.clip(job.number)
     try:
@@ -105,7 +105,7 @@ def build_shard(job: Job) -> int:
 
 
 def rows_path(out: Path, shard: Shard) -> Path:
-    """Where the rows of a finished shard wait for the manifest."""
+    """Where the rows of a finished shard are stored until the manifest is written."""
     return out / ROWS / f"{shard.name}.json"
 
 
@@ -118,28 +118,28 @@ def build_dataset(
     quiet: bool = False,
     retry: bool = False,
 ) -> Built:
-    """Build the data set of a recipe, or what is missing of it.
+    """Build the data set of a recipe, or the missing part of it.
 
-    The files depend on the recipe (and the films that it names) alone: not on the engine, the number of workers, or
-    interruptions. A shard is complete or not there; one that was finished is not made again, unless its files are
-    missing or of another size, or some of its samples failed and ``retry`` or ``strict`` asks for it.
+    The files depend only on the recipe (and the videos that it names), not on the engine, the number of workers, or
+    interruptions. A shard is either complete or absent. A finished one is not made again, unless its files are missing
+    or of a different size, or some of its samples failed and ``retry`` or ``strict`` asks for it.
 
     Args:
         recipe: what to make.
         out: folder; new, empty, or with an unfinished data set of the same recipe.
         engine: runs the work; None: this process.
-        cache: folder of the people found in films; None: ``.people`` in ``out``.
-        strict: the first clip that fails ends the work, in place of a line in ``failures.csv``.
+        cache: folder of the people found in videos; None: ``.people`` in ``out``.
+        strict: the first clip that fails ends the work, instead of adding a line to ``failures.csv``.
         quiet: no progress bar.
-        retry: make shards again in which samples failed.
+        retry: remake shards in which samples failed.
 
     Warns:
-        TensorsimWarning: settings of walls in the recipe, and no radar with a wall.
+        TensorsimWarning: the recipe has wall settings but no radar with a wall.
 
     Raises:
-        TensorsimError: another data set or other files in the folder, sources with other clips, or radars, weights or a
-            version of the package other than when it was begun, another run that is writing there, a source that is
-            not there, every sample failed, or, if ``strict``, a clip that fails.
+        TensorsimError: another data set or other files in the folder; changed clips, radars, weights or package version
+            since it was begun; another run that is writing there; a source that does not exist; every sample failed;
+            or, if ``strict``, a clip that fails.
     """
     if recipe.without_effect:
         warnings.warn(
@@ -160,7 +160,7 @@ def build_dataset(
             start = {"recipe": recipe.to_document(), "clips": plan.listing, "made_with": made}
             write_json(out / ROWS / BEGUN, start)
         elif begun != plan.listing:
-            # Samples would change their numbers, and people would come into two parts.
+            # Sample numbers would change, and people could end up in two parts.
             raise TensorsimError(
                 f"{out}: got sources with other clips, people or labels than when this data set was begun, expected "
                 "the same or a new folder"
@@ -174,7 +174,7 @@ def build_dataset(
             done = json.loads((out / DONE).read_text(encoding="utf-8"))
             return Built(done["samples"], done["failures"], 0)
         for name in (DONE, *MANIFESTS):
-            (out / name).unlink(missing_ok=True)  # of a finished data set; now it is none
+            (out / name).unlink(missing_ok=True)  # from a finished data set, which it no longer is
 
         def job(number: int) -> Job:
             return Job(document, str(out.resolve()), kept, number, strict, retry or strict)
@@ -197,7 +197,7 @@ def _run(engine: Engine, name: str, unit: str, total: int, done: Iterator[int], 
 
 
 def _films(plan: Plan) -> list[int]:
-    """One clip of every film whose people networks have to find."""
+    """One clip of every video in which networks have to find people."""
     first: dict[str, int] = {}
     for number, source in enumerate(plan.sources):
         for index in range(len(source) if source.finds_people else 0):
@@ -207,9 +207,9 @@ def _films(plan: Plan) -> list[int]:
 
 
 def _begun(out: Path, recipe: DatasetRecipe, made: dict[str, Any]) -> str | None:
-    """The listing of the clips with which the data set of the folder was begun; None of a new one.
+    """The digest of the clips with which the folder's data set was begun; None for a new one.
 
-    What an interrupted run left half written is removed.
+    Incomplete files of an interrupted run are removed.
 
     Raises:
         TensorsimError: another data set, one made with other radars, weights or another version, or other files.
@@ -238,7 +238,7 @@ def _begun(out: Path, recipe: DatasetRecipe, made: dict[str, Any]) -> str | None
 
 
 def _is_there(out: Path, shard: Shard) -> bool:
-    """Whether a shard is finished: its rows, and the files that they name, of the sizes that were written."""
+    """Whether a shard is finished: its rows exist, and the files that they name have the sizes written."""
     path = rows_path(out, shard)
     if not path.is_file():
         return False
@@ -248,7 +248,7 @@ def _is_there(out: Path, shard: Shard) -> bool:
 
 
 def _forget_failures(out: Path, plan: Plan) -> None:
-    """Shards with samples that failed count as missing."""
+    """Make shards with failed samples count as missing."""
     for shard in plan.shards:
         path = rows_path(out, shard)
         if path.is_file() and rows_of_shard(path)["failures"]:

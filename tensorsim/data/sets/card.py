@@ -1,4 +1,4 @@
-"""The data card: what is in a data set, in words and tables."""
+"""The data card: describes a data set in words and tables."""
 
 from collections import Counter
 
@@ -24,10 +24,10 @@ def card(plan: Plan, counts: Counter[tuple[str, str]], failures: int, size: int)
     """The text of ``README.md`` in the folder of a data set.
 
     Args:
-        plan: of the recipe.
+        plan: plan of the recipe.
         counts: samples by part and class.
-        failures: number of clips of which samples failed.
-        size: bytes of all shards.
+        failures: number of clips with failed samples.
+        size: total size of the shards in bytes.
     """
     recipe = plan.recipe
     total = sum(counts.values())

@@ -12,14 +12,14 @@ class Clip:
     """One labelled clip.
 
     Attributes:
-        name: tells it apart from all others of its source; it does not depend on where the files are.
+        name: unique within its source; it does not depend on where the files are.
         label: name of its class.
-        person: who is in it; where nobody says so, the file, as somebody else than in any other file.
-        origin: the film or file, or the generator.
-        part: of the data set, if the source fixes it; else "".
-        path: of its file, if it has one.
-        key: of the motion within the file.
-        start_s, end_s: the part of the file; a file that has the name of the clip holds this part alone.
+        person: who is in it; if unknown, the file, so that each file counts as a different person.
+        origin: the video or file, or the generator.
+        part: part of the data set, if the source fixes it; else "".
+        path: path of its file, if it has one.
+        key: key of the motion within the file.
+        start_s, end_s: the section of the file; a file named like the clip holds only this section.
     """
 
     name: str
@@ -38,9 +38,9 @@ class ClipSource(Protocol):
 
     #: Names of the classes in their order.
     labels: tuple[str, ...]
-    #: Whether the source says of every clip who is in it; else each file counts as another person.
+    #: Whether the source states who is in each clip; otherwise each file counts as a different person.
     names_people: bool
-    #: Whether networks have to find people in films, which :meth:`prepare` does.
+    #: Whether networks have to find people in videos, which :meth:`prepare` does.
     finds_people: bool
 
     def __len__(self) -> int:
@@ -53,7 +53,7 @@ class ClipSource(Protocol):
         """Who is in a clip; the same as ``clip(index).person``, without the rest."""
 
     def adapted(self, clip: Clip, variation: Variation) -> Variation:
-        """The variation with what the clip itself decides."""
+        """The variation, with values that the clip itself determines."""
 
     def scene(self, clip: Clip, variation: Variation) -> Scene:
         """The people of a varied clip on the floor.
@@ -63,9 +63,9 @@ class ClipSource(Protocol):
         """
 
     def prepare(self, clip: Clip, again: bool = False) -> None:
-        """Do the work that all variations of a clip share, such as finding the people of a film, and keep it.
+        """Do the work that all variations of a clip share, such as finding people in a video, and keep the result.
 
         Args:
             clip: one of the clips.
-            again: also where it failed before; that it did is kept as well.
+            again: retry if it failed before; failures are kept as well.
         """

@@ -1,4 +1,4 @@
-"""Ways to run the work: in this process, in several, or on the nodes of a Ray cluster."""
+"""Ways to run the work: in this process, in several processes, or on the nodes of a Ray cluster."""
 
 import json
 import logging
@@ -14,7 +14,7 @@ from tensorsim.process import end_with_parent
 
 Work = Callable[[Any], int]
 
-#: Times that a worker may die in a row before the work is given up.
+#: Consecutive worker deaths before giving up.
 _DEATHS = 3
 
 
@@ -22,11 +22,11 @@ class Engine(Protocol):
     """Runs independent jobs in any order."""
 
     def run(self, work: Work, jobs: Iterable[Any]) -> Iterator[int]:
-        """Call ``work`` for every job; yields what it returns, as it comes."""
+        """Call ``work`` for every job; yields results as they arrive."""
 
 
 class Serial:
-    """In this process, one after the other."""
+    """Runs jobs in this process, one after the other."""
 
     def run(self, work: Work, jobs: Iterable[Any]) -> Iterator[int]:
         """See :class:`Engine`."""
@@ -35,15 +35,15 @@ class Serial:
 
 
 class Processes:
-    """In several processes of this machine; one that dies is replaced and its job done again.
+    """Runs jobs in several processes on this machine; a process that dies is replaced and its job repeated.
 
-    Processes are started anew, so a script that uses them needs ``if __name__ == "__main__":``.
+    Processes are spawned, so a script that uses them needs ``if __name__ == "__main__":``.
 
     Args:
         workers: number of processes.
 
     Raises:
-        TensorsimError: a worker dies several times in a row; what a job raises.
+        TensorsimError: workers die several times in a row, or an error raised by a job.
     """
 
     def __init__(self, workers: int) -> None:
@@ -61,7 +61,7 @@ class Processes:
                 while waiting or running:
                     while waiting and len(running) < 2 * self.workers:
                         running[pool.submit(work, waiting[-1])] = waiting[-1]
-                        waiting.pop()  # only now: a pool that broke meanwhile refuses jobs
+                        waiting.pop()  # only now: a pool that has broken meanwhile refuses jobs
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
                         count = future.result()
                         del running[future]
@@ -91,7 +91,7 @@ def _one_thread() -> None:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
-    """End the workers, also in the midst of jobs that nobody asks for any more; then none of them writes any more."""
+    """Stop the workers, even in the middle of jobs that are no longer needed, so that none of them writes any more."""
     processes = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
@@ -101,11 +101,11 @@ def _end(pool: ProcessPoolExecutor) -> None:
 
 
 class RayCluster:
-    """On the nodes of a Ray cluster, by Ray Data; all of them need the folder of the data set.
+    """Runs jobs on the nodes of a Ray cluster with Ray Data; all nodes need access to the data set's folder.
 
     Args:
-        address: of a running cluster; None starts one on this machine.
-        workers: processors to use on this machine where one is started.
+        address: address of a running cluster; None starts one on this machine.
+        workers: processors to use if a cluster is started on this machine.
 
     Raises:
         TensorsimError: Ray is not installed.

@@ -1,4 +1,4 @@
-"""Recipes with comments, which run as they are: a small one, and one for training a classifier."""
+"""Commented recipes that run as they are: a small one, and one for training a classifier."""
 
 EXAMPLE = """\
 # A recipe of a labelled data set. Build it: tensorsim dataset build RECIPE.yaml --out DIR --workers 2

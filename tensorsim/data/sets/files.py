@@ -1,4 +1,4 @@
-"""Files of people as a source of labelled clips: films, key points, captured motion, and the layouts of public sets."""
+"""Files of people as a source of labelled clips: videos, keypoints, captured motion, and public data sets."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +14,7 @@ from tensorsim.data.skeletons import Motion
 from tensorsim.errors import TensorsimError
 from tensorsim.files import shown_name
 
-#: Memory for the motions that a source keeps; a minute of one person at 120 frames per second takes 2.4 MB.
+#: Memory in MB for motions kept by a source; a minute of one person at 120 frames per second takes 2.4 MB.
 _KEPT_MB = 200.0
 #: How the clips of each kind of source are listed.
 LISTS: dict[str, Callable[[SourceConfig], list[Clip]]] = {
@@ -31,16 +31,16 @@ LISTS: dict[str, Callable[[SourceConfig], list[Clip]]] = {
 
 
 class FileClips:
-    """Clips of files.
+    """Clips from files.
 
     Args:
         recipe: gives length and rate of the motion.
-        source: kind and place of the files.
-        number: of the source in the recipe.
-        cache: folder of the people that were found in films; None finds them every time.
+        source: kind and location of the files.
+        number: number of the source in the recipe.
+        cache: folder of the people found in videos; None finds them every time.
 
     Raises:
-        TensorsimError: a folder or table that is not there or has no clips, or an unknown class.
+        TensorsimError: a folder or table that does not exist or has no clips, or an unknown class.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class FileClips:
         return self.clips[index].person
 
     def adapted(self, clip: Clip, variation: Variation) -> Variation:
-        """As it is."""
+        """The variation, unchanged."""
         return variation
 
     def scene(self, clip: Clip, variation: Variation) -> Scene:
@@ -83,7 +83,7 @@ class FileClips:
         return part_of(moved, self.recipe.duration_s, self.recipe.motion_hz, variation.start)
 
     def _motion(self, clip: Clip) -> Motion:
-        """The people of a clip's file; the last ones are kept, since files with many motions take long to read."""
+        """The people in a clip's file; recent ones are cached, since files with many motions are slow to read."""
         key = (clip.path, clip.key)
         if key not in self._motions:
             self._motions[key] = self.finder.motion(*key)
@@ -93,12 +93,12 @@ class FileClips:
         return self._motions[key]
 
     def prepare(self, clip: Clip, again: bool = False) -> None:
-        """Find the people of the clip's file."""
+        """Find the people in the clip's file."""
         self.finder.motion(clip.path, clip.key, again)
 
 
 def _in_utf8(clip: Clip) -> Clip:
-    """What the data set says of a clip as text that its files can hold; only the path stays that of the file."""
+    """The clip with all text made valid UTF-8 for the data set's files; only the path stays as it is."""
     return replace(
         clip,
         name=shown_name(clip.name),
@@ -109,14 +109,14 @@ def _in_utf8(clip: Clip) -> Clip:
 
 
 def _told_apart(clip: Clip, source: SourceConfig, number: int) -> Clip:
-    """A person known by the file alone is somebody else than in a file of the same name of another source."""
+    """Make a person known only by the file differ from that of an equally named file in another source."""
     return (
         replace(clip, person=f"{source.kind}{number}/{clip.person}") if clip.person == clip.origin else clip
     )
 
 
 def cut(motion: Motion, clip: Clip) -> Motion:
-    """The part of a motion between the times of a clip; a file that is named as the clip holds this part alone.
+    """The part of a motion between the times of a clip; a file named like the clip holds only this part.
 
     Raises:
         TensorsimError: fewer than two frames are left.

@@ -16,12 +16,12 @@ from tensorsim.motion.people import PeopleConfig, draw_people
 class GeneratedPeople:
     """People of :class:`~tensorsim.motion.ActivityGenerator`; everybody does every activity.
 
-    A person of a recipe's seed keeps the same body; manner, place and noise are those of the sample.
+    For a given recipe seed a person keeps the same body; manner, place and noise depend on the sample.
 
     Args:
         recipe: gives seed, length and rate of the motion, heights and ranges.
         source: the activities and the number of people.
-        number: of the source in the recipe.
+        number: number of the source in the recipe.
     """
 
     names_people = True
@@ -45,7 +45,7 @@ class GeneratedPeople:
         return Clip(f"{person}/{label}", label, person, person)
 
     def adapted(self, clip: Clip, variation: Variation) -> Variation:
-        """The height is that of the person."""
+        """The variation, with the person's height."""
         body = draw_people(1, self._config(variation), self._body_generator(clip.person))
         return replace(variation, height_m=float(body.height_m[0]))
 
@@ -66,7 +66,7 @@ class GeneratedPeople:
                 [torch.full_like(manner.heading_rad, variation.side_m), manner.start_m[:, 1]], -1
             ),
         )
-        # Played at its speed, the motion lasts as long as it should.
+        # So that the motion has the right duration after its change of speed.
         motion = ActivityGenerator(config).generate(
             clip.label,
             people=who,

@@ -1,4 +1,4 @@
-"""What samples depend on beside the text of a recipe: the radars and weights that it names, and this package."""
+"""What samples depend on besides the recipe text: the radars and weights that it names, and this package."""
 
 import hashlib
 import json
@@ -13,14 +13,14 @@ from tensorsim.radar.presets import radar_scene
 
 
 def made_with(recipe: DatasetRecipe) -> dict[str, Any]:
-    """What the presets and files of a recipe hold now.
+    """The current contents of the presets and files that a recipe names.
 
     Returns:
-        Plain values: ``version`` of the package; ``radars``, by name the fields of each with its wall and floor, None
-        where there is none; ``denoisers``, the SHA-256 of the weights of each that has any.
+        Plain values: ``version`` of the package; ``radars``, by name the fields of each with its wall and floor (None
+        if there is none); ``denoisers``, the SHA-256 of the weights of each that has any.
 
     Raises:
-        TensorsimError: a radar or weights that are not there.
+        TensorsimError: a radar or weights that do not exist.
     """
     scenes = {view.name: radar_scene(view.preset) for view in recipe.radars}
     weights = {
@@ -40,10 +40,10 @@ def made_with(recipe: DatasetRecipe) -> dict[str, Any]:
 
 
 def digest(recipe: DatasetRecipe, made: dict[str, Any]) -> str:
-    """SHA-256 of a recipe and what it was made with, which tells data sets apart.
+    """SHA-256 of a recipe and what it was made with, which identifies the data set.
 
     Args:
-        recipe: its text.
+        recipe: the recipe.
         made: see :func:`made_with`.
     """
     text = json.dumps([recipe.to_document(), made], sort_keys=True)
@@ -51,7 +51,7 @@ def digest(recipe: DatasetRecipe, made: dict[str, Any]) -> str:
 
 
 def difference(there: Any, here: Any, name: str = "") -> str:
-    """The first value in which two documents (mappings of mappings, numbers, ...) differ, by its keys."""
+    """The first value in which two documents (mappings of mappings, numbers, ...) differ, with its keys, as text."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in there | here:
             if there.get(key) != here.get(key):

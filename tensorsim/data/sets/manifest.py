@@ -1,4 +1,4 @@
-"""What tells of a finished data set: manifest, failures, data card, contact sheet."""
+"""Descriptions of a finished data set: manifest, failures, data card, contact sheet."""
 
 import csv
 import json
@@ -22,21 +22,21 @@ from tensorsim.files import complete_file, reading, write_json, write_text
 
 Row = dict[str, Any]
 
-#: The same rows in two formats, written once all shards are there.
+#: The same rows in two formats, written once all shards exist.
 MANIFESTS = ("manifest.parquet", "manifest.csv")
 
 
 def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]) -> tuple[list[int], int]:
-    """Write everything beside the shards of a complete data set; ``dataset.json``, which says that, is the last.
+    """Write everything but the shards of a complete data set; ``dataset.json``, which marks it complete, comes last.
 
     Args:
         out: folder of the data set.
-        plan: of its recipe.
+        plan: plan of its recipe.
         made: see :func:`~tensorsim.data.sets.made_with.made_with`.
         finished: the rows of each shard, in order.
 
     Returns:
-        Numbers of samples in each shard, and of clips of which samples failed.
+        Number of samples in each shard, and number of clips with failed samples.
 
     Raises:
         TensorsimError: every sample failed.
@@ -80,7 +80,7 @@ def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]
 
 
 def rows_of_shard(path: Path) -> dict[str, Any]:
-    """What is kept of a finished shard: ``rows`` of the manifest, ``failures``, the SHA-256 of ``files`` and their
+    """The record of a finished shard: ``rows`` of the manifest, ``failures``, the SHA-256 of ``files`` and their
     ``bytes``.
 
     Raises:
@@ -92,7 +92,7 @@ def rows_of_shard(path: Path) -> dict[str, Any]:
 
 
 def _write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
-    """Write every clip of which samples failed, with their number and the first reason."""
+    """List every clip with failed samples, with their number and the first reason."""
     with complete_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, ["clip", "path", "samples", "reason"])
         writer.writeheader()
@@ -103,8 +103,8 @@ def _write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
 def _manifest(
     out: Path, recipe: DatasetRecipe, made: dict[str, Any]
 ) -> Iterator[Callable[[list[Row]], None]]:
-    """``manifest.parquet``, which holds the recipe and what it was made with as well, and ``manifest.csv``: a function
-    that adds rows to both."""
+    """Write ``manifest.parquet``, which also holds the recipe and what it was made with, and ``manifest.csv``; gives
+    a function that adds rows to both."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -135,7 +135,7 @@ def _manifest(
 
 
 def _finished(out: Path) -> Path:
-    """The manifest of a data set, which is there once all its shards are."""
+    """The manifest of a data set, which exists once all its shards do."""
     path = out / "manifest.parquet"
     if not path.is_file():
         raise TensorsimError(f"{out}: got no manifest.parquet, expected a finished data set")
@@ -143,7 +143,7 @@ def _finished(out: Path) -> Path:
 
 
 def recipe_of(out: Path) -> DatasetRecipe:
-    """The recipe that the manifest of a data set holds.
+    """The recipe stored in the manifest of a data set.
 
     Raises:
         TensorsimError: no manifest there, or a damaged one.
@@ -155,9 +155,9 @@ def recipe_of(out: Path) -> DatasetRecipe:
 
 
 def made_of(out: Path) -> dict[str, Any]:
-    """What a data set was made with, as :func:`~tensorsim.data.sets.made_with.made_with` says it.
+    """What a data set was made with, as returned by :func:`~tensorsim.data.sets.made_with.made_with`.
 
-    Data sets of earlier versions do not tell it: an empty dictionary.
+    Empty for data sets of earlier versions, which do not state it.
 
     Raises:
         TensorsimError: no manifest there, or a damaged one.
@@ -169,14 +169,14 @@ def made_of(out: Path) -> dict[str, Any]:
 
 
 def _metadata(path: Path) -> dict[bytes, bytes]:
-    """The documents that a manifest holds."""
+    """The documents stored in a manifest."""
     import pyarrow.parquet as pq
 
     return pq.read_schema(path).metadata or {}
 
 
 def rows_of(out: Path, **wanted: str) -> Iterator[Row]:
-    """Rows of the manifest whose columns have these values, in the order of the samples.
+    """Rows of the manifest whose columns have these values, in sample order.
 
     Raises:
         TensorsimError: no manifest there, or a damaged one.
@@ -193,7 +193,7 @@ def rows_of(out: Path, **wanted: str) -> Iterator[Row]:
 
 
 def columns_of(out: Path, *names: str) -> list[npt.NDArray[Any]]:
-    """Columns of the manifest, in the order of the samples.
+    """Columns of the manifest, in sample order.
 
     Raises:
         TensorsimError: no manifest there, or a damaged one.

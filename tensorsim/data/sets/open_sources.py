@@ -1,4 +1,4 @@
-"""From the sources that a recipe names to the clips that they have."""
+"""From the sources that a recipe names to their clips."""
 
 from tensorsim.data.sets.clips import ClipSource
 from tensorsim.data.sets.files import FileClips
@@ -11,13 +11,13 @@ def open_source(recipe: DatasetRecipe, source: SourceConfig, number: int, cache:
     """The clips of a source.
 
     Args:
-        recipe: that the source belongs to.
+        recipe: the recipe that the source belongs to.
         source: its description.
-        number: its place in the recipe.
-        cache: folder of what is found in films; None finds it every time.
+        number: its position in the recipe.
+        cache: folder of the people found in videos; None finds them every time.
 
     Raises:
-        TensorsimError: a folder or table that is not there or has no clips.
+        TensorsimError: a folder or table that does not exist or has no clips.
     """
     if source.kind == "generated":
         return GeneratedPeople(recipe, source, number)

@@ -14,7 +14,7 @@ from tensorsim.recognition.map_image import area_weights
 
 DataType = Literal["uint8", "float16"]
 
-#: Outputs of one transmitter and receiver, those of an array, and those of any radar.
+#: Outputs for one transmitter and receiver, those for an array, and those for any radar.
 MAPS = ("doppler_time", "range_time", "range_time_mti")
 SIGNALS = ("profiles", "if_signal")
 OF_PAIR = (*MAPS, *SIGNALS, "ridges", "picture")
@@ -29,24 +29,25 @@ class OutputConfig:
     Attributes:
         kinds: ``"doppler_time"`` (F, K), ``"range_time"`` and ``"range_time_mti"`` (R, M): maps in decibels below their
             peak; ``"ridges"`` (C, K): Doppler in Hz; ``"picture"`` (size, size) uint8: the input of a classifier, row 0
-            the lowest speed; ``"profiles"`` (M, R, 2) and ``"if_signal"`` (M, N, 2): real and imaginary part over the
-            largest magnitude, float16; ``"range_doppler_angle"`` (frames, R, F, beams) in decibels and
+            the lowest speed; ``"profiles"`` (M, R, 2) and ``"if_signal"`` (M, N, 2): real and imaginary part divided by
+            the largest magnitude, float16; ``"range_doppler_angle"`` (frames, R, F, beams) in decibels and
             ``"point_cloud"`` (frames, points, 4) float32: range in m, speed in m/s, sine of the azimuth and power in
-            dB, NaN where there is no point, both of an array (above a ratio of signal to noise of 20 dB the side lobes
-            of ``range_window="hamming"`` are points as well, those of ``"hann"`` hardly); ``"joints"`` (P, T, 14, 3)
+            dB, NaN where there is no point, both for an array (above a signal-to-noise ratio of 20 dB, side lobes of
+            ``range_window="hamming"`` become points too, those of ``"hann"`` hardly ever); ``"joints"`` (P, T, 14, 3)
             float32: metres, as the radar sees them, NaN where nobody is.
-        dtype: of maps: ``"uint8"``, 255 at the peak and 0 at ``range_db`` below it, or ``"float16"``, decibels.
-        range_db: range of uint8 maps.
-        size: (rows, columns) of maps, every cell the mean power of what it covers; None keeps them.
-        rate_hz: columns per second of maps at most, likewise; None keeps them; none beside ``size``. Doppler-time maps
-            have no more than Doppler frames: about 20 a second with the ``overlap`` of 0.5 that recipes have.
-        picture_size, picture_speed_m_s, picture_range_db: of pictures.
-        frames_per_s, beams, cube_size, points: of the outputs of an array: frames per second, directions in steps of
-            equal sine, cells of range and Doppler of a cube, and points of a frame.
+        dtype: type of maps: ``"uint8"``, 255 at the peak and 0 at ``range_db`` below it, or ``"float16"``, decibels.
+        range_db: dynamic range of uint8 maps.
+        size: (rows, columns) of maps, each cell the mean power of what it covers; None keeps them.
+        rate_hz: maximum columns per second of maps, averaged likewise; None keeps them; not used with ``size``.
+            Doppler-time maps have at most one column per Doppler frame: about 20 per second with the recipes'
+            ``overlap`` of 0.5.
+        picture_size, picture_speed_m_s, picture_range_db: settings of pictures.
+        frames_per_s, beams, cube_size, points: settings of array outputs: frames per second, directions equally
+            spaced in sine, range and Doppler cells of a cube, and points per frame.
 
     Raises:
-        TensorsimError: unknown kinds, kinds that no one radar gives together, a ``rate_hz`` beside a ``size``, or
-            numbers that are not positive.
+        TensorsimError: unknown kinds, kinds that no single radar can give together, ``rate_hz`` together with ``size``,
+            or numbers that are not positive.
     """
 
     kinds: tuple[str, ...] = ("doppler_time",)
@@ -103,12 +104,12 @@ class OutputConfig:
 
     @property
     def needs_pair(self) -> bool:
-        """Whether there are outputs of one transmitter and receiver."""
+        """Whether there are outputs for one transmitter and receiver."""
         return bool(set(self.kinds) & set(OF_PAIR))
 
     @property
     def needs_array(self) -> bool:
-        """Whether there are outputs of an array."""
+        """Whether there are outputs for an array."""
         return bool(set(self.kinds) & set(OF_ARRAY))
 
 
@@ -120,7 +121,7 @@ class Stored(NamedTuple):
 
 
 def resized(power: Tensor, rows: int, columns: int) -> Tensor:
-    """Power (H, W) to cells (rows, columns), each the mean of what it covers."""
+    """Average power (H, W) to cells (rows, columns), each the mean of what it covers."""
 
     def weights(cells: int, count: int) -> Tensor:
         return area_weights(torch.arange(cells, dtype=torch.float64), 1.0, 0.0, float(cells), count)
@@ -131,7 +132,7 @@ def resized(power: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def stored_map(magnitude: Tensor, config: OutputConfig, duration_s: float) -> Stored:
-    """A map (H, W) of magnitudes as :class:`OutputConfig` says; ``duration_s`` is that of all its columns."""
+    """A map (H, W) of magnitudes stored as :class:`OutputConfig` states; ``duration_s`` spans all its columns."""
     power = magnitude.double().square()
     rows, columns = power.shape
     if config.size is not None:
@@ -153,7 +154,7 @@ def in_decibels(power: Tensor, config: OutputConfig) -> Stored:
 
 
 def stored_signal(signal: Tensor) -> Stored:
-    """A complex signal (...) as its parts (..., 2) over the largest magnitude, float16."""
+    """A complex signal (...) as real and imaginary parts (..., 2) divided by the largest magnitude, float16."""
     peak = float(signal.abs().max())
     parts = torch.view_as_real(signal / peak if peak > 0 else signal)
     return Stored(parts.to(torch.float16).numpy(), peak)

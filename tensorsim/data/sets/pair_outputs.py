@@ -1,4 +1,4 @@
-"""Outputs of a radar with one transmitter and receiver: maps, ridges, pictures, profiles and the signal itself."""
+"""Outputs for a radar with one transmitter and receiver: maps, ridges, pictures, profiles and the signal itself."""
 
 from dataclasses import replace
 from typing import Any
@@ -24,7 +24,7 @@ from tensorsim.recognition.map_image import MapToImage
 
 
 def of_samples(processing: ProcessingConfig) -> ProcessingConfig:
-    """The same with the engine that computes samples of the intermediate frequency."""
+    """The same processing, with the engine that computes samples of the intermediate frequency."""
     return replace(processing, engine="time", near_bins=None, energy_stride=1)
 
 
@@ -61,7 +61,7 @@ def scatterers(stage: PoseToDoppler, joints: Tensor, valid: Tensor, fps: float) 
 
 
 def recorded(simulator: RadarSimulator, points: Tensor, rcs: Tensor) -> Tensor:
-    """The intermediate frequency (1, M, N) with all that the receiver does to it."""
+    """The intermediate frequency (1, M, N) with all receiver effects."""
     recorder: Any = simulator.recorder
     _, levels = recorder.echoes(points, rcs, points.shape[1])
     power = recorder.noise.noise_power(levels.signal)
@@ -80,7 +80,7 @@ def recorded(simulator: RadarSimulator, points: Tensor, rcs: Tensor) -> Tensor:
 def maps_of(
     stage: PoseToDoppler, profiles: Tensor, points: Tensor, rcs: Tensor, wanted: OutputConfig
 ) -> dict[str, Tensor]:
-    """Magnitudes of maps by name, with a leading dimension, of profiles (B, M, R); processed ones are denoised."""
+    """Magnitudes of maps by name, with a batch dimension, from profiles (B, M, R); processed ones are denoised."""
     simulator = stage.simulator
     moving = simulator.mti(profiles)
     if simulator.gate is not None:
@@ -99,7 +99,7 @@ def maps_of(
 def stored_maps(
     simulator: RadarSimulator, maps: dict[str, Tensor], wanted: OutputConfig, duration_s: float
 ) -> dict[str, Stored]:
-    """What is stored of the maps (H, W) of one sample, on the CPU."""
+    """The maps (H, W) of one sample as they are stored, on the CPU."""
     found = {name: stored_map(maps[name], wanted, duration_s) for name in MAPS if name in wanted.kinds}
     doppler = maps["doppler_time"]
     if "ridges" in wanted.kinds:

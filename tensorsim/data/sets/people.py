@@ -1,4 +1,4 @@
-"""The people of a file: read from motion and key points, found by networks in films, and kept."""
+"""The people in a file: read from motion and keypoints, or found in videos by networks and cached."""
 
 import hashlib
 from collections.abc import Callable
@@ -23,19 +23,19 @@ from tensorsim.files import complete_file, sha256_of, shown_name, write_text
 from tensorsim.pipeline import VideoToPose
 from tensorsim.vision.smoothing.along_time import nearest_valid
 
-#: Files of captured motion by suffix; other files are key points (.json) or films.
+#: Files of captured motion by suffix; other files are keypoints (.json) or videos.
 _MOTION = (".bvh", ".npz", ".skeleton", ".mat")
 
 T = TypeVar("T")
 
 
 def is_film(file: Path) -> bool:
-    """Whether networks have to find the people of a file."""
+    """Whether networks have to find the people in a file."""
     return file.suffix.lower() not in (*_MOTION, ".json") and not file.is_dir()
 
 
 def _at_own_rate(read: Callable[[float | None], T], fps: float | None) -> T:
-    """What is read at the frame rate that a file states, or at ``fps`` where it states none that makes sense."""
+    """Read at the frame rate that a file states, or at ``fps`` if it states no sensible one."""
     try:
         return read(None)
     except TensorsimError:
@@ -45,9 +45,9 @@ def _at_own_rate(read: Callable[[float | None], T], fps: float | None) -> T:
 
 
 def finite_everywhere(motion: Motion, name: str) -> Motion:
-    """Those people of a motion who are in it, with joints in every frame: where they are not seen, as nearest to it.
+    """The people who appear in a motion, with joints in every frame: unseen frames copy the nearest seen one.
 
-    Splines run through these places.
+    Splines run through these frames.
 
     Raises:
         TensorsimError: a motion without people.
@@ -61,11 +61,11 @@ def finite_everywhere(motion: Motion, name: str) -> Motion:
 
 
 class PeopleFinder:
-    """Reads or finds the people of files; the camera of films and key points is estimated from their people.
+    """Reads or finds the people in files; the camera of videos and keypoints is estimated from the people.
 
     Args:
-        source: its ``fps`` and ``image_size`` serve where files do not tell them.
-        cache: folder for the people of films, by the hash of the film and of the networks; None keeps nothing.
+        source: its ``fps`` and ``image_size`` are used if files do not state them.
+        cache: folder for the people found in videos, by hash of the video and the networks; None caches nothing.
     """
 
     def __init__(self, source: SourceConfig, cache: Path | None) -> None:
@@ -73,15 +73,15 @@ class PeopleFinder:
 
     @torch.no_grad()
     def motion(self, path: str, key: str, again: bool = False) -> Motion:
-        """The people of a file; joints are finite everywhere.
+        """The people in a file; joints are finite everywhere.
 
         Args:
-            path: of the file.
-            key: of the motion in it.
-            again: look also where nobody was found before, see :meth:`kept`.
+            path: path of the file.
+            key: key of the motion in it.
+            again: search even if nobody was found before, see :meth:`kept`.
 
         Raises:
-            TensorsimError: a file that is missing or damaged, or a film in which nobody was found.
+            TensorsimError: a file that is missing or damaged, or a video in which nobody was found.
         """
         file = Path(path)
         if not file.exists():
@@ -112,13 +112,13 @@ class PeopleFinder:
         return Motion(pose.joints[0], pose.valid[0], found.fps)
 
     def kept(self, file: Path, digest: str, find: Callable[[Path], Motion], again: bool = False) -> Motion:
-        """What ``find`` finds in a film, kept in ``cache`` for the next time; so is the reason if there is nobody.
+        """The result of ``find`` for a video, kept in ``cache`` for the next time, as is the reason for a failure.
 
         Args:
-            file: the film, or the name of one.
-            digest: of all that the people depend on.
+            file: the video, or a name for it.
+            digest: hash of everything that the people depend on.
             find: takes ``file``.
-            again: call it also where it failed before.
+            again: call it even if it failed before.
 
         Raises:
             TensorsimError: what ``find`` raises, or raised before.
@@ -158,7 +158,7 @@ class PeopleFinder:
 
     @cached_property
     def of_networks(self) -> bytes:
-        """Hash of the networks, and the versions of the package and of those that read films and run networks."""
+        """Hash of the networks and of the versions of this package and those that read videos and run networks."""
         import cv2
 
         from tensorsim.registry import locate

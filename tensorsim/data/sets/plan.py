@@ -24,7 +24,7 @@ class Shard(NamedTuple):
     """A run of samples of one part.
 
     Attributes:
-        name: of its file, without suffix.
+        name: name of its file, without suffix.
         part: training, validation or test.
         first, stop: half-open range of sample numbers.
     """
@@ -38,19 +38,19 @@ class Shard(NamedTuple):
 class Plan:
     """All samples of a recipe, without making any.
 
-    Sample numbers run through the parts in turn; within a part clips are in an order drawn from the seed, so that every
-    shard has samples of many classes.
+    Sample numbers run through the parts in turn; within a part, clips are in random order drawn from the seed, so that
+    every shard has samples of many classes.
 
     Args:
         recipe: the recipe.
-        cache: folder of what is found in films.
+        cache: folder of the people found in videos.
 
     Attributes:
         labels: names of the classes, in the order of the sources.
 
     Raises:
-        TensorsimError: a folder or table that is not there, no clips in it, or classes that pictures in class folders
-            cannot tell apart.
+        TensorsimError: a folder or table that does not exist or has no clips, or classes that would share a folder of
+            pictures.
     """
 
     def __init__(self, recipe: DatasetRecipe, cache: str | None = None) -> None:
@@ -67,7 +67,7 @@ class Plan:
             self._check_folders()
 
     def _check_folders(self) -> None:
-        """Refuse classes whose pictures would come into one folder, also where capitals do not count."""
+        """Refuse classes whose pictures would share a folder, even on a case-insensitive file system."""
         there: dict[str, str] = {}
         for label in self.labels:
             other = there.setdefault(folder_name(label).casefold(), label)
@@ -79,7 +79,7 @@ class Plan:
 
     @property
     def clips(self) -> int:
-        """Number of clips of all sources."""
+        """Total number of clips in all sources."""
         return int(self.starts[-1])
 
     def __len__(self) -> int:
@@ -91,13 +91,13 @@ class Plan:
         return self.sources[number], self.sources[number].clip(place)
 
     def _place(self, index: int) -> tuple[int, int]:
-        """The number of the source of a clip, and that of the clip in it."""
+        """The number of a clip's source, and the clip's number in it."""
         number = int(np.searchsorted(self.starts, index, side="right")) - 1
         return number, index - int(self.starts[number])
 
     @cached_property
     def listing(self) -> str:
-        """SHA-256 of the clips that files hold; those of generated people follow from the recipe."""
+        """SHA-256 of the clips in files; those of generated people follow from the recipe."""
         digest = hashlib.sha256()
         for source in self.sources:
             for clip in source.clips if isinstance(source, FileClips) else ():
@@ -106,7 +106,7 @@ class Plan:
 
     @cached_property
     def parts(self) -> dict[str, Indices]:
-        """Clips of each part, in the order of the samples."""
+        """Clips of each part, in sample order."""
         part = self._part_of_clips()
         order = np.random.Generator(np.random.PCG64(seed_of(self.recipe.seed, "order")))
         return {name: order.permutation(np.flatnonzero(part == k)) for k, name in enumerate(PARTS)}
@@ -138,7 +138,7 @@ class Plan:
 
     @cached_property
     def shards(self) -> list[Shard]:
-        """All shards, in the order of the samples."""
+        """All shards, in sample order."""
         shards, first = [], 0
         for part, clips in self.parts.items():
             stop = first + len(clips) * self.recipe.variations.count
@@ -149,7 +149,7 @@ class Plan:
         return shards
 
     def clip_of_sample(self, sample: int) -> tuple[str, int, int]:
-        """Part, clip and number of the variation of a sample."""
+        """Part, clip and variation number of a sample."""
         count = self.recipe.variations.count
         for part, clips in self.parts.items():
             if sample < len(clips) * count:
@@ -175,14 +175,14 @@ class Plan:
         for word in filter(None, variation.companions.split(",")):
             seed = int(word)
             other_source, other = self._companion(there.person, part, seed)
-            # They start beside the first and go the same way; body, mirror image and speed are their own.
+            # They start beside the first person and head the same way; body, mirroring and speed are their own.
             own = replace(draw(self.recipe.variations, seed), heading_deg=variation.heading_deg)
             scenes.append(other_source.scene(other, other_source.adapted(other, own)))
         together = beside_each_other(scenes, self.recipe.variations.spacing_m)
         return kept_inside(together, self.recipe.variations)
 
     def _companion(self, person: str, part: str, seed: int) -> tuple[ClipSource, Clip]:
-        """A clip of the part with somebody else, if there is anybody else."""
+        """A clip of the part with a different person, if there is one."""
         clips = self.parts[part]
         for attempt in range(100):
             found = self.clip(int(clips[seed_of(seed, "who", attempt) % len(clips)]))
@@ -192,9 +192,9 @@ class Plan:
 
 
 def shared_out(groups: Sequence[str], shares: Sequence[float], seed: int) -> npt.NDArray[np.int8]:
-    """The part of each group: numbers of groups near the shares, and at least one for every share above 0.
+    """The part of each group, in proportion to the shares, if possible with at least one group per positive share.
 
-    Which groups go where depends on their names and the seed alone.
+    The assignment depends only on the names of the groups, the shares and the seed.
     """
     order = sorted(
         range(len(groups)), key=lambda k: hashlib.sha256(f"{seed}/{groups[k]}".encode()).hexdigest()

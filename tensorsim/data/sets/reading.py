@@ -1,4 +1,4 @@
-"""Reading data sets for training: by number, as a stream shared out to ranks and workers, or simulated on the fly."""
+"""Read data sets for training: by index, as a stream distributed over ranks and workers, or simulated on the fly."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -24,12 +24,12 @@ from tensorsim.data.sets.variations import Variation
 from tensorsim.device import rank_and_processes, usable_device
 from tensorsim.errors import TensorsimError
 
-#: Outputs that a classifier can look at.
+#: Outputs that can serve as classifier input.
 _PICTURES = ("picture", *MAPS)
 
 
 def share_of_worker() -> tuple[int, int]:
-    """Number of this worker among all workers of all ranks, and how many there are.
+    """Index of this worker among all workers of all ranks, and their number.
 
     Ranks are those of ``torchrun``, workers those of a ``DataLoader``.
     """
@@ -51,7 +51,7 @@ def chosen_names(recipe: DatasetRecipe, output: str | None, radars: Sequence[str
     """Arrays to stack: one output of some radars.
 
     Raises:
-        TensorsimError: an output that the recipe does not have, or that is no map, or an unknown radar.
+        TensorsimError: an output that the recipe does not have or that is not a map, or an unknown radar.
     """
     there = [kind for kind in _PICTURES if kind in recipe.outputs.kinds]
     if output is None and there:
@@ -68,13 +68,13 @@ def chosen_names(recipe: DatasetRecipe, output: str | None, radars: Sequence[str
 
 
 class MapDataset(Dataset[dict[str, Any]]):
-    """Labelled maps of a data set that ``tensorsim dataset build`` made, by number.
+    """Labelled maps of a data set made by ``tensorsim dataset build``, by index.
 
     Args:
-        folder: of the data set.
+        folder: folder of the data set.
         split: ``"train"``, ``"validation"`` or ``"test"``; None takes all.
-        output: which of its outputs; None takes pictures where there are any, else Doppler-time maps.
-        radars: whose maps are stacked as channels; None takes all.
+        output: which of its outputs; None takes pictures if there are any, else Doppler-time maps.
+        radars: radars whose maps are stacked as channels; None takes all.
         labels: classes to use, in the order of their numbers; None takes all.
 
     Samples: ``{"map": (C, H, W) float32 in [0, 1], "label": int, "id": str}``, 1 at the peak of the map.
@@ -82,7 +82,7 @@ class MapDataset(Dataset[dict[str, Any]]):
     Attributes:
         labels: names of the classes.
         targets: (N,) int64 class of every sample.
-        digest: SHA-256 of the recipe and what it was made with, which tells data sets apart.
+        digest: SHA-256 of the recipe and what it was made with, which identifies the data set.
 
     Raises:
         TensorsimError: no data set there, an unknown part, output, radar or class, or no samples.
@@ -134,7 +134,7 @@ class MapDataset(Dataset[dict[str, Any]]):
         return {"map": stacked(maps, self.names), "label": label, "id": self.ids[index]}
 
     def class_weights(self) -> Tensor:
-        """(classes,) weights for a cross-entropy that counts every class alike; their mean over samples is 1."""
+        """(classes,) weights for a cross-entropy that weighs all classes equally; their mean over samples is 1."""
         counts = torch.bincount(self.targets, minlength=len(self.labels)).float()
         weights = torch.where(counts > 0, 1 / counts.clamp_min(1), torch.zeros_like(counts))
         return weights * len(self) / (weights * counts).sum()
@@ -158,12 +158,12 @@ def collate_maps(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Samples as a batch, for the ``collate_fn`` of a ``DataLoader``.
 
     Args:
-        samples: B of those of :class:`MapDataset`, with maps (C, H, W) of one C and H. They are not checked: torch
-            raises RuntimeError for maps that do not fit together.
+        samples: B samples of :class:`MapDataset`, with maps (C, H, W) of equal C and H. They are not checked: torch
+            raises RuntimeError for maps that do not match.
 
     Returns:
         ``{"map": (B, C, H, W) float32, "label": (B,) int64, "id": list of B str}``; W is that of the longest map,
-        shorter ones are padded with 0, the floor, at their end.
+        shorter ones are padded at the end with 0, the floor.
     """
     width = max(sample["map"].shape[-1] for sample in samples)
     maps = [torch.nn.functional.pad(s["map"], (0, width - s["map"].shape[-1])) for s in samples]
@@ -175,11 +175,11 @@ def collate_maps(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 class MapStream(IterableDataset[dict[str, Any]]):
-    """A data set shard by shard, distributed over ranks and workers; every sample comes once in an epoch.
+    """A data set shard by shard, distributed over ranks and workers; every sample comes once per epoch.
 
     Args:
         maps: data set to read.
-        shuffle: shards, and the samples in them, come in another order in every epoch; call :meth:`set_epoch`.
+        shuffle: shards, and the samples in them, come in a new order in every epoch; call :meth:`set_epoch`.
         seed: random seed of the order.
 
     Samples: as those of :class:`MapDataset`.
@@ -209,29 +209,29 @@ class MapStream(IterableDataset[dict[str, Any]]):
 
 
 class SimulatedMaps(IterableDataset[dict[str, Any]]):
-    """The samples of a recipe, simulated while they are asked for, with new variations in every round.
+    """The samples of a recipe, simulated on demand, with new variations in every round.
 
-    Nothing is stored. The first round has the very samples of the data set that the recipe describes; use several
+    Nothing is stored. The first round has exactly the samples of the data set that the recipe describes; use several
     workers of a ``DataLoader`` to simulate on the CPU while the network trains, or a ``device`` and a ``batch`` to
-    simulate in the process that trains.
+    simulate in the training process.
 
     Args:
         recipe: as for :class:`MapDataset`.
         split: part of it; None takes all.
         rounds: number of rounds through its samples; None never ends.
         output, radars: see :class:`MapDataset`.
-        device: where the radar chain runs, and where the maps are. People are generated or read on the CPU. A GPU needs
+        device: where the radar chain runs and the maps are. People are generated or read on the CPU. A GPU needs
             a ``DataLoader`` without workers.
         batch: samples in one pass of the radar chain, see
-            :func:`~tensorsim.data.sets.batches.synthesize_batch`; the maps are the same for any.
-        cache: folder of the people found in films and rendered films, such as ``.people`` in the folder of a data set.
-            None keeps nothing on disk: they are found anew in every process, of rendered films for every sample.
+            :func:`~tensorsim.data.sets.batches.synthesize_batch`; the maps do not depend on it.
+        cache: folder of the people found in videos and rendered videos, such as ``.people`` in a data set's folder.
+            None keeps nothing on disk: they are found again in every process, in rendered videos for every sample.
 
     Samples: as those of :class:`MapDataset`. Clips that fail are left out.
 
     Raises:
-        TensorsimError: an unknown part, output or radar, a source that is not there, a batch below 1, or a device that
-            cannot be used.
+        TensorsimError: an unknown part, output or radar, a source that does not exist, a batch below 1, or a device
+            that cannot be used.
     """
 
     def __init__(
@@ -271,7 +271,7 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
             done += 1
 
     def _samples(self, numbers: Sequence[int], done: int) -> Iterator[dict[str, Any]]:
-        """Those of some samples that do not fail, in a round."""
+        """The given samples in a round, except those that fail."""
         recipe, clips, drawn = self.plan.recipe, [], []
         for number in numbers:
             part, clip, count = self.plan.clip_of_sample(number)
@@ -293,5 +293,5 @@ class SimulatedMaps(IterableDataset[dict[str, Any]]):
         try:
             return list(synthesize_batch(self.plan.recipe, drawn, self.device))
         except TensorsimError:
-            # One of them: the others are made without it.
+            # If one of several fails, they are made one by one.
             return [None] if len(drawn) == 1 else [self._arrays([one])[0] for one in drawn]

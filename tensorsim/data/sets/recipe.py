@@ -1,4 +1,4 @@
-"""The recipe of a data set: which people, varied how, seen by which radars, stored as what."""
+"""The recipe of a data set: which people, how varied, seen by which radars, and how stored."""
 
 import os
 import re
@@ -43,22 +43,22 @@ class SourceConfig:
     """Where people and their labels come from.
 
     Attributes:
-        kind: ``"generated"``: tensorsim's own generator; ``"rendered"``: the same people, filmed by
+        kind: ``"generated"``: tensorsim's own generator; ``"rendered"``: the same people, rendered by
             :class:`~tensorsim.data.PersonRenderer` and found again by the networks, with their errors; ``"films"``,
-            ``"keypoints"`` and ``"motion"``: a folder with a folder per class, of films, COCO key points (.json) or
+            ``"keypoints"`` and ``"motion"``: a folder with one folder per class, of videos, COCO keypoints (.json) or
             captured motion (.bvh, .npz); ``"table"``: a CSV or Parquet table of such files; the others: the layouts of
-            public sets, see ``tensorsim.data.layouts``.
+            public data sets, see ``tensorsim.data.layouts``.
         path: folder or file; relative paths are relative to the working directory.
-        table: CSV or Parquet file that the layouts ``kinetics``, ``charades`` and ``movi`` need beside the folder.
+        table: CSV or Parquet file that the layouts ``kinetics``, ``charades`` and ``movi`` need besides the folder.
         classes: classes to use, in the order of their numbers; empty: all. For generated people these are activities.
         people: number of generated or rendered people.
-        fps: frames per second of key points, which never tell it, of motion files that do not, and of rendered films
+        fps: frames per second of keypoints, which never state it, of motion files that do not, and of rendered videos
             (30).
-        image_size: (height, width) of the pictures of key points, where the file does not tell it, and of rendered
-            films (360, 640).
+        image_size: (height, width) of the images behind keypoints, if the file does not state it, and of rendered
+            videos (360, 640).
 
     Raises:
-        TensorsimError: a field that the kind needs and does not have, or has and does not use.
+        TensorsimError: a field that the kind needs is missing, or a given one is not used by the kind.
     """
 
     kind: SourceKind = "generated"
@@ -103,17 +103,17 @@ class SourceConfig:
 
 @dataclass(frozen=True)
 class RadarView:
-    """A radar and its place. Every radar sees the same motion.
+    """A radar and its position. Every radar sees the same motion.
 
     Attributes:
-        name: of its arrays in a sample; variables of ``.mat`` files begin with it, or with ``radar_`` where it does not
-            begin with a letter.
+        name: prefix of its arrays in a sample; variables of ``.mat`` files begin with it, preceded by ``radar_`` if it
+            does not begin with a letter.
         preset: a preset of ``tensorsim.radar.presets`` or a YAML file, with its wall and floor.
-        x_m, y_m: place of the radar's origin on the floor.
-        yaw_deg: direction that it looks to, counter-clockwise seen from above; 0 is +y.
+        x_m, y_m: position of the radar's origin on the floor.
+        yaw_deg: direction in which it looks, counter-clockwise seen from above; 0 is +y.
 
     Raises:
-        TensorsimError: a name that cannot be part of a file name, a preset that is not there, a place that is not
+        TensorsimError: a name that cannot be part of a file name, a preset that does not exist, a position that is not
             finite.
     """
 
@@ -135,11 +135,11 @@ class SplitConfig:
     """How samples are split into parts.
 
     Attributes:
-        by: ``"person"``: nobody is in two parts, as far as the source names people; where it does not, each file counts
-            as another person. ``"source"``: no film, file or generated person is in two parts. ``"table"``: as the
-            column ``split`` says.
-        shares: of the people (or sources) in training, validation and test. A part with a share has at least one of
-            them if there are enough.
+        by: ``"person"``: nobody is in two parts, as far as the source names people; if it does not, each file counts
+            as a different person. ``"source"``: no video, file or generated person is in two parts. ``"table"``: as
+            stated in the column ``split``.
+        shares: shares of the people (or sources) in training, validation and test. A part with a positive share has at
+            least one if there are enough.
 
     Raises:
         TensorsimError: shares that are negative or do not add up to 1.
@@ -162,9 +162,9 @@ class StorageConfig:
     """Files of the data set.
 
     Attributes:
-        format: ``"webdataset"``: tar shards; ``"hdf5"`` and ``"mat"``: the same shards as such files; ``"png"``: one
+        format: ``"webdataset"``: tar shards; ``"hdf5"`` and ``"mat"``: the same shards in these formats; ``"png"``: one
             picture per sample and radar in a folder per part and class.
-        shard_samples: samples of a shard, which is also what a worker does at a time.
+        shard_samples: samples per shard; a worker makes one shard at a time.
 
     Raises:
         TensorsimError: an unknown format or fewer than one sample.
@@ -178,13 +178,13 @@ class StorageConfig:
         require_counts(self, "shard_samples")
 
 
-#: Data sets need the echo near the people only, and half as many Doppler frames as a picture for the eye.
+#: Data sets need only the echo near the people, and half as many Doppler frames as pictures for viewing.
 _PROCESSING = ProcessingConfig(
     engine="range-bins", near_bins=8, energy_stride=8, overlap=0.5, range_gate_m=(0.5, 10.0)
 )
 
 
-#: Fields of a scene that change nothing without a wall.
+#: Fields of a scene that have no effect without a wall.
 _OF_WALLS = ("multipath", "wall_echo", "wall_paths", "wall_attenuation", "incidence", "bounces")
 
 
@@ -194,9 +194,9 @@ def folder_name(label: str) -> str:
 
 
 def matlab_name(array: str) -> str:
-    """The variable of an array ``RADAR.OUTPUT`` in a ``.mat`` file: English letters, digits and ``_``.
+    """The variable name of an array ``RADAR.OUTPUT`` in a ``.mat`` file: ASCII letters, digits and ``_``.
 
-    MATLAB's names begin with a letter: where the radar's does not, ``radar_`` comes before it.
+    MATLAB names begin with a letter: if the radar's does not, ``radar_`` is put before it.
     """
     name = re.sub(r"\W", "_", array, flags=re.ASCII)
     return (name if re.match("[A-Za-z]", name) else f"radar_{name}")[:31]
@@ -204,26 +204,26 @@ def matlab_name(array: str) -> str:
 
 @dataclass(frozen=True)
 class DatasetRecipe:
-    """Everything that the samples of a data set depend on, beside the films and files that it names.
+    """Everything that the samples of a data set depend on, besides the videos and files that it names.
 
     Attributes:
-        name: of the data set.
-        seed: of everything that is random.
-        duration_s: of every sample; of longer clips a part is drawn, shorter ones end with an empty scene.
-        motion_hz: rate at which the motion of people is put together.
-        sources: of people and labels.
-        variations: of every clip.
-        radars: that observe the scene.
+        name: name of the data set.
+        seed: for everything that is random.
+        duration_s: duration of each sample; from longer clips a section is drawn, shorter ones end with an empty scene.
+        motion_hz: rate at which the motion of people is assembled.
+        sources: sources of people and labels.
+        variations: how each clip is varied.
+        radars: radars that observe the scene.
         scene: propagation and noise for all radars; its radar and wall come from ``radars``.
         processing: signal to maps.
-        gate_people: outputs without a range axis are made of those range bins of ``processing.range_gate_m`` that
-            people reach in the sample: several times faster, and with the noise of these bins alone.
+        gate_people: outputs without a range axis use only the range bins of ``processing.range_gate_m`` that people
+            reach in the sample: several times faster, and with the noise of these bins only.
         outputs: arrays of a sample.
-        split: into training, validation and test.
-        storage: files.
+        split: split into training, validation and test.
+        storage: file format.
 
     Raises:
-        TensorsimError: no source or radar, names of radars that repeat, or a scene with a radar or wall.
+        TensorsimError: no source or radar, repeated radar names, or a scene with a radar or wall.
 
     Example:
         >>> recipe = DatasetRecipe(radars=(RadarView("front", "through-wall"),), duration_s=2.0)
@@ -254,7 +254,7 @@ class DatasetRecipe:
         if not self.sources or not self.radars:
             raise TensorsimError("DatasetRecipe: got no source or no radar, expected at least one of each")
         names = [view.name for view in self.radars]
-        if len({name.casefold() for name in names}) < len(names):  # WebDataset reads them in small letters
+        if len({name.casefold() for name in names}) < len(names):  # WebDataset reads them in lower case
             raise TensorsimError(
                 f"DatasetRecipe.radars: got the names {names}, expected ones that differ not only in capitals"
             )
@@ -306,7 +306,7 @@ class DatasetRecipe:
 
     @property
     def without_effect(self) -> list[str]:
-        """Settings of walls that the recipe changes although none of its radars has a wall."""
+        """Wall settings that the recipe changes although none of its radars has a wall."""
         if any(radar_scene(view.preset).wall is not None for view in self.radars):
             return []
         of_scene, of_variations = SceneConfig(), VariationConfig()
@@ -321,7 +321,7 @@ class DatasetRecipe:
 
     @classmethod
     def from_document(cls, document: dict[str, Any], where: str = "recipe") -> "DatasetRecipe":
-        """The recipe of a mapping; what it does not name keeps its default.
+        """The recipe in a mapping; values that it omits keep their defaults.
 
         Raises:
             TensorsimError: unknown keys, or values that the recipe refuses.
@@ -333,13 +333,13 @@ class DatasetRecipe:
         return recipe
 
     def to_document(self) -> dict[str, Any]:
-        """Mappings, lists, numbers and strings from which :meth:`from_document` makes the same."""
+        """Mappings, lists, numbers and strings that :meth:`from_document` turns back into the same recipe."""
         document: dict[str, Any] = to_document(self)
         return document
 
     @classmethod
     def from_yaml(cls, path: str | os.PathLike[str]) -> "DatasetRecipe":
-        """The recipe of a YAML file, as ``tensorsim dataset example`` prints one.
+        """The recipe in a YAML file, such as ``tensorsim dataset example`` prints.
 
         Raises:
             TensorsimError: no such file, not YAML, unknown keys, or values that the recipe refuses.
@@ -347,5 +347,5 @@ class DatasetRecipe:
         return cls.from_document(read_yaml(path), str(path))
 
     def to_yaml(self, path: str | os.PathLike[str]) -> None:
-        """Write a file from which :meth:`from_yaml` reads the same."""
+        """Write a file that :meth:`from_yaml` reads back unchanged."""
         write_text(path, dump_limited_yaml(self.to_document()))

@@ -1,4 +1,4 @@
-"""People who are rendered into films and found again by the networks, as a source of labelled clips."""
+"""People rendered to video and found again by the networks, as a source of labelled clips."""
 
 import hashlib
 from dataclasses import replace
@@ -20,18 +20,18 @@ from tensorsim.render.renderer import PersonRenderer
 #: Two metres behind the radar, so that a whole body is in view from 1.5 m on.
 CAMERA = CameraConfig(position_m=(0.0, -2.0, 1.0))
 _FPS, _IMAGE_SIZE = 30.0, (360, 640)
-#: What is drawn for a film: only where it takes place. Everything else is varied once people are found.
+#: Only the position is drawn for a video. Everything else is varied after people are found.
 _FILM = VariationConfig(heading_deg=(0.0, 0.0), mirror=0.0)
 
 
 class RenderedPeople:
-    """Generated people in front of a camera, one film for each activity of everybody.
+    """Generated people in front of a camera, one video per person and activity.
 
     Args:
-        recipe: gives seed, length of the films, heights and ranges.
-        source: the activities, the number of people, frames per second and size of the films.
-        number: of the source in the recipe.
-        cache: folder for the people that were found; None finds them every time.
+        recipe: gives seed, length of the videos, heights and ranges.
+        source: the activities, the number of people, frames per second and size of the videos.
+        number: number of the source in the recipe.
+        cache: folder for the people found; None finds them every time.
     """
 
     names_people = True
@@ -51,7 +51,7 @@ class RenderedPeople:
         return len(self.people)
 
     def adapted(self, clip: Clip, variation: Variation) -> Variation:
-        """As it is."""
+        """The variation, unchanged."""
         return variation
 
     def scene(self, clip: Clip, variation: Variation) -> Scene:
@@ -60,7 +60,7 @@ class RenderedPeople:
         return part_of(moved, self.recipe.duration_s, self.recipe.motion_hz, variation.start)
 
     def prepare(self, clip: Clip, again: bool = False) -> None:
-        """Render the film and find the people in it."""
+        """Render the video and find the people in it."""
         self._motion(clip, again)
 
     @torch.no_grad()
@@ -74,12 +74,12 @@ class RenderedPeople:
         return finite_everywhere(found, clip.name)
 
     def _filmed(self, clip: Clip) -> Scene:
-        """The person of a clip as the film shows them."""
+        """The person of a clip as shown in the video."""
         drawn = draw(_FILM, seed_of(self.recipe.seed, clip.name, "film"))
         return self.people.scene(clip, self.people.adapted(clip, drawn))
 
     def _watched(self, film: Scene, seed: int) -> Motion:
-        """Who the networks find in a film, whose room and clothes are those of the seed."""
+        """The people that the networks find in a rendered video, whose room and clothes follow from the seed."""
         render = PersonRenderer(CAMERA, *self.size)
         with one_thread():  # for the same bits everywhere
             frames = render(film.joints, seed, valid=film.valid).frames

@@ -17,8 +17,8 @@ class Sample(NamedTuple):
     """A sample.
 
     Attributes:
-        arrays: by name, ``RADAR.OUTPUT``.
-        row: of the manifest.
+        arrays: arrays by name, ``RADAR.OUTPUT``.
+        row: row of the manifest.
     """
 
     arrays: dict[str, npt.NDArray[Any]]
@@ -41,7 +41,7 @@ VARIATION_COLUMNS: dict[str, type] = {
 
 
 def columns(recipe: DatasetRecipe) -> dict[str, type]:
-    """Names and types of the columns of the manifest of a recipe."""
+    """Names and types of the manifest columns for a recipe."""
     peaks = {f"{view.name}.{kind}.peak_db": float for view in recipe.radars for kind in recipe.outputs.kinds}
     return FIRST_COLUMNS | VARIATION_COLUMNS | LAST_COLUMNS | peaks
 
@@ -52,7 +52,7 @@ def sample_id(number: int) -> str:
 
 
 def content_hash(arrays: dict[str, npt.NDArray[Any]], label: int) -> str:
-    """SHA-256 of the arrays of a sample and its class, whatever files they are stored in."""
+    """SHA-256 of a sample's arrays and class, whatever files they are stored in."""
     digest = hashlib.sha256(str(label).encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -73,7 +73,7 @@ def make_sample(plan: Plan, number: int, shard: str) -> Sample:
 
 
 def sample_of_row(plan: Plan, row: dict[str, Any]) -> Sample:
-    """The sample of a row of the manifest, made again.
+    """Recreate the sample of a manifest row.
 
     Raises:
         TensorsimError: see :func:`make_sample`.

@@ -31,11 +31,11 @@ class Scene(NamedTuple):
 
 
 def varied(motion: Motion, variation: Variation) -> Motion:
-    """Recorded people with another height, mirrored, turned and put where the variation says, at another speed.
+    """Apply a variation to recorded people: height, mirroring, heading, position and speed.
 
     Args:
-        motion: people; their places relative to one another are scaled with their height.
-        variation: of the first of them.
+        motion: people; their positions relative to each other scale with their height.
+        variation: refers to the first person.
 
     Raises:
         TensorsimError: nobody in it.
@@ -54,9 +54,9 @@ def varied(motion: Motion, variation: Variation) -> Motion:
 
 
 def part_of(motion: Motion, duration_s: float, rate_hz: float, start: float) -> Scene:
-    """``duration_s`` of a motion at ``rate_hz``, from a share ``start`` of what there is to choose from.
+    """``duration_s`` of a motion at ``rate_hz``, beginning at a fraction ``start`` of the possible start times.
 
-    A shorter one is there for as long as it lasts. Frames in which somebody is absent do not matter.
+    In a shorter motion people are present only for as long as it lasts. Joints of absent people do not matter.
 
     Raises:
         TensorsimError: fewer than two frames.
@@ -79,11 +79,11 @@ def part_of(motion: Motion, duration_s: float, rate_hz: float, start: float) -> 
 
 
 def beside_each_other(scenes: list[Scene], spacing_m: float) -> Scene:
-    """Several scenes of one length in one: the first stays, the others start to its right and left in turn.
+    """Combine several scenes of equal length: the first stays, the others start alternately to its right and left.
 
     Args:
-        scenes: each with its people; the first of them counts.
-        spacing_m: distance in x of neighbours at the start.
+        scenes: each with its people; the first person of each determines its position.
+        spacing_m: distance in x between neighbours at the start.
     """
     joints, valid = [], []
     for k, scene in enumerate(scenes):
@@ -95,13 +95,13 @@ def beside_each_other(scenes: list[Scene], spacing_m: float) -> Scene:
 
 
 def _start(scene: Scene) -> Tensor:
-    """Where the hips (3,) of the first person are above when that person is first there, with z 0."""
+    """The floor position (3,), with z = 0, of the first person's hips when that person first appears."""
     first = int(scene.valid[0].int().argmax())
     return F.pad(mid_hips(scene.joints[0, first])[:2], (0, 1))
 
 
 def kept_inside(scene: Scene, config: VariationConfig) -> Scene:
-    """Everybody moved along y by the least amount that keeps hips within ``keep_m``, the nearest first."""
+    """Move everybody along y by the smallest amount that keeps hips within ``keep_m``, the near limit first."""
     if not bool(scene.valid.any()):
         return scene
     near, far = config.keep_m
@@ -112,7 +112,7 @@ def kept_inside(scene: Scene, config: VariationConfig) -> Scene:
 
 
 def seen_from(joints: Tensor, x_m: float, y_m: float, yaw_deg: float) -> Tensor:
-    """Joints (..., 3) in the axes of a radar at (x, y) that looks along +y turned by ``yaw_deg``."""
+    """Joints (..., 3) in the axes of a radar at (x, y) that looks along +y rotated by ``yaw_deg``."""
     yaw = math.radians(yaw_deg)
     cos, sin = math.cos(yaw), math.sin(yaw)
     turn = joints.new_tensor([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])

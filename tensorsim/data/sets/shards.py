@@ -20,7 +20,7 @@ _MAT_HEADER = b"MATLAB 5.0 MAT-file, tensorsim"
 
 
 def shard_path(folder: Path, storage: StorageConfig, name: str) -> Path:
-    """The file of a shard; for pictures the folder that they are in."""
+    """The file of a shard, or the folder of its pictures."""
     return folder / "shards" / f"{name}{SUFFIXES.get(storage.format, '')}"
 
 
@@ -32,7 +32,7 @@ def npy_bytes(array: npt.NDArray[Any]) -> bytes:
 
 
 def write_shard(folder: Path, storage: StorageConfig, name: str, samples: Sequence[Sample]) -> dict[str, str]:
-    """Write the samples of one shard; every file appears complete.
+    """Write the samples of one shard; every file appears only when complete.
 
     Returns:
         SHA-256 of each file, by its path in the folder.
@@ -55,7 +55,7 @@ def _pictures(folder: Path, sample: Sample) -> dict[Path, bytes]:
     place = folder / row["part"] / folder_name(row["label"])
     files = {}
     for name, array in sample.arrays.items():
-        # The highest speed is on top in a picture for the eye.
+        # In a picture for viewing the highest speed is at the top.
         content = cv2.imencode(".png", np.ascontiguousarray(array[::-1]))[1].tobytes()
         files[place / f"{row['id']}_{name.split('.')[0]}.png"] = content
     return files
@@ -104,12 +104,12 @@ def _mat(samples: Sequence[Sample]) -> bytes:
         variables[matlab_name(name)] = np.stack(arrays) if alike else _cells(arrays)
     file = io.BytesIO()
     savemat(file, variables, do_compression=True, oned_as="column")
-    # The header holds the time at which it was written.
+    # The original header contains the time of writing.
     return _MAT_HEADER.ljust(116, b" ") + file.getvalue()[116:]
 
 
 def _for_matlab(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """MATLAB has no half precision in its files."""
+    """Convert half precision, which MATLAB files do not have."""
     return array.astype(np.float32) if array.dtype == np.float16 else array
 
 

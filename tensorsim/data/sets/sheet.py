@@ -7,13 +7,13 @@ import numpy as np
 from tensorsim.data.sets.recipe import DatasetRecipe
 from tensorsim.data.sets.stored import StoredArrays
 
-#: Samples of a class, classes that are shown, and outputs that are pictures, the best first.
+#: Samples per class and largest number of classes shown; then outputs that are pictures, the best first.
 _SAMPLES, _CLASSES = 6, 24
 _SHOWN = ("doppler_time", "picture", "range_time_mti", "range_time")
 
 
 def draw_sheet(out: Path, recipe: DatasetRecipe) -> bool:
-    """Write ``contact_sheet.png``: maps of the first radar, if the data set has any; returns whether it has."""
+    """Write ``contact_sheet.png``: maps of the first radar, if there are any; returns whether there are."""
     from tensorsim.data.sets.manifest import rows_of
     from tensorsim.plot.figure import new_figure, save_figure
 

@@ -17,7 +17,7 @@ from tensorsim.files import reading
 
 @lru_cache(maxsize=256)
 def _members(path: Path, changed_ns: int) -> dict[str, tuple[int, int]]:
-    """Offset and size of every file in a tar that was last changed at a time."""
+    """Offset and size of every file in a tar; ``changed_ns`` makes cached results expire when it changes."""
     with reading(path, "a shard"), tarfile.open(path) as tar:
         return {member.name: (member.offset_data, member.size) for member in tar}
 
@@ -35,15 +35,15 @@ class StoredArrays:
     """Reads arrays of a data set.
 
     Args:
-        folder: of the data set.
-        recipe: of the data set.
+        folder: folder of the data set.
+        recipe: recipe of the data set.
     """
 
     def __init__(self, folder: Path, recipe: DatasetRecipe) -> None:
         self.folder, self.recipe = folder, recipe
 
     def __call__(self, row: dict[str, Any], name: str) -> npt.NDArray[Any]:
-        """The array ``RADAR.OUTPUT`` of the sample of a row of the manifest.
+        """The array ``RADAR.OUTPUT`` of the sample in a manifest row.
 
         Raises:
             TensorsimError: a shard that is missing or damaged, or no such array.

@@ -1,4 +1,4 @@
-"""One sample: the scene of its people, and what each radar of the recipe makes of it."""
+"""One sample: the scene with its people, and the outputs of each radar of the recipe."""
 
 import math
 from dataclasses import replace
@@ -18,17 +18,17 @@ from tensorsim.data.sets.variations import Variation, seed_of
 from tensorsim.errors import collected_warnings
 from tensorsim.radar.processing.ambiguity import gate_around
 
-#: How far a body reaches beyond its joints, range bins beside it, and what bounces inside a wall add to the range.
+#: Extent of a body beyond its joints, extra range bins on each side, and range added by bounces inside a wall.
 _BODY_M, _MARGIN_BINS, _WALL_M = 0.2, 5, 2.0
 
 
 class Synthesized(NamedTuple):
-    """Arrays of a sample by name, ``RADAR.OUTPUT``, and what the manifest says of them.
+    """Arrays of a sample by name, ``RADAR.OUTPUT``, and what the manifest says about them.
 
     Attributes:
-        arrays: as they are stored.
-        peaks: magnitude that is 0 dB (or 1) in each.
-        warnings: of the simulation.
+        arrays: arrays as stored.
+        peaks: magnitude that corresponds to 0 dB (or 1) in each.
+        warnings: warnings of the simulation.
     """
 
     arrays: dict[str, npt.NDArray[Any]]
@@ -62,7 +62,7 @@ def view_config(recipe: DatasetRecipe, view: RadarView, variation: Variation) ->
 
 
 def people_gate(config: SimulationConfig, scene: Scene) -> tuple[float, float] | float | None:
-    """(nearest, farthest) range of the bins that people of a scene reach, within the gate of a configuration."""
+    """(nearest, farthest) range of the bins that a scene's people reach, within the gate of a configuration."""
     gate, radar = config.processing.range_gate_m, config.scene.radar
     if isinstance(gate, float | int) or not bool(scene.valid.any()):
         return gate
@@ -92,12 +92,12 @@ def synthesize(recipe: DatasetRecipe, scene: Scene, variation: Variation) -> Syn
 
 
 class View(NamedTuple):
-    """What one radar is to make of one sample.
+    """What one radar needs to simulate one sample.
 
     Attributes:
-        config: of the simulation.
-        scene: in the axes of the radar.
-        noise_seed: of the receiver noise.
+        config: configuration of the simulation.
+        scene: the people in the axes of the radar.
+        noise_seed: seed of the receiver noise.
     """
 
     config: SimulationConfig
@@ -106,7 +106,7 @@ class View(NamedTuple):
 
 
 def view_of(recipe: DatasetRecipe, view: RadarView, scene: Scene, variation: Variation) -> View:
-    """A radar of a recipe and a sample, whose people are in the world."""
+    """The :class:`View` of one radar of a recipe for a sample; ``scene`` is in world axes."""
     seen = scene._replace(joints=seen_from(scene.joints, view.x_m, view.y_m, view.yaw_deg))
     config = view_config(recipe, view, variation)
     if recipe.gate_people and not recipe.outputs.has_range:

@@ -1,4 +1,4 @@
-"""Augmentation of batches of maps (B, C, H, W), as modules that run where the batch is; only in training mode."""
+"""Augmentation of batches of maps (B, C, H, W), as modules that run on the batch's device, in training mode only."""
 
 import torch
 from torch import Tensor, nn
@@ -9,15 +9,15 @@ _LAYOUT = "(B, C, rows, columns)"
 
 
 class SpecAugment(nn.Module):
-    """Bands of rows and of columns are set to 0, others for every map.
+    """Sets bands of rows and of columns to 0, different ones in every map.
 
-    Source: D. S. Park et al., "SpecAugment", Interspeech 2019, without its warping of time; by torchaudio.
+    Source: D. S. Park et al., "SpecAugment", Interspeech 2019, without its time warping; uses torchaudio.
 
     Args:
-        rows, columns: part of the rows and of the columns that a band covers at most; its width is uniform from 0.
+        rows, columns: largest fraction of the rows and columns that a band covers; its width is uniform from 0.
 
     Raises:
-        TensorsimError: parts outside of 0 to 1.
+        TensorsimError: fractions outside 0 to 1.
     """
 
     def __init__(self, rows: float = 0.15, columns: float = 0.15) -> None:
@@ -41,10 +41,10 @@ class SpecAugment(nn.Module):
 
 
 class RandomShift(nn.Module):
-    """Maps moved by whole cells along speed (or range) and time; what comes in from outside is 0.
+    """Shifts maps by whole cells along speed (or range) and time; cells shifted in are 0.
 
     Args:
-        rows, columns: largest shifts, either way.
+        rows, columns: largest shift in either direction.
 
     Raises:
         TensorsimError: negative shifts.
@@ -57,7 +57,7 @@ class RandomShift(nn.Module):
         self.rows, self.columns = rows, columns
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Maps (B, C, H, W) to the same, moved."""
+        """Maps (B, C, H, W) to the same, shifted."""
         check_min_rank(maps, 4, "RandomShift", _LAYOUT)
         if not self.training:
             return maps
@@ -73,10 +73,10 @@ class RandomShift(nn.Module):
 
 
 class AddNoise(nn.Module):
-    """Gaussian noise on the levels of maps, which stay within [0, 1].
+    """Adds Gaussian noise to the levels of maps, which stay within [0, 1].
 
     Args:
-        deviation: largest standard deviation; that of a map is uniform from 0.
+        deviation: largest standard deviation; for each map it is drawn uniformly from 0.
 
     Raises:
         TensorsimError: a negative deviation.
@@ -98,7 +98,7 @@ class AddNoise(nn.Module):
 
 
 class SignFold(nn.Module):
-    """Doppler without its sign, as radars with one real channel see it: the larger level of both signs.
+    """Doppler without its sign, as seen by radars with one real channel: the larger of the levels at both signs.
 
     Rows ascend in Doppler, zero at row H // 2, as in Doppler-time maps. Works in evaluation mode as well.
 
@@ -112,7 +112,7 @@ class SignFold(nn.Module):
         middle, half = rows // 2, rows // 2
         if half < 1:
             raise TensorsimError(f"SignFold: got {rows} row, expected at least 2")
-        # Row 0 is the most negative speed of an even number of rows: it has no positive partner and is left out.
+        # With an even number of rows, row 0, the most negative speed, has no positive counterpart and is left out.
         positive = maps[..., middle : middle + half, :]
         negative = maps[..., middle - half + 1 : middle + 1, :].flip(-2)
         return torch.maximum(positive, negative)

@@ -1,4 +1,4 @@
-"""What differs between the samples that are made of one clip, and how it is drawn."""
+"""What differs between samples made from one clip, and how it is drawn."""
 
 import hashlib
 from dataclasses import asdict, dataclass, fields, replace
@@ -17,31 +17,32 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class VariationConfig:
-    """Ranges (low, high) are drawn uniformly; a range of equal numbers is fixed. None leaves a quantity as it is.
+    """Ranges (low, high) to draw from uniformly; equal numbers fix a value. None leaves a quantity as it is.
 
     Attributes:
-        count: samples made of every clip.
+        count: samples made from each clip.
         height_m: body height.
         distance_m: y of the hips of the first person at the start.
-        side_m: x of the hips of the first person at the start; of generated people, of the middle of their path.
-        keep_m: nearest and farthest y of anybody; people are moved along y by the least amount to stay inside.
-        heading_deg: turn of the whole motion about the vertical. Generated people face the radar at 0.
-        mirror: probability that left and right are exchanged.
+        side_m: x of the hips of the first person at the start; for generated people, of the middle of their path.
+        keep_m: nearest and farthest y of anybody; people are moved along y by the smallest amount to stay inside.
+        heading_deg: rotation of the whole motion about the vertical. Generated people face the radar at 0.
+        mirror: probability that left and right are swapped.
         speed: factor on the speed of the motion.
-        people: least and most people (clips, for recordings) of a scene; the label is that of the first.
-        spacing_m: distance in x of neighbours at the start.
-        bodies: scatterers of a person to choose from, see :class:`~tensorsim.SceneConfig`.
+        people: smallest and largest number of people (for recordings, clips) in a scene; the first gives the label.
+        spacing_m: distance in x between neighbours at the start.
+        bodies: scatterer models to choose from, see :class:`~tensorsim.SceneConfig`.
         snr_db: signal-to-noise ratio per IF sample; None takes that of the scene.
         sway, vital_signs: probability that people sway, and that they breathe.
-        wall_permittivity, wall_thickness_m: of the walls that radars have.
+        wall_permittivity, wall_thickness_m: of the radars' walls, if they have any.
         phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db: of the receivers,
-            see :class:`~tensorsim.config.ReceiverConfig`. Samples with such effects take the engine ``"time"``.
-        real_receiver: probability that receivers have one channel in place of I and Q.
-        denoisers: to choose from, see :class:`~tensorsim.config.ProcessingConfig`; none leaves that of the recipe.
+            see :class:`~tensorsim.config.ReceiverConfig`. Samples with such effects use the engine ``"time"``.
+        real_receiver: probability that receivers have one channel instead of I and Q.
+        denoisers: denoisers to choose from, see :class:`~tensorsim.config.ProcessingConfig`; none keeps that of the
+            recipe.
 
     Raises:
-        TensorsimError: a range that does not ascend or is out of bounds, a probability outside of 0 to 1, an unknown
-            kind of scatterers or denoiser.
+        TensorsimError: a range that does not ascend or is out of bounds, a probability outside 0 to 1, or an unknown
+            scatterer model or denoiser.
     """
 
     count: int = 1
@@ -116,13 +117,13 @@ class VariationConfig:
 
 @dataclass(frozen=True)
 class Variation:
-    """What was drawn for one sample; a row of the manifest has these fields, from which the sample is made again.
+    """What was drawn for one sample; the sample can be recreated from these fields, which are in its manifest row.
 
     Attributes:
-        seed: of body, manner and noise.
+        seed: for body, manner and noise.
         height_m, distance_m, side_m, heading_deg, mirrored, speed: of the first person.
-        start: beginning of the part of a long clip, as a share of what there is to choose from.
-        companions: seeds of further people, by comma.
+        start: start of the section of a long clip, as a fraction of the possible start times.
+        companions: seeds of further people, comma-separated.
         body, snr_db, sway, vital_signs, wall_permittivity, wall_thickness_m: of the scene.
         phase_noise_dbc_hz, iq_imbalance_db, iq_phase_rad, dc_offset_db, adc_bits, adc_headroom_db, real_receiver: of
             the receivers.
@@ -154,29 +155,29 @@ class Variation:
     denoiser: str | None
 
     def row(self) -> dict[str, Any]:
-        """As columns of the manifest."""
+        """The fields as manifest columns."""
         return asdict(self)
 
     @classmethod
     def of_row(cls, row: dict[str, Any]) -> "Variation":
-        """The inverse of :meth:`row`; other columns are left aside."""
+        """The inverse of :meth:`row`; other columns are ignored."""
         return cls(**{field.name: row[field.name] for field in fields(cls)})
 
     def receiver(self, usual: ReceiverConfig) -> ReceiverConfig:
-        """A receiver with what was drawn; the rest is as usual."""
+        """A receiver with the drawn values; the rest is as in ``usual``."""
         names = [field.name for field in fields(ReceiverConfig) if field.name != "real"]
         drawn = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(usual, real=usual.real or self.real_receiver, **drawn)
 
 
 def seed_of(*words: object) -> int:
-    """A seed from 0 to 2^63 - 1 that depends on these words alone."""
+    """A seed from 0 to 2^63 - 1 that depends only on these words."""
     text = "\0".join(str(word) for word in words)
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
 def draw(config: VariationConfig, seed: int) -> Variation:
-    """The variation of this seed. One number is drawn for each field, so that ranges do not affect one another."""
+    """The variation of this seed. One number is drawn for each field, so that ranges do not affect each other."""
     numbers = np.random.Generator(np.random.PCG64(seed)).random(32)
     place = iter(numbers.tolist())
 

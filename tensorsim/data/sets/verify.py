@@ -1,4 +1,4 @@
-"""Whether the files of a finished data set are those that were written."""
+"""Check that the files of a finished data set are those that were written."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ def wrong_files(folder: Path) -> tuple[int, dict[str, str]]:
     """Compare the shards, or pictures, of a data set with the SHA-256 values in its ``dataset.json``.
 
     Returns:
-        The number of files that it lists, and by name what is wrong with those that differ.
+        The number of files listed, and by name what is wrong with those that differ.
 
     Raises:
         TensorsimError: no finished data set there, or a damaged ``dataset.json``.
