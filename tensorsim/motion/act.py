@@ -167,7 +167,7 @@ def tip_over(pose: BodyPose, tilt: Tensor, way: Tensor) -> BodyPose:
 def arms_on_floor(
     way: Tensor, spread: Tensor, overhead: Tensor | bool = False
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Flexion and abduction in degrees that put the arms in the plane of the floor when the body has tipped over by 90.
+    """Flexion and abduction in degrees that lay the arms on the floor plane, for a body tipped over by a right angle.
 
     Args:
         way: as in :func:`tip_over`.

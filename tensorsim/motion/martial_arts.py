@@ -94,7 +94,7 @@ def punch_once(time: Tensor, who: People) -> Act:
 
 
 def kick_round(time: Tensor, who: People) -> Act:
-    """Turns on the standing leg, snaps the other one round in an arc with a high knee, and sets it down again."""
+    """Turns on the standing leg, snaps the other in an arc from the side, knee raised, and sets it down."""
     v = Vary(who)
     tempo = who.tempo[:, None]
     since = _seldom(time, who, 2.2)

@@ -50,7 +50,7 @@ class VideoToPose(nn.Module):
         person_height_m: body heights in metres by person (order of appearance); the last one applies to all further
             people. Default 1.80 and 1.70.
         initial_distance_m: known distance of each person in the first good frames; calibrates the focal length.
-        camera: position and focal length of the camera.
+        camera: position, orientation and focal length of the camera.
         keypoint_threshold: score from which a keypoint counts as seen.
         detection_interval: run the detector on every n-th frame (panel: 2), less often from 45 frames per second.
         fewest_joints: how many of the 14 joints must be seen for a frame to be used.
