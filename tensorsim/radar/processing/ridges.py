@@ -13,6 +13,7 @@ from tensorsim.errors import (
     check_floating,
     check_min_rank,
     check_positive,
+    is_exporting,
 )
 from tensorsim.ops import flatten_batch, unflatten_batch
 
@@ -64,8 +65,11 @@ def connect(peaks: Ridges, orders: Tensor, bins: int) -> Ridges:
     jump = torch.minimum(jump, bins - jump)
     parts = [torch.arange(count, device=index.device).expand(index[..., :1, :].shape)]
     # Blocks of frames: six ridges have 720 permutations, whose costs would be larger than the map.
-    clips = max(1, index[..., 0, 0].numel())
-    for block in jump.split(max(1, (1 << 18) // (clips * orders.numel())), -3):
+    blocks = [jump]
+    if not is_exporting():
+        clips = max(1, index[..., 0, 0].numel())
+        blocks = list(jump.split(max(1, (1 << 18) // (clips * orders.numel())), -3))
+    for block in blocks:
         cost = block[..., 0, :].index_select(-1, orders[:, 0])
         for row in range(1, count):
             cost = cost + block[..., row, :].index_select(-1, orders[:, row])
