@@ -11,7 +11,7 @@ from tensorsim.exceptions import TensorsimError
 class App:
     """Start the web app: upload a film or choose an activity, set parameters and view the results.
 
-    Needs gradio: pip install "tensorsim[app]". Only this machine can open the page unless --host says otherwise.
+    Needs gradio: pip install "tensorsim[app]". Only this machine can reach the page unless --host says otherwise.
     """
 
     host: str = "127.0.0.1"
@@ -19,9 +19,9 @@ class App:
     port: int = 7860
     """Port to listen on."""
     largest_mb: float = 200.0
-    """Largest size of a film in megabytes."""
+    """Maximum size of a film in megabytes."""
     longest_s: float = 60.0
-    """Longest duration of a film in seconds."""
+    """Maximum duration of a film in seconds."""
 
     def run(self) -> None:
         """Run the command."""

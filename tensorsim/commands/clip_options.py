@@ -27,32 +27,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ClipOptions(RadarOptions):
-    """How a whole clip is simulated, and what is written of it."""
+    """How to simulate a whole clip, and what output to write."""
 
     people: Annotated[Option[str], tyro.conf.arg(metavar="all|moving|nearest|NUMBER")] = None
-    """Who is in the scene: everybody, those who move, the nearest person, or one by number. Default: all."""
+    """Who is in the scene: everybody, those who move, the nearest person, or one person by number. Default: all."""
     sway: Option[bool] = None
-    """People sway while they stand. Default: off."""
+    """Make people sway while they stand. Default: off."""
     vital_signs: Option[bool] = None
-    """People breathe and their hearts beat. Default: off."""
+    """Make people breathe and their hearts beat. Default: off."""
     motion: Option[Literal["smooth", "paper"]] = None
-    """Two-sided smoothing with spline interpolation, or, as in the paper, a forward filter with linear interpolation
-    and a Savitzky-Golay filter. Default: smooth."""
+    """How motion is smoothed: two-sided smoothing with spline interpolation, or, as in the paper, a forward filter with
+    linear interpolation and a Savitzky-Golay filter. Default: smooth."""
     denoiser: Option[str] = None
-    """Denoiser for the displayed maps: none, perona-malik, ksvd (minutes), dncnn, or DnCNN weights of your own (.pth,
-    .safetensors or a name of `tensorsim models list`). Default: none."""
+    """Denoiser for the displayed maps: none, perona-malik, ksvd (takes minutes), dncnn, or your own DnCNN weights
+    (.pth, .safetensors or a name from `tensorsim models list`). Default: none."""
     figure_format: Literal["png", "pdf", "svg"] = "png"
-    """Format of the pictures."""
+    """File format of the figures."""
     hide_ridges: bool = False
     """Do not draw ridges on the Doppler-time map."""
     sound: bool = False
-    """Also write doppler.wav, the micro-Doppler as sound: approaching motion left, receding motion right."""
+    """Also write doppler.wav, the micro-Doppler as sound: approaching motion on the left, receding motion on the
+    right."""
     full_rate: bool = False
-    """Keep one column of the range-time maps per pulse instead of 256 per second."""
+    """Keep one column per pulse in the range-time maps instead of 256 per second."""
     save: Annotated[str, tyro.conf.arg(metavar="npz,mat,h5")] = "npz"
-    """Formats of maps and poses: npz, which is always written, and additionally mat (MATLAB) or h5 (HDF5)."""
+    """File formats of maps and poses: npz, which is always written, plus mat (MATLAB) or h5 (HDF5)."""
     device: str = "auto"
-    """Device: cpu, cuda, cuda:1, ...; auto takes a GPU if there is one."""
+    """Device: cpu, cuda, cuda:1, ...; auto uses a GPU if there is one."""
 
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""

@@ -22,21 +22,21 @@ class DatasetBuild:
     """
 
     recipe: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RECIPE.yaml")]]
-    """What to make; `tensorsim dataset example` prints one."""
+    """Recipe of the data set; `tensorsim dataset example` prints one."""
     out: Path
-    """Folder of the data set."""
+    """Folder for the data set."""
     workers: int = 1
-    """Number of processes on this machine."""
+    """Number of processes on this machine; ignored with --address."""
     engine: Literal["processes", "ray"] = "processes"
-    """Ray also runs on clusters: pip install "tensorsim[scale]"."""
+    """What runs the work; Ray also runs on clusters: pip install "tensorsim[scale]"."""
     address: Option[str] = None
-    """Address of a running Ray cluster; all nodes must share the output folder. Default: one is started here."""
+    """Address of a running Ray cluster; all nodes must share the output folder. Default: start one here."""
     cache: Option[Path] = None
     """Folder for the people found in films; several data sets can share it. Default: OUT/.people."""
     strict: bool = False
-    """Stop at the first clip that fails instead of adding a line to failures.csv."""
+    """Stop at the first clip that fails instead of recording it in failures.csv."""
     retry: bool = False
-    """Try again the samples that failed in an earlier run."""
+    """Retry samples that failed in an earlier run."""
     quiet: bool = False
     """No progress bars."""
 
@@ -72,7 +72,7 @@ class DatasetExample:
     """Print a small recipe with comments: two activities, 8 samples."""
 
     large: bool = False
-    """Print one for training instead: the 12 activities of 100 people, seen by three radars, 1200 samples."""
+    """Print one for training instead: 100 people doing the 12 activities, seen by three radars, 1200 samples."""
 
     def run(self) -> None:
         """Run the command."""
@@ -83,14 +83,14 @@ class DatasetExample:
 
 @dataclass(frozen=True)
 class DatasetSample:
-    """Make one sample of a data set again from its row in the manifest, and compare it with the stored hash."""
+    """Regenerate one sample of a data set from its row in the manifest, and compare it with the stored hash."""
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DIR")]]
-    """The data set."""
+    """Folder of the data set."""
     id: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="ID")]]
-    """Its name in the manifest."""
+    """ID of the sample in the manifest."""
     out: Option[Path] = None
-    """Folder for its arrays, as ID.RADAR.OUTPUT.npy."""
+    """Folder for the arrays of the sample, written as ID.RADAR.OUTPUT.npy."""
 
     def run(self) -> None:
         """Run the command."""
@@ -107,10 +107,10 @@ class DatasetSample:
 
 @dataclass(frozen=True)
 class DatasetVerify:
-    """Check the files of a data set against their SHA-256 in dataset.json."""
+    """Check the files of a data set against their SHA-256 hashes in dataset.json."""
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DIR")]]
-    """The data set."""
+    """Folder of the data set."""
 
     def run(self) -> None:
         """Run the command."""

@@ -42,15 +42,15 @@ CAMERA_M = (0.0, 0.0, 1.0)
 class Demo(NetworkOptions, ClipOptions):
     """Render a film of a person with known motion and simulate the radar from it. Needs no input file.
 
-    Writes what `simulate` writes, film.mp4, and the truth: maps_truth.npz, pose_truth.npz; each map picture shows the
-    map from the film beside that of the true motion; summary.json lists the errors.
+    Writes what `simulate` writes, film.mp4, and the ground truth: maps_truth.npz and pose_truth.npz. Each map figure
+    shows the map from the film beside the map of the true motion; summary.json lists the errors.
     """
 
     activity: str = "walking"
     """What the person does: walking, punching, kicking, grabbing, sitting down, standing up, rotating, sitting to
     walking, walking to sitting, falling to walking, walking to falling, or empty."""
     out: Path = Path("demo")
-    """Output folder; it is written only when the whole run has succeeded."""
+    """Output folder, written only if the whole run succeeds."""
     duration: float = 4.0
     """Length of the film in seconds."""
 

@@ -17,27 +17,26 @@ FOV_SD_DEG = 4.0
 class EvaluateCamera:
     """Estimate known cameras from generated walks, and print the errors of tilt, field of view and range.
 
-    One row per tilt and height, over all fields of view: the median and the largest error of the camera that the
-    pipeline uses, which draws uncertain tilts towards a level one. Walks of which less than half is in the picture are
-    left out.
+    One row per tilt and height, over all fields of view: the median and the maximum error of the camera that the
+    pipeline uses, which shifts uncertain tilts towards level. Walks that are less than half in view are left out.
     """
 
     tilts: tuple[float, ...] = (0.0, 12.0, 24.0, 35.0)
-    """Tilts in degrees below level."""
+    """Downward tilts in degrees."""
     heights: tuple[float, ...] = (0.8, 1.5, 3.0)
     """Heights in metres above the floor."""
     fovs: tuple[float, ...] = (40.0, 60.0, 90.0)
     """Horizontal fields of view in degrees."""
     walks: int = 5
-    """Walks of different people in front of each camera."""
+    """Number of walks in front of each camera, each by a different person."""
     noise: float = 2.0
-    """Standard deviation of the key points in pixels, in pictures of 640 x 480."""
+    """Standard deviation of the keypoint errors in pixels, for images of 640 x 480."""
     turn: float = 80.0
-    """Angle in degrees by which people turn after half the time; 0 for straight walks."""
+    """Angle in degrees by which people turn halfway through; 0 for straight walks."""
     known_height: bool = True
-    """Use the true height of the person; otherwise 1.70 m is assumed."""
+    """Use the true height of the person; otherwise assume 1.70 m."""
     seed: int = 0
-    """Random seed of people and paths."""
+    """Random seed for people and paths."""
 
     def run(self) -> None:
         """Run the command."""

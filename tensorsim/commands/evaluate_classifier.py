@@ -16,26 +16,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluateClassifier:
-    """Print accuracy against signal-to-noise ratio, and confusion matrices at the lowest and highest ratio."""
+    """Print accuracy against signal-to-noise ratio, and confusion matrices at the lowest and highest ratios."""
 
     weights: Path
-    """Weights of SPNet or SPGNet (.safetensors); both ways round are averaged where they state so."""
+    """Weights of SPNet or SPGNet (.safetensors); if they say so, the logits of each image and of its copy with approach
+    and retreat exchanged are averaged."""
     maps: Option[Path] = None
-    """Folder of maps; missing ones are made first, in 224 pixels or the size of the network's pictures."""
+    """Folder of maps; missing ones are generated first, at 224 pixels or at the network's image size."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Scenes to evaluate on."""
     people: int = 40
-    """People per scene; each does all 12 activities."""
+    """People per scene; each performs all 12 activities."""
     held_out: bool = False
-    """Only every fifth of them: for a folder that the network was trained on."""
+    """Use only every fifth person: for a folder that the network was trained on."""
     maps_seed: int = 1
-    """Random seed of people, motion and noise; a seed that the network was not trained on makes a test set."""
+    """Random seed for people, motion and noise; for a test set, use a seed the network was not trained on."""
     snr: tuple[float, ...] = (50.0, 40.0, 30.0, 20.0, 10.0)
     """Signal-to-noise ratios in dB; films are evaluated at the highest."""
     films: Option[Path] = None
-    """Folder of films and what networks found in them, as kept in films/ by `tensorsim evaluate truth --settings c`."""
+    """Folder of films and what the networks found in them, as kept in films/ by `tensorsim evaluate truth --settings
+    c`."""
     poses: Option[Path] = None
-    """Folder with a pose.npz of `tensorsim simulate` per film, in folders whose names begin with S1 to S12."""
+    """Folder with a pose.npz from `tensorsim simulate` per film, in subfolders whose names begin with S1 to S12."""
     out: Option[Path] = None
     """Folder for the confusion matrices as CSV and PNG."""
     quiet: bool = False

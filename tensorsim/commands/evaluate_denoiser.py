@@ -11,24 +11,25 @@ from tensorsim.files import write_text
 
 @dataclass(frozen=True)
 class EvaluateDenoiser:
-    """Print PSNR and the errors of ridges and envelope, before and after, for each kind of map and each rival."""
+    """Print PSNR and the errors of ridges and envelope, before and after denoising, for each kind of map and each
+    denoiser."""
 
     weights: Path
-    """Weights of DnCNN (.safetensors, .pth)."""
+    """DnCNN weights (.safetensors, .pth)."""
     against: Several[Path] = ()
-    """More weights of DnCNN to compare with, such as dncnn_gray_blind.pth."""
+    """Further DnCNN weights to compare with, such as dncnn_gray_blind.pth."""
     clips: int = 11
-    """Clips per scene, activity after activity from S2 on."""
+    """Clips per scene, cycling through the activities from S2."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Scenes to evaluate on."""
     snr: tuple[float, ...] = (10.0,)
     """Signal-to-noise ratios in dB."""
     seed: int = 1
-    """Random seed of people, motion and noise; use one that was not trained on."""
+    """Random seed for people, motion and noise; use one that was not trained on."""
     ksvd: bool = True
     """Include K-SVD, which takes about a minute per map."""
     out: Option[Path] = None
-    """File for the table as CSV."""
+    """CSV file for the table."""
     quiet: bool = False
     """No progress bar."""
 

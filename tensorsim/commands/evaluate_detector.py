@@ -9,18 +9,19 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class EvaluateDetector:
-    """Print average precision and recall on held-out pictures, and how long two detectors follow people in films."""
+    """Print average precision and recall on held-out images, and compare how long two detectors follow people in
+    films."""
 
     weights: Option[Path] = None
     """Weights of RTMDet (.safetensors, .pth, .onnx) or ACF (.safetensors). Default: the shipped ones."""
     against: Option[Path] = None
-    """Weights of another detector, measured in the same way; needed for --films."""
+    """Weights of another detector, evaluated in the same way; needed for --films."""
     data: Option[Path] = None
-    """Folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out pictures are used."""
+    """Folder of coco_small-*.tar, coco_more-*.tar and coco_extra-*.tar, whose held-out images are used."""
     coco: Option[Path] = None
-    """Folder with one COCO annotation file (*.json) and its pictures in images/."""
+    """Folder with one COCO annotation file (*.json) and its images in images/."""
     films: Several[Path] = ()
-    """Videos to follow people in."""
+    """Videos in which to follow people."""
     quiet: bool = False
     """No progress bars."""
 

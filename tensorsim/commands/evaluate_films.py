@@ -16,40 +16,41 @@ from tensorsim.files import check_folder, complete_file, write_text
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateFilms(NetworkOptions):
-    """Label real films of known activity in each scene, as `tensorsim simulate --least-probability 0` would: every
-    film gets a label, however uncertain.
+    """Label real films of known activity in each scene, as `tensorsim simulate --least-probability 0` would: every film
+    gets a label, however uncertain.
 
-    Prints a table and writes films.md, films.json, films.csv and a contact sheet (PNG) per film. What the networks
-    find is kept in cache/.
+    Prints a table and writes films.md, films.json, films.csv and a contact sheet (PNG) per film. What the networks find
+    is cached in cache/.
     """
 
     data: Path
-    """Folder of films with labels.json: a list of {"file", "start_s", "end_s", "accept": [activities]}."""
+    """Folder of films with a labels.json: a list of {"file", "start_s", "end_s", "accept": [activities]}."""
     out: Path
     """Output folder."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
-    """Radars."""
+    """Scenes to evaluate in."""
     body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
     """Scatterers of a person, as in `tensorsim simulate`."""
     classifier: Option[str] = None
     """Activity classifier: path or name. Default: the shipped one."""
     only: Several[str] = ()
-    """Names of films, or parts of names. Default: all films."""
+    """Names of films, or parts of names, to select. Default: all films."""
     lifter: Option[Literal["temporal", "nearest"]] = None
-    """How key points become 3D, as in `tensorsim simulate`."""
+    """How keypoints are lifted to 3D, as in `tensorsim simulate`."""
     stride: int = 1
     """Keep every n-th frame."""
     whole: bool = False
-    """Label whole films, not only the seconds in which the activity happens."""
+    """Label whole films, not just the seconds in which the activity happens."""
     variants: bool = False
-    """Also label each film in five variants (mirrored, shortened at either end, slightly perturbed key points), and
+    """Also label five variants of each film (mirrored, shortened at either end, slightly perturbed keypoints), and
     print means over all six. This takes six times as long, except for the networks, which run once."""
     calibrate: bool = True
-    """Estimate the camera of each film from its people; otherwise it is level and sees 60 degrees horizontally."""
+    """Estimate the camera of each film from the people in it; otherwise assume a level camera that sees 60 degrees
+    horizontally."""
     seed: int = 0
-    """Random seed of the receiver's noise."""
+    """Random seed for the receiver noise."""
     device: str = "auto"
-    """Device: cpu, cuda, cuda:1, ...; auto takes a GPU if there is one."""
+    """Device: cpu, cuda, cuda:1, ...; auto uses a GPU if there is one."""
     quiet: bool = False
     """No progress bars."""
 

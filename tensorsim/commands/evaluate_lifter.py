@@ -9,21 +9,22 @@ from tensorsim.exceptions import TensorsimError, check_seed
 
 @dataclass(frozen=True)
 class EvaluateLifter:
-    """Print the errors of the three lifters, from key points to smooth joints, with known camera and body height.
+    """Print the errors of the three lifters, from keypoints to smoothed joints, with known camera and body height.
 
-    Generated people have other seeds than in training; of motion capture, every second sequence was never trained on.
+    Generated people use seeds that were not trained on; of motion capture, only the sequences held out in training are
+    used, every second one.
     """
 
     motion: Several[Path] = ()
     """Motion capture files (.npz, .bvh)."""
     films: Option[Path] = None
-    """Folder films/ of `tensorsim evaluate truth --settings c`: key points that networks found in rendered films."""
+    """Folder films/ of `tensorsim evaluate truth --settings c`: keypoints that the networks found in rendered films."""
     weights: Option[str] = None
     """Weights of the temporal lifter: path or name. Default: the shipped one."""
     motions: int = 1200
     """Held-out motions from which views are drawn."""
     seed: int = 1234
-    """Random seed of motions, cameras and errors; use one that was not trained on."""
+    """Random seed for motions, cameras and errors; use one that was not trained on."""
     quiet: bool = False
     """No progress bar."""
 

@@ -13,7 +13,8 @@ from tensorsim.files import check_folder, write_json, write_text
 class EvaluateMeasured:
     """Train on simulation alone and test on measured clips; then fine-tune on 10 measured clips per class, and on all.
 
-    Prints a table and writes measured.json, confusion matrices, calibration and the weights trained on simulation.
+    Prints a table and writes measured.json, confusion matrices, calibration results and the weights trained on
+    simulation.
     """
 
     train: Path
@@ -21,23 +22,24 @@ class EvaluateMeasured:
     out: Path
     """Output folder."""
     test: Option[Path] = None
-    """Folder of measured sets to test on, with the same layout. Default: the last 30 % of each class of --train, in the
-    order of the files; then only the rest is trained on. With --quick and --ablation, which learn nothing from --train,
-    it may be the same folder."""
+    """Folder of measured sets to test on, with the same layout. Default: the last 30 % of each class of --train, in
+    file order; only the rest is then trained on. With --quick or --ablation, which learn nothing from --train, it may
+    be the same folder."""
     quick: bool = False
     """Use the shipped weights, trained on simulation alone, and train nothing."""
     ablation: bool = False
-    """Instead, train on simulation without each of its effects in turn, and print how much each contributes."""
+    """Instead, train on simulation without each of its effects in turn, and print and write (ablation_SET.md) how much
+    each contributes."""
     sets: Several[Literal["glasgow_cfar_masks", "kmkim_cw24_iq", "radhar_points"]] = ()
-    """Names of the sets. Default: all that both folders have."""
+    """Names of the sets. Default: all that are in --train and, if given, --test."""
     clips: int = 300
     """Simulated clips per class."""
     repeats: int = 1
-    """Trainings of each simulation in an ablation, with consecutive seeds from --seed on."""
+    """Number of trainings per simulation in an ablation, with consecutive seeds starting at --seed."""
     steps: int = 600
     """Batches of 64 when training on simulation; half as many with a few measured clips, twice as many with all."""
     seed: int = 0
-    """Random seed of simulation and training."""
+    """Random seed for simulation and training."""
     quiet: bool = False
     """No progress bar."""
 

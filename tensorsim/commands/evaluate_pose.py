@@ -10,23 +10,23 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class EvaluatePose:
-    """Print mean OKS and PCK@0.1 (of the longer side of the box) on held-out people.
+    """Print mean OKS and PCK@0.1 (relative to the longer side of the box) on held-out people.
 
-    The column "body" leaves out the face; "pairs" scores left/right pairs of the body with either assignment.
+    The column "body" leaves out the face; "pairs" scores left/right pairs of the body in either order.
 
-    The columns "seen" and "ghosts" are of the same people, cut by the edge of the picture: the share of key points with
-    scores of 0.3 or more among those in the picture, and among those outside the picture, which are spurious.
+    The columns "seen" and "ghosts" are for the same people, cropped by the edge of the image: the share of keypoints
+    with scores of 0.3 or more among those inside the image, and among those outside it, which are spurious.
     """
 
     weights: Option[Path] = None
-    """Weights of HRNet (.safetensors, .pth) or of any heat-map network (.onnx). Default: the shipped ones."""
+    """Weights of HRNet (.safetensors, .pth) or of any heatmap network (.onnx). Default: the shipped ones."""
     data: Option[Path] = None
     """Folder of the shards coco_small, coco_more, coco_extra and lspet (NAME-*.tar), whose held-out people are used;
-    "large" ones have eight labelled key points or more and at least a quarter of the height of their picture."""
+    "large" people have at least eight labelled keypoints and a quarter of the height of their image."""
     coco: Option[Path] = None
-    """Folder with one COCO annotation file (*.json) and its pictures in images/."""
+    """Folder with one COCO annotation file (*.json) and its images in images/."""
     flip_test: bool = True
-    """Average with the mirror image."""
+    """Average with the output for the mirror image."""
     engine: Engine = "torch"
     """What runs the network, as in `tensorsim simulate`."""
     quiet: bool = False

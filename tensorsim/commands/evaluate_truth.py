@@ -12,34 +12,34 @@ from tensorsim.files import check_folder, write_text
 
 @dataclass(frozen=True)
 class EvaluateTruth:
-    """Compare the maps of the pipeline with those of motion that is exactly known.
+    """Compare the maps of the pipeline with the maps of exactly known motion.
 
-    Prints a table and writes truth.md, truth.csv and a picture per scene. Running it again with the same arguments
+    Prints a table and writes truth.md, truth.csv and a figure per scene. Running it again with the same arguments
     resumes it.
     """
 
     out: Path
-    """Output folder; its cells/ keeps the figures of every clip."""
+    """Output folder; its cells/ keeps the results of every clip."""
     clips: int = 10
     """Clips per row of the table."""
     activities: Several[str] = ()
-    """Activities, each a row. Default: all twelve, or none with --motion ("all" for all with --motion)."""
+    """Activities, one row each. Default: all twelve, or none with --motion ("all" for all with --motion)."""
     motion: Several[Path] = ()
-    """Motion capture (.npz, .bvh), each file a row."""
+    """Motion capture files (.npz, .bvh), one row each."""
     motion_fps: Option[float] = None
-    """Frames per second of the motion capture, overriding the files' values; needed if they state none."""
+    """Frames per second of the motion capture, overriding the values in the files; needed if they state none."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
-    """Radars."""
+    """Scenes to evaluate in."""
     settings: tuple[Literal["a", "b", "c"], ...] = ("a", "b")
     """Start from true 3D joints at video rate (a), true 2D key points (b), or the rendered film and networks (c)."""
     stages: bool = True
-    """Also replace each stage in turn by the truth."""
+    """Also replace each stage in turn with the truth."""
     detector: Option[str] = None
-    """Person detector for setting c: path or name. Default: $TENSORSIM_DETECTOR if it is set, else the shipped one."""
+    """Person detector for setting c: path or name. Default: $TENSORSIM_DETECTOR if set, else the shipped one."""
     pose: Option[str] = None
-    """Pose network for setting c: path or name. Default: $TENSORSIM_POSE if it is set, else the shipped one."""
+    """Pose network for setting c: path or name. Default: $TENSORSIM_POSE if set, else the shipped one."""
     lifter: Option[Literal["temporal", "nearest"]] = None
-    """How key points are lifted. Default: as in `tensorsim simulate`."""
+    """How keypoints are lifted to 3D. Default: as in `tensorsim simulate`."""
     seed: int = 0
     """Seed of the first clip of each activity; further clips use consecutive seeds."""
     jobs: int = 1

@@ -13,23 +13,23 @@ from tensorsim.files import check_folder
 
 @dataclass(frozen=True)
 class RunExperiment:
-    """Run an experiment, or list them: `tensorsim experiment list`.
+    """Run an experiment, or list them all: `tensorsim experiment list`.
 
-    Writes a report (NAME.md), tables (NAME*.csv), figures (NAME-*.png and .svg) and the settings that repeat it
-    (NAME.yaml). Running it again with the same arguments resumes it, with the same results. Options that are not given
-    keep the experiment's defaults, which the report lists.
+    Writes a report (NAME.md), tables (NAME*.csv), figures (NAME-*.png and .svg) and the settings to repeat it
+    (NAME.yaml). Running it again with the same arguments resumes it, with the same results. Options not given keep the
+    experiment's defaults, which the report lists.
     """
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
-    """Name of an experiment, or list, which prints the names."""
+    """Name of an experiment, or list to print the names."""
     out: Option[Path] = None
     """Output folder."""
     quick: bool = False
-    """A small test run (one to two minutes)."""
+    """Do a small test run (one to two minutes)."""
     config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
-    """Settings, such as the NAME.yaml of an earlier run."""
+    """Settings file, such as the NAME.yaml of an earlier run."""
     cache: Option[Path] = None
-    """Folder of scene sets, trained networks and intermediate results. Default: OUT/work."""
+    """Folder for scene sets, trained networks and intermediate results. Default: OUT/work."""
     networks: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
     """Recognisers: spnet, ccln, ..."""
     scenes: Annotated[Option[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = None
@@ -47,33 +47,33 @@ class RunExperiment:
     maps: Option[str] = None
     """Folder of simulated maps of everyday motion, as made by `tensorsim train everyday`. Default: in the cache."""
     groups: Option[int] = None
-    """Number of groups of these maps, of about 100 clips each."""
+    """Number of groups of these maps, with about 100 clips each."""
     clips: Option[int] = None
     """Clips per class."""
     test_clips: Option[int] = None
-    """Test clips per class, of other people."""
+    """Test clips per class, by other people."""
     size: Option[int] = None
-    """Height and width of the pictures."""
+    """Height and width of the images."""
     epochs: Option[int] = None
     """Passes over the training clips."""
     steps: Option[int] = None
-    """Batches of a training that does not count epochs."""
+    """Number of batches for trainings that do not count epochs."""
     film_steps: Option[int] = None
-    """Batches of a training on the maps of everyday motion."""
+    """Number of batches when training on the maps of everyday motion."""
     length_s: Option[float] = None
     """Length of a clip in seconds."""
     seeds: Option[int] = None
-    """Number of trainings with different initial weights."""
+    """Number of trainings, each with different initial weights."""
     film_seeds: Option[int] = None
-    """Number of trainings with different initial weights on the maps of everyday motion."""
+    """Number of trainings on the maps of everyday motion, each with different initial weights."""
     snr_db: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="DB ...")] = None
-    """Signal-to-noise ratios of the tests in dB."""
+    """Signal-to-noise ratios in dB to test at."""
     seed: Option[int] = None
-    """Random seed of people, motion and noise."""
+    """Random seed for people, motion and noise."""
     jobs: int = 1
-    """Number of processes, in `networks`, `snr`, `inputs` and `paper`."""
+    """Number of processes, for `networks`, `snr`, `inputs` and `paper` only."""
     settings: Option[str] = None
-    """Folder with the NAME.yaml of earlier runs, for `paper`: the sizes of its experiments."""
+    """Folder with the NAME.yaml of earlier runs, for `paper`: they set the sizes of its experiments."""
     quiet: bool = False
     """No progress bars."""
 

@@ -15,10 +15,10 @@ SUFFIXES = (".bvh", ".npz")
 
 @dataclass(frozen=True)
 class BuildLibrary:
-    """Build a pool of poses for lifting, from motion files or from tensorsim's own generator.
+    """Build a library of poses for lifting, from motion files or from tensorsim's own generator.
 
-    Poses are scaled to one body height and turned to one heading (the lifter turns them to all headings), each with its
-    mirror image; of poses that are nearly the same only one is kept.
+    Poses are scaled to one body height and turned to one heading (the lifter turns them to all headings), and the
+    mirror image of each is added; of nearly identical poses only one is kept.
     """
 
     sources: tyro.conf.Positional[Several[Path]] = ()
@@ -28,11 +28,11 @@ class BuildLibrary:
     generate: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Number of generated poses to add, from the activities and the pose sampler."""
     most: Annotated[Option[int], tyro.conf.arg(metavar="N")] = None
-    """Largest number of poses, chosen at random; the lifter needs about 2 KB of memory per pose."""
+    """Maximum number of poses, chosen at random; the lifter needs about 2 KB of memory per pose."""
     tolerance: float = 0.015
-    """Poses closer than this are duplicates: root mean square over the joints, in body heights."""
+    """Poses closer than this are duplicates: root-mean-square distance over the joints, in body heights."""
     seed: int = 0
-    """Random seed of the generator and of the choice of poses."""
+    """Random seed for the generator and the choice of poses."""
     quiet: bool = False
     """No progress bars."""
 

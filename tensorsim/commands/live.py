@@ -24,27 +24,27 @@ if TYPE_CHECKING:
 class Live(NetworkOptions, RadarOptions):
     """Simulate the radar in real time from a camera and show the result on a local web page.
 
-    The page has the camera's picture with the people in it, a scrolling Doppler-time map, and the labels. Frames that
+    The page shows the camera image with the people in it, a scrolling Doppler-time map, and the labels. Frames that
     arrive too fast to be processed are dropped and counted. Ends with the film, or with Ctrl-C.
 
-    Poses are lifted by nearest matching, and the camera is not estimated: set pose.camera in a --config.
+    Poses are lifted by nearest-neighbour matching, and the camera is not estimated: set pose.camera in a --config file.
     """
 
     camera: str
-    """Number of a camera, address of a stream (rtsp://...), or a film played in real time."""
+    """Camera number, address of a stream (rtsp://...), or a film to play in real time."""
     person_height: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
-    """Body heights in metres in order of appearance, instead of those of the configuration (1.80, 1.70); the last one
+    """Body heights in metres in order of appearance, overriding those of the configuration (1.80, 1.70); the last one
     applies to all further people."""
     fps: Option[float] = None
     """Frames per second, overriding the source's value."""
     every_frame: bool = False
     """Process every frame of a film, however long that takes, instead of dropping frames to keep up with real time."""
     seconds: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
-    """Stop after this many seconds of the film."""
+    """Stop after this many seconds of video."""
     port: int | None = 8787
-    """Port of the page on 127.0.0.1; 0 takes a free one, None shows no page."""
+    """Port of the page on 127.0.0.1; 0 picks a free one, None shows no page."""
     record: Option[Path] = None
-    """Record the page to this film, whose name ends in .webm or .mp4."""
+    """Record the page to this video file (.webm or .mp4)."""
 
     def run(self) -> None:
         """Run the command."""

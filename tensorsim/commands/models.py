@@ -10,7 +10,7 @@ from tensorsim.exceptions import TensorsimError
 
 @dataclass(frozen=True)
 class ListModels:
-    """List the weights that are known by name: shipped ones, and those downloaded from their authors on demand."""
+    """List the weights known by name: shipped ones, and those downloaded from their authors on demand."""
 
     def run(self) -> None:
         """Run the command."""
@@ -25,10 +25,10 @@ class ListModels:
 
 @dataclass(frozen=True)
 class FetchModels:
-    """Download weights into the cache, so that later runs need no network."""
+    """Download weights into the cache, so that later runs need no internet connection."""
 
     names: tyro.conf.Positional[Several[str]]
-    """Names as `tensorsim models list` prints them."""
+    """Names as printed by `tensorsim models list`."""
     quiet: bool = False
     """No progress bar."""
 
@@ -45,7 +45,7 @@ class FetchModels:
 
 @dataclass(frozen=True)
 class VerifyModels:
-    """Check shipped and fetched weights against their SHA-256."""
+    """Check shipped and fetched weights against their SHA-256 hashes."""
 
     def run(self) -> None:
         """Run the command."""

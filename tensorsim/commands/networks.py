@@ -16,17 +16,17 @@ class NetworkOptions:
     """Which networks find people in films."""
 
     detector: Option[str] = None
-    """Person detector: RTMDet as .pth, .safetensors or .onnx, or a name of `tensorsim models list`. Default:
-    $TENSORSIM_DETECTOR if it is set, else the shipped one."""
+    """Person detector: RTMDet as .pth, .safetensors or .onnx, or a name from `tensorsim models list`. Default:
+    $TENSORSIM_DETECTOR if set, else the shipped one."""
     pose: Option[str] = None
-    """Pose network with COCO-17 heat maps: HRNet as .pth, .safetensors or a name of `tensorsim models list`, or any
-    such network as .onnx. Default: $TENSORSIM_POSE if it is set, else the shipped one."""
+    """Pose network with COCO-17 heatmaps: HRNet as .pth, .safetensors or a name from `tensorsim models list`, or any
+    such network as .onnx. Default: $TENSORSIM_POSE if set, else the shipped one."""
     flip_test: Option[bool] = None
-    """Also run the pose network on the mirror image of each person: more accurate, twice the cost. Default: on."""
+    """Also run the pose network on the mirror image of each person: more accurate, at twice the cost. Default: on."""
     engine: Engine = "onnxruntime"
-    """What runs the networks on the processor. ONNX Runtime takes half the time of torch, after exporting the networks
-    once to the user's cache. Faster and less exact: "openvino" (pip install openvino) runs the pose network in bfloat16
-    on processors that support it, "int8" in 8-bit integers. On a GPU it is always torch."""
+    """What runs the networks on the CPU. ONNX Runtime takes half the time of torch, after exporting the networks once
+    to the user's cache. Faster but less exact: "openvino" (pip install openvino) runs the pose network in bfloat16 on
+    CPUs that support it, "int8" in 8-bit integers. A GPU always uses torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:

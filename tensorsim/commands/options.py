@@ -68,7 +68,7 @@ _NEEDED: dict[str, tuple[str, Callable[["SceneConfig"], bool]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RadarOptions(PanelOptions, ReceiverOptions):
-    """How people's joints become maps, and how these look. Options that are not given keep the configured value."""
+    """How people's joints become maps, and how these look. Options not given keep the configured value."""
 
     config: Annotated[Option[Path], tyro.conf.arg(metavar="YAML")] = None
     """Configuration of a run: a YAML file with fields of SimulationConfig, or the summary.json of an earlier run. Other
@@ -76,37 +76,37 @@ class RadarOptions(PanelOptions, ReceiverOptions):
     paper: bool = False
     """Use the paper's literal formulas throughout (SimulationConfig.paper)."""
     scene: Option[Literal["free-space", "through-wall"]] = None
-    """Radar of 77 GHz in free space, or of 2 GHz behind a wall, with multipath. Default: free-space."""
+    """A 77 GHz radar in free space, or a 2 GHz radar behind a wall, with multipath. Default: free-space."""
     radar: Annotated[Option[str], tyro.conf.arg(metavar="NAME|FILE")] = None
     """Another radar for the scene: a preset (tensorsim.radar.presets: ti-awr1642, ti-awr1843, ti-iwr6843,
     infineon-bgt60tr13c, infineon-bgt24mtr12, cw-24ghz, glasgow-ancortek, radhar-iwr1443, free-space, through-wall, and
     the arrays ti-awr1843-array, infineon-bgt60tr13c-array) or a YAML file with fields of RadarConfig; its wall, if
     any, replaces that of the scene; its floor, if any, adds reflections."""
     body: Option[Literal["joints", "limbs", "version1", "surface"]] = None
-    """Scatterers of a person: the 14 joints with the panel's cross sections, 36 points along ellipsoidal limbs whose
-    cross section follows the aspect, the 13 points of the original's first version, or 59 points on torso and limbs
-    whose power per speed matches measured walks. Default: joints."""
+    """Scatterers of a person: the 14 joints with the panel's cross sections (joints), 36 points along ellipsoidal limbs
+    with aspect-dependent cross sections (limbs), the 13 points of the original's first version (version1), or 59 points
+    on torso and limbs whose power at each speed matches measured walks (surface). Default: joints."""
     integration: Option[Literal["noncoherent", "paper"]] = None
-    """How the Doppler-time map sums range bins; "paper" loses the sign of Doppler. Default: noncoherent."""
+    """How the Doppler-time map sums over range bins; "paper" loses the sign of Doppler. Default: noncoherent."""
     wall_paths: Option[Literal["series", "paper"]] = None
     """Internal reflections in the wall: complete to first order, or as in the paper. Default: series."""
     multipath: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
-    """Paths reflected inside the wall or by it. Default: True if there is a wall."""
+    """Paths reflected by the wall or inside it. Default: True if there is a wall."""
     leakage: Option[bool] = None
-    """Direct signal from the transmitter to the receiver. Default: off."""
+    """Direct signal from transmitter to receiver. Default: off."""
     wall_echo: Option[bool] = None
     """Static specular reflection from the wall. Default: off."""
     snr: Option[float] = None
-    """Signal-to-noise ratio in dB of the people's echo, per IF sample. Default: 50."""
+    """Signal-to-noise ratio of the people's echo in dB, per IF sample. Default: 50."""
     classifier: Option[str] = None
-    """Activity classifier: SPGNet or SPNet as .safetensors, or a name of `tensorsim models list`; "none"
-    for no label. Default: the shipped one."""
+    """Activity classifier: SPGNet or SPNet as .safetensors, or a name from `tensorsim models list`; "none" for no
+    label. Default: the shipped one."""
     least_probability: float = 0.2
     """Labels with a lower probability become "not sure"; 0 always returns the most probable class."""
     seed: Option[int] = None
     """Random seed. Default: 0."""
     colormap: Literal["turbo", "viridis", "jet", "parula", "gray"] = "turbo"
-    """Colours of the maps."""
+    """Colour scale of the maps."""
     dynamic_range: float = 50.0
     """Dynamic range of the maps, in dB below the peak."""
     quiet: bool = False

@@ -76,29 +76,30 @@ class PanelOptions:
     """Parameters of the control panel."""
 
     keypoint_threshold: Option[float] = None
-    """Smallest score of a visible key point. Default: 0.3."""
+    """Minimum score of a visible keypoint. Default: 0.3."""
     person_weight: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="KG ...")] = None
-    """Body weights in kg in order of appearance; cross sections scale with the body surface. Default: 84.24 75.00."""
+    """Body weights in kg in order of appearance; cross sections scale with body surface area. Default: 84.24 75.00."""
     min_detection_size: Option[float] = None
-    """Smallest width and height of a detection in pixels. Default: 5."""
+    """Minimum width and height of a detection in pixels. Default: 5."""
     detection_interval: Option[int] = None
     """The detector runs on every n-th frame. Default: 2."""
     max_tracks: Option[int] = None
-    """Largest number of people tracked at once. Default: 5."""
+    """Maximum number of people tracked at once. Default: 5."""
     confirmation_hits: Option[int] = None
-    """Detections within --confirmation-window that confirm a track. Default: 2."""
+    """Detections within --confirmation-window needed to confirm a track. Default: 2."""
     confirmation_window: Option[int] = None
-    """Frames in which the detector ran, for --confirmation-hits. Default: 5."""
+    """Number of detector runs over which --confirmation-hits are counted. Default: 5."""
     deletion_misses: Option[int] = None
-    """Misses within --deletion-window that end a track. Default: 23."""
+    """Misses within --deletion-window after which a track ends. Default: 23."""
     deletion_window: Option[int] = None
-    """Frames in which the detector ran, for --deletion-misses. Default: 23."""
+    """Number of detector runs over which --deletion-misses are counted. Default: 23."""
     assignment_threshold: Option[float] = None
-    """Largest squared Mahalanobis distance of a detection from its track. Default: 150."""
+    """Maximum squared Mahalanobis distance of a detection from its track. Default: 150."""
     process_noise: Option[float] = None
-    """Kalman process noise of a track's box, in size^2 / frame^3 with the size of the box. Default: 0.001."""
+    """Kalman process noise of a track's box in size^2 / frame^3, where size is the longer side of the box. Default:
+    0.001."""
     measurement_noise: Option[float] = None
-    """Kalman measurement noise of a track's box, in size^2. Default: 0.0004 (panel: 0.01)."""
+    """Kalman measurement noise of a track's box in size^2. Default: 0.0004 (panel: 0.01)."""
     carrier_hz: Option[float] = None
     """Start frequency of the sweep in Hz. Default: 77e9 (through-wall: 2e9)."""
     chirp_s: Option[float] = None
@@ -108,7 +109,7 @@ class PanelOptions:
     prf_hz: Option[float] = None
     """Pulse repetition frequency in Hz. Default: 8192 (through-wall: 128)."""
     sample_rate_hz: Option[float] = None
-    """Sample rate of the intermediate frequency in Hz. Default: 10e6."""
+    """Sample rate of the intermediate-frequency (IF) signal in Hz. Default: 10e6."""
     tx_position: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Position of the transmitter in metres. Default: -0.1 0 1.5."""
     rx_position: Annotated[Option[tuple[float, float, float]], _XYZ] = None
@@ -124,19 +125,19 @@ class PanelOptions:
     wall_size: Annotated[Option[tuple[float, float, float]], _XYZ] = None
     """Width, thickness and height of the wall in metres. Default: 5 0.24 2.5."""
     wall_center: Annotated[Option[tuple[float, float, float]], _XYZ] = None
-    """Centre of the wall in metres. Default: its near face touches the plane of the antennas."""
+    """Centre of the wall in metres. Default: the near face touches the plane of the antennas."""
     smoothing_ratio: Option[float] = None
     """Length in seconds of a Savitzky-Golay filter along the pulses (panel: 0.25). Default: none, see --motion."""
     range_window: Option[Literal["hamming", "hann", "blackman"]] = None
-    """Window over fast time. Default: hamming."""
+    """Window function over fast time. Default: hamming."""
     mti: Option[Literal["two-pulse", "n-pulse"]] = None
-    """Moving target indicator. Default: two-pulse."""
+    """Method of moving target indication (MTI). Default: two-pulse."""
     stft_window: Option[float] = None
     """Length of the STFT window in seconds. Default: 0.1."""
     stft_overlap: Option[float] = None
-    """Overlap, as a fraction, of neighbouring STFT windows. Default: 0.9."""
+    """Overlap of neighbouring STFT windows, as a fraction. Default: 0.9."""
     ridges: Option[int] = None
-    """Number of ridges of the Doppler-time map. Default: 3."""
+    """Number of ridges in the Doppler-time map. Default: 3."""
 
 
 #: The field of the configuration that an option of :class:`PanelOptions` sets.

@@ -24,29 +24,30 @@ RECEIVER_FIELDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ReceiverOptions:
-    """The receiver, the room and its other radars."""
+    """The receiver, the room, and other radars in it."""
 
     receiver: Option[Literal["ideal", "typical"]] = None
-    """An ideal receiver, or one with the phase noise, 12-bit converters, I/Q imbalance and offset of an integrated
-    radar; the options below change individual effects. Default: ideal."""
+    """An ideal receiver, or a typical one with the phase noise, 12-bit ADCs, I/Q imbalance and DC offset of an
+    integrated radar; the options below change individual effects. Default: ideal."""
     phase_noise_dbc_hz: Option[float] = None
-    """Phase noise of the oscillator 1 MHz from the carrier in dBc/Hz, such as -93. Default: none."""
+    """Phase noise of the oscillator in dBc/Hz at 1 MHz from the carrier, such as -93. Default: none."""
     iq_imbalance_db: Option[float] = None
     """Gain of Q relative to I in dB. Default: 0."""
     iq_phase_deg: Option[float] = None
     """Deviation of the I/Q phase difference from 90 degrees. Default: 0."""
     dc_offset_db: Option[float] = None
-    """Power of a constant offset relative to that of the people's echo, in dB. Default: none."""
+    """Power of a DC offset relative to the people's echo, in dB. Default: none."""
     real_receiver: Annotated[Option[bool], tyro.conf.FlagConversionOff] = None
-    """One channel instead of I and Q: spectra of a radar without range are mirror-symmetric. Default: two."""
+    """One real channel instead of I and Q; spectra of a radar that measures no range become mirror-symmetric.
+    Default: I and Q."""
     adc_bits: Option[int] = None
-    """Bits of the converters. Default: no quantisation."""
+    """Resolution of the ADCs in bits. Default: no quantisation."""
     adc_headroom_db: Option[float] = None
-    """Full scale of the converters above the rms of their input, in dB; smaller values saturate more. Default: 12."""
+    """Full scale of the ADCs above the rms of their input, in dB; smaller values saturate more. Default: 12."""
     clutter: Option[Literal["none", "room"]] = None
     """Furniture and walls of a room, seen by a slightly vibrating sensor. Default: none."""
     interference: Annotated[Option[tuple[float, float, float]], numbers("X Y Z")] = None
-    """Another radar in the same band at this position in metres, with slower sweeps. Default: none."""
+    """Position in metres of another radar in the same band, with longer sweeps. Default: none."""
 
     def with_receiver(self, config: "SimulationConfig") -> "SimulationConfig":
         """The configuration with ``--receiver``, ``--iq-phase-deg``, ``--clutter`` and ``--interference``."""

@@ -58,52 +58,51 @@ _MEANT_FOR = {
 
 @dataclass(frozen=True)
 class Simulate(NetworkOptions, ClipOptions):
-    """Simulate the radar maps of the people in a video, in motion capture, or in key points of a video.
+    """Simulate the radar maps of the people in a video, in motion capture, or in keypoints from a video.
 
-    Writes report.html, maps.npz, pose.npz, summary.json, a PNG per map, skeleton.png and overlay.mp4 into a folder.
+    Writes report.html, maps.npz, pose.npz, summary.json, a figure per map, skeleton.png and overlay.mp4 to a folder.
     """
 
     source: tyro.conf.Positional[Path]
-    """A video that OpenCV can decode; motion capture as .bvh or .npz (joints by name, AMASS, data_3d_h36m.npz); or key
-    points of a video, COCO or BlazePose, as .json, or a folder with one such file per frame."""
+    """A video that OpenCV can decode; motion capture as .bvh or .npz (named joints, AMASS, data_3d_h36m.npz); or
+    keypoints from a video, COCO or BlazePose, as .json, or a folder with one such file per frame."""
     out: Path
-    """Output folder; it is written only when the whole run has succeeded."""
+    """Output folder, written only if the whole run succeeds."""
     person_height: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
     """Body heights in metres in order of appearance; the last one applies to all further people. Default: 1.80 1.70."""
     initial_distance: Annotated[Option[tuple[float, ...]], tyro.conf.arg(metavar="METRES ...")] = None
-    """Distances of the people in metres when they first appear. For videos and key points they determine the focal
-    length. Motion capture is shifted so that the first person starts there; by default it stays where the file puts
-    it, if that is in front of the radar."""
+    """Distances of the people in metres when they first appear. For videos and keypoints they determine the focal
+    length. Motion capture is shifted so that the first person starts there; by default it stays where the file puts it,
+    unless somebody would come too near the radar."""
     camera_fov: Option[float] = None
-    """Horizontal field of view of the camera in degrees, when no initial distance is given. Default: estimated. With
+    """Horizontal field of view of the camera in degrees, used if no initial distance is given. Default: estimated. With
     --no-calibrate: 60 degrees horizontally. If the film gives no information: 60 degrees along the longer side."""
     calibrate: Option[bool] = None
     """Estimate tilt, roll, height and field of view of the camera from the people in the film. Default: on, except with
-    --camera-fov, --initial-distance or --position paper; with --config, as stated there."""
+    --camera-fov, --initial-distance or --position paper; with --config, as it says."""
     position: Option[Literal["camera", "paper"]] = None
-    """Camera model, or the paper's pixel displacement (no motion along the optical axis). Default: camera."""
+    """How people are placed: with a camera model, or with the paper's pixel displacement (no motion along the optical
+    axis). Default: camera."""
     lifter: Option[Literal["temporal", "nearest"]] = None
-    """How key points become 3D: by a network that uses a window of frames, or from the nearest poses of a library.
-    Default: temporal."""
+    """How keypoints are lifted to 3D: by a network that sees a window of frames, or from the nearest poses of a
+    library. Default: temporal."""
     library: Option[Path] = None
-    """Pool of poses for the nearest lifter, as written by `tensorsim library build`. Default: the shipped one."""
+    """Pose library for the nearest lifter, as written by `tensorsim library build`. Default: the shipped one."""
     per_person: bool = False
-    """If there are several people in the scene, also simulate and label each one alone: maps_person_N.npz and
+    """With several people in the scene, also simulate and label each one alone: maps_person_N.npz and
     doppler_time_person_N.png, with N as in the overlay."""
     fps: Option[float] = None
     """Frames per second, overriding the file's value."""
     start: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
-    """Where to start, in seconds of the film."""
+    """Start time in the film, in seconds."""
     end: Annotated[Option[float], tyro.conf.arg(metavar="SECONDS")] = None
-    """Where to stop, in seconds of the film."""
+    """End time in the film, in seconds."""
     stride: int = 1
     """Keep every n-th frame."""
     image_size: Annotated[Option[tuple[int, int]], numbers("WIDTH HEIGHT", int)] = None
-    """Width and height in pixels of the pictures in which the key points were found, if their file does not state
-    them."""
+    """Width and height in pixels of the images in which the keypoints were found, if their file does not state them."""
     clip: Option[str] = None
-    """Which motion to take from a file with several: the name of an array, or subject and action as in
-    "S1/Walking"."""
+    """Which motion to use from a file with several: the name of an array, or subject and action as in "S1/Walking"."""
     heading: Annotated[float, tyro.conf.arg(metavar="DEGREES")] = 0.0
     """Rotation of motion capture about the vertical axis, in degrees (counter-clockwise seen from above)."""
 

@@ -17,13 +17,13 @@ class TrainAcf:
     out: Path
     """Folder for acf.safetensors."""
     rounds: tuple[int, ...] = (32, 64, 256)
-    """Trees of each stage; each stage starts anew with the mistakes of the one before."""
+    """Number of trees in each stage; each stage starts anew with the mistakes of the one before."""
     positives: int = 3000
-    """Largest number of windows with people, mirrored ones included."""
+    """Maximum number of windows with people, including mirrored ones."""
     negatives: int = 3000
-    """Windows without people that each stage adds."""
+    """Number of windows without people that each stage adds."""
     seed: int = 0
-    """Random seed of sampling and boosting."""
+    """Random seed for sampling and boosting."""
     quiet: bool = False
     """No progress bars."""
 

@@ -17,47 +17,47 @@ class TrainClassifier(TrainOptions):
     """Train SPNet or SPGNet on Doppler-time maps; running it again with the same arguments resumes it."""
 
     maps: Option[Path] = None
-    """Folder of maps; missing ones are made first (hours: 12 clips per person and scene)."""
+    """Folder of maps; missing ones are generated first (hours: 12 clips per person and scene)."""
     data: Option[Path] = None
-    """Data set of `tensorsim dataset build` instead of --maps: its classes, and its parts for training and validation.
-    Besides the weights, the confusion matrix (confusion.md) and the network as TorchScript and ONNX
+    """Data set from `tensorsim dataset build` to use instead of --maps: its classes, and its parts for training and
+    validation. Besides the weights, the confusion matrix (confusion.md) and the network as TorchScript and ONNX
     (picture_to_label.pt, .onnx) are written. --scenes, --people, --snr, --maps-seed, --films, --film-maps,
     --film-people and --film-seed need --maps; --init may have other classes."""
     labels: Several[str] = ()
     """Classes of --data to train on. Default: all."""
     radars: Several[str] = ()
-    """Radars of --data whose maps are used, as channels. Default: all."""
+    """Radars of --data whose maps are used, as input channels. Default: all."""
     network: Literal["spnet", "spgnet"] = "spnet"
-    """SPNet on 224x224 pictures, or SPGNet (s2p6) on 32x32."""
+    """SPNet on 224x224 images, or SPGNet (s2p6) on 32x32 ones."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Scenes to train on."""
     people: int = 300
-    """People per scene; each does all 12 activities, and every fifth is held out."""
+    """People per scene; each performs all 12 activities, and every fifth is held out."""
     snr: tuple[float, float] = (10.0, 50.0)
     """Lowest and highest signal-to-noise ratio in dB; the paper uses 50 50."""
     size: Option[int] = None
-    """Height and width of the pictures, a divisor of 224. Default: that of the network."""
+    """Height and width of the images; with --maps, a divisor of 224. Default: that of the network."""
     films: Option[Path] = None
-    """Folder of films and what networks found in them, as kept in films/ by `tensorsim evaluate truth --settings c`:
-    their errors are applied to the motion of --film-maps."""
+    """Folder of films and what the networks found in them, as kept in films/ by `tensorsim evaluate truth --settings
+    c`: their errors are applied to the motion of --film-maps."""
     film_maps: Option[Path] = None
-    """Folder of further maps to train on, of motion as the pipeline finds it in films; missing ones are made first,
-    without rendering."""
+    """Folder of further maps to train on, of motion as the pipeline finds it in films; missing ones are generated
+    first, without rendering."""
     film_people: int = 40
     """People per scene in --film-maps."""
     learning_rate: float = 1.47e-3
-    """Learning rate of the first half of the epochs; the second half has a tenth of it. With --init use less."""
+    """Learning rate for the first half of the epochs; the second half uses a tenth of it. Use less with --init."""
     masks: tuple[float, float] = (0.0, 0.0)
-    """Largest share of the rows (speeds) and of the columns (time) of a picture that is masked in training, as in
-    SpecAugment; 0 0 masks nothing."""
+    """Maximum share of the rows (speeds) and of the columns (time) of an image to mask in training, as in SpecAugment;
+    0 0 masks nothing."""
     epochs: int = 20
     """Passes over the training clips."""
     batch: int = 64
     """Clips per step."""
     maps_seed: int = 0
-    """Random seed of people, motion and noise of --maps."""
+    """Random seed for people, motion and noise of --maps."""
     film_seed: int = 2
-    """Random seed of people, motion and noise of --film-maps."""
+    """Random seed for people, motion and noise of --film-maps."""
 
     def run(self) -> None:
         """Run the command."""

@@ -12,17 +12,17 @@ class TrainDenoiser(TrainOptions):
     """Train DnCNN on maps with and without noise; running it again with the same arguments resumes it."""
 
     maps: Path
-    """Folder of patches of maps; missing ones are made first."""
+    """Folder of map patches; missing ones are generated first."""
     clips: int = 240
-    """Clips per scene, activity after activity; every eleventh is held out."""
+    """Clips per scene, cycling through the activities; every eleventh is held out."""
     depth: int = 20
-    """Number of convolutions."""
+    """Number of convolutional layers."""
     steps: int = 20_000
     """Optimiser steps."""
     batch: int = 128
     """Patches per step."""
     maps_seed: int = 0
-    """Random seed of people, motion and noise of the maps."""
+    """Random seed for people, motion and noise of the maps."""
 
     def run(self) -> None:
         """Run the command."""

@@ -13,24 +13,24 @@ from tensorsim.exceptions import check_positive
 class TrainDetector(PeopleOptions):
     """Train the person detector RTMDet on tar shards of people; running it again with the same arguments resumes it.
 
-    OUT/detector.safetensors has the best weights with calibrated scores.
+    Writes the best weights, with calibrated scores, to OUT/detector.safetensors.
     """
 
     data: Path
     """Folder of the shards coco_small, coco_more, coco_extra, coco_hardneg, films_teacher, lspet, pedestrian and
     backgrounds (NAME-*.tar)."""
     teacher: Option[Path] = None
-    """Weights of a better RTMDet (.safetensors, .pth, .onnx), whose output is learnt besides the labels."""
+    """Weights of a better RTMDet (.safetensors, .pth, .onnx), whose output is learned in addition to the labels."""
     variant: Literal["nano-person", "small-person", "m-person"] = "small-person"
     """Variant of RTMDet, for people only."""
     steps: int = 5000
     """Optimiser steps."""
     batch: int = 16
-    """Pictures per step."""
+    """Images per step."""
     learning_rate: float = 1e-3
     """Peak learning rate."""
     validate_every: int = 250
-    """Steps between validations on the held-out pictures."""
+    """Steps between validations on the held-out images."""
 
     def run(self) -> None:
         """Run the command."""

@@ -11,27 +11,27 @@ from tensorsim.exceptions import TensorsimError, check_positive, check_seed
 
 @dataclass(frozen=True, kw_only=True)
 class TrainEveryday(TrainOptions):
-    """Train SPNet or SPGNet on pictures of everyday motion in both presets, and calibrate it on held-out ones.
+    """Train SPNet or SPGNet on images of everyday motion in both presets, and calibrate it on held-out ones.
 
     Writes OUT/classifier.safetensors; running it again with the same arguments resumes it.
     """
 
     maps: Path
-    """Folder of pictures; missing groups are made first (about 10 s each on one core)."""
+    """Folder of images; missing groups are generated first (about 10 s each on one core)."""
     groups: int = 50
     """Number of groups, each of up to 99 clips and some of an empty scene; every fifth group is held out."""
     maps_seed: int = 0
-    """Random seed of the people, motion, cameras and errors of the pictures."""
+    """Random seed for the people, motion, cameras and errors in the images."""
     network: Literal["spnet", "spgnet"] = "spgnet"
-    """SPGNet (s2p6) on 32x32 pictures, or SPNet."""
+    """SPGNet (s2p6) on 32x32 images, or SPNet."""
     size: Option[int] = None
-    """Height and width of the pictures, a divisor of 64. Default: 32 for SPGNet, 64 for SPNet."""
+    """Height and width of the images, a divisor of 64. Default: 32 for SPGNet, 64 for SPNet."""
     learning_rate: float = 1e-3
     """Peak learning rate."""
     epochs: int = 10
-    """Passes over the training pictures."""
+    """Passes over the training images."""
     batch: int = 64
-    """Pictures per step."""
+    """Images per step."""
     share: float = 1.0
     """Weight of the trained parameters when averaged with --init, from 0 (only --init) to 1 (only trained)."""
 

@@ -14,11 +14,11 @@ class TrainLifter(TrainOptions):
     """Train a lifter; running it again with the same arguments resumes it."""
 
     network: Literal["temporal", "videopose3d"] = "temporal"
-    """TemporalLifter, or VideoPose3D with a window of 27 frames."""
+    """TemporalLifter, or VideoPose3D with a 27-frame window."""
     motion: Several[Path] = ()
     """Motion capture files (.npz, .bvh) in addition to the generated motion; every second sequence is held out."""
     motions: int = 12_000
-    """Number of motions of all kinds; they are made first, in OUT/motion.pt."""
+    """Number of motions of all kinds; they are generated first, into OUT/motion.pt."""
     steps: int = 7000
     """Optimiser steps."""
     batch: int = 48
@@ -30,7 +30,7 @@ class TrainLifter(TrainOptions):
     learning_rate: float = 1.5e-3
     """Peak learning rate."""
     motion_seed: int = 0
-    """Random seed of the motions."""
+    """Random seed for the motions."""
 
     def run(self) -> None:
         """Run the command."""

@@ -25,11 +25,11 @@ class TrainPose(PeopleOptions):
     size: tuple[int, int] = (128, 96)
     """Height and width of the crops."""
     first_size: tuple[int, int] = (96, 64)
-    """Height and width of smaller crops to begin with."""
+    """Height and width of the smaller crops used at first."""
     first_steps: Option[int] = None
     """Steps with the smaller crops, fewer than --steps. Default: half of --steps, at most 6000; 0 with --init."""
     width: Option[int] = None
-    """Channels of HRNet's branch of highest resolution (default: 24), or of most layers of CPM (default: 32)."""
+    """Channels of HRNet's highest-resolution branch (default: 24), or of most layers of CPM (default: 32)."""
     steps: int = 12000
     """Optimiser steps."""
     batch: int = 32
@@ -37,18 +37,18 @@ class TrainPose(PeopleOptions):
     learning_rate: float = 2e-3
     """Peak learning rate."""
     augmentation: Literal["full", "mild"] = "full"
-    """How much crops are rotated, scaled, shifted and cut: "full", or "mild" to end a training with crops closer to
-    those of films."""
+    """How much crops are rotated, scaled, shifted and cut: "full", or "mild" to end a training with crops that are
+    closer to those of films."""
     second_labels: Option[Path] = None
-    """Key points of the people of lspet by another network, in COCO's results format (.json): where they agree with
+    """Keypoints of the people of lspet from another network, in COCO's results format (.json): where they agree with
     the labels, they correct these and add the face."""
     teacher: Option[Path] = None
-    """A better network of COCO-17 heat maps for crops of the same size (.onnx), whose output the HRNet learns besides
-    the labels."""
+    """A better network with COCO-17 heatmaps for crops of the same size (.onnx), whose output the HRNet learns in
+    addition to the labels."""
     validate_every: int = 500
-    """Steps between validations on held-out people, by which the best weights are chosen."""
+    """Steps between validations on held-out people, which select the best weights."""
     presence: bool = False
-    """Train only the head of the HRNet in --init that tells which key points are in the picture, on crops of one size
+    """Train only the head of the HRNet in --init that tells which keypoints are inside the image, on crops of one size
     and without rendered people."""
 
     def run(self) -> None:

@@ -23,13 +23,13 @@ class TrainOptions:
     init: Option[Path] = None
     """Weights to start from (.safetensors)."""
     seed: int = 0
-    """Random seed, except for stored maps or rendered people."""
+    """Random seed for everything but stored maps and rendered people."""
     device: str = "auto"
-    """Device: cpu, cuda, cuda:1, ...; auto takes a GPU if there is one."""
+    """Device: cpu, cuda, cuda:1, ...; auto uses a GPU if there is one."""
     workers: int = 1
-    """Processes that prepare samples."""
+    """Number of processes that prepare samples."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Precision of convolutions and matrix products; auto takes bfloat16 if the device supports it."""
+    """Precision of convolutions and matrix products; auto uses bfloat16 if the device supports it."""
     quiet: bool = False
     """No progress bar."""
 
@@ -106,7 +106,7 @@ class PeopleOptions(TrainOptions):
     rendered: int = 0
     """Number of rendered people; one core renders about five per second."""
     rendered_seed: int = 0
-    """Random seed of their poses, looks and cameras."""
+    """Random seed for their poses, looks and cameras."""
 
     def loop(self, **settings: Any) -> "LoopConfig":
         """As for all training commands, after checks of the options for rendered people."""
