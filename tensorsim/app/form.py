@@ -162,7 +162,7 @@ def for_demo(options: dict[str, Any]) -> dict[str, Any]:
     unknown = [name for name in options if name not in Demo.__dataclass_fields__]
     if unknown:
         raise TensorsimError(
-            f"{unknown[0].replace('_', ' ')} applies to a file only, not to a generated person"
+            f"{unknown[0].replace('_', ' ')} applies only to files, not to a generated person"
         )
     return options
 

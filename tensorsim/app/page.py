@@ -48,10 +48,10 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
         with gr.Row():
             with gr.Column(scale=1, min_width=300):
                 film = gr.File(
-                    label=f"Film, up to {longest_s:g} s; motion capture; key points", file_types=FILE_TYPES
+                    label=f"Film, motion capture or keypoints, up to {longest_s:g} s", file_types=FILE_TYPES
                 )
                 activity = gr.Dropdown(
-                    _activities(), value="walking", label="Or an activity of a generated person"
+                    _activities(), value="walking", label="Or the activity of a generated person"
                 )
                 duration = gr.Number(
                     4.0,
@@ -61,7 +61,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                 )
                 scene = gr.Radio(_SCENES, value="free-space", label="Scene")
                 radar = gr.Dropdown(["", *PRESETS], value="", label="Radar preset")
-                paper = gr.Checkbox(label="Formulas of the paper, as printed")
+                paper = gr.Checkbox(label="Use the paper's formulas as printed")
                 inputs = {film, activity, duration, scene, radar, paper}
                 components = {}
                 for group in GROUPS:
@@ -73,13 +73,13 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                     start = gr.Button("Simulate", variant="primary", elem_id="simulate")
                     compare = gr.Button("Compare", elem_id="compare")
                     cancel = gr.Button("Cancel", elem_id="cancel")
-                gr.Markdown("Compare runs with the settings of now and keeps the last result beside it.")
+                gr.Markdown("Compare runs the current settings and shows the result beside the previous one.")
                 _examples(activity, scene, duration)
             with gr.Column(scale=3, min_width=360):
                 status = gr.HTML("Ready.", elem_id="status")
                 with gr.Row(visible=False) as working:
                     flat = gr.Image(label="Film", interactive=False, buttons=[])
-                    world = gr.Image(label="World of the radar", interactive=False, buttons=[])
+                    world = gr.Image(label="Scene around the radar", interactive=False, buttons=[])
                 result = gr.HTML(elem_id="result")
         running, shown = gr.State(None), gr.State(())
         outputs = [status, working, flat, world, result, running, shown]
@@ -206,7 +206,7 @@ def check_length(film: Path, longest_s: float, given: dict[str, Any]) -> None:
     if seconds is None or seconds > longest_s:
         length = "an unknown length" if seconds is None else f"{seconds:.1f} s"
         raise TensorsimError(
-            f"{film.name}: got {length}, expected at most {longest_s:g} s; set Start and End in the group Camera"
+            f"{film.name}: got {length}, expected at most {longest_s:g} s; set Start and End in the Camera group"
         )
 
 
@@ -228,7 +228,7 @@ def _part(film: Path, given: dict[str, Any]) -> tuple[float | None, float]:
         motion = load_motion(film, given.get("clip"), fps)
         count, fps = motion.valid.shape[1], motion.fps
     elif fps is None:
-        raise TensorsimError(f"{film.name}: the file has no frame rate; give Fps in the group Camera")
+        raise TensorsimError(f"{film.name}: the file has no frame rate; set Fps in the Camera group")
     else:
         size = given.get("image_size")
         count = load_keypoints(film, None if size is None else size[::-1]).valid.shape[0]
@@ -274,7 +274,7 @@ def _results(runs: Runs, tokens: tuple[str, ...]) -> str:
             continue
         links = [
             f'<a href="/runs/{token}/{html.escape(path.name)}" download="{html.escape(path.name)}">'
-            f"{html.escape('everything' if path.name == ARCHIVE else path.name)}</a>"
+            f"{html.escape('all files' if path.name == ARCHIVE else path.name)}</a>"
             for path in run.files()
         ]
         parts.append(

@@ -101,7 +101,7 @@ class Runs:
             run.error = self._without_paths(" ".join(str(error).split()))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
-            run.error = f"the simulation failed ({type(error).__name__}); the terminal has the details"
+            run.error = f"the simulation failed ({type(error).__name__}); see the terminal for details"
         finally:
             run.finished.set()
 

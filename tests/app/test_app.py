@@ -98,7 +98,7 @@ def test_values_of_controls_become_options() -> None:
     ):
         options_of({"denoiser": "/etc/passwd"})
     with pytest.raises(
-        TensorsimError, match="initial distance applies to a file only, not to a generated person"
+        TensorsimError, match="initial distance applies only to files, not to a generated person"
     ):
         for_demo({"initial_distance": (4.0,)})
 
@@ -123,7 +123,7 @@ def test_what_takes_too_long_is_refused_whatever_its_kind(tmp_path: Path) -> Non
     with pytest.raises(TensorsimError, match=r"people.json: got 6.0 s, expected at most 5 s"):
         check_length(keypoints, 5.0, {"fps": 10.0})
     check_length(keypoints, 5.0, {"fps": 20.0})
-    with pytest.raises(TensorsimError, match=r"people\.json: the file has no frame rate; give Fps"):
+    with pytest.raises(TensorsimError, match=r"people\.json: the file has no frame rate; set Fps"):
         check_length(keypoints, 5.0, {})
     settings = {"scene": "free-space", "radar": None, "paper": False}
     with pytest.raises(TensorsimError, match=r"got 100 s, expected 0\.5 to 60 s"):
@@ -231,7 +231,7 @@ def test_failures_are_one_sentence_without_folders(
     run = ended(runs.start(lambda folder: Work(folder, error=TensorsimError(message))))
     assert run.error == "film.mp4: OpenCV cannot read this, expected a video"
     broken = ended(runs.start(lambda folder: Work(folder, error=RuntimeError("inner"))))
-    assert broken.error == "the simulation failed (RuntimeError); the terminal has the details"
+    assert broken.error == "the simulation failed (RuntimeError); see the terminal for details"
     assert "inner" in capsys.readouterr().err
 
 
