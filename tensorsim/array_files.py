@@ -64,6 +64,6 @@ def _h5py() -> Any:
         import h5py
     except ImportError as error:
         raise TensorsimError(
-            f"--save h5: h5py cannot be imported ({error}), expected it installed: pip install h5py"
+            f"--save h5: h5py cannot be imported ({error}); install it with: pip install h5py"
         ) from None
     return h5py

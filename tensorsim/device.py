@@ -24,7 +24,7 @@ def usable_device(name: str) -> torch.device:
     except Exception as error:  # each backend raises its own errors
         raise TensorsimError(f"--device: {name!r} is not usable here: {first_line(error)}") from None
     if not usable:
-        raise TensorsimError(f"--device: {name!r} is not usable here: it computes a wrong sum")
+        raise TensorsimError(f"--device: {name!r} is not usable here: it gets a simple sum wrong")
     return device
 
 

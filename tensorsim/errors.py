@@ -79,7 +79,7 @@ def check_like_weights(x: Tensor, weight: Tensor, name: str) -> None:
     """
     if (x.dtype != weight.dtype and not is_autocast(x)) or x.device != weight.device:
         raise TensorsimError(
-            f"{name}: got {x.dtype} on {x.device}, expected {weight.dtype} on {weight.device} as the weights"
+            f"{name}: got {x.dtype} on {x.device}, expected {weight.dtype} on {weight.device} like the weights"
         )
 
 
@@ -189,7 +189,9 @@ def check_replaced(part: str, given: Mapping[str, bool]) -> None:
     """
     unused = [name for name, is_given in given.items() if is_given]
     if unused:
-        raise TensorsimError(f"{part}: got a ready one and {', '.join(unused)}, expected one or the other")
+        raise TensorsimError(
+            f"{part}: got a ready-made one and {', '.join(unused)}, expected one or the other"
+        )
 
 
 def is_exporting() -> bool:

@@ -133,7 +133,7 @@ def keypoint_source(
     found = load_keypoints(path, size)
     size = found.size if size is None else size
     if size is None:
-        raise TensorsimError(f"{path}: the file has no size of its pictures; give --image-size")
+        raise TensorsimError(f"{path}: the file does not state the image size; give --image-size")
     kept = cut.frames(found.valid.shape[0], fps, path)
     _check_size(found, size)
     people = _lifted(found, stage, kept, size, fps / cut.stride, calibrate)

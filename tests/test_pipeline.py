@@ -524,7 +524,7 @@ def test_refuses_other_parts_in_place_of_ready_ones() -> None:
 def test_positions_are_not_rounded_by_mixed_precision() -> None:
     with (
         torch.autocast("cpu", torch.bfloat16),
-        pytest.raises(ts.TensorsimError, match=r"video: got it under torch\.autocast, expected that off"),
+        pytest.raises(ts.TensorsimError, match=r"video: got it under torch\.autocast, expected it off"),
     ):
         pipeline()(two_clips(), FPS)
 

@@ -37,7 +37,7 @@ def application(host: str, largest_mb: float, longest_s: float) -> Iterator[Any]
             from fastapi.responses import FileResponse
         except ImportError as error:
             raise TensorsimError(
-                f'app: gradio cannot be imported ({error}), expected it installed: pip install "tensorsim[app]"'
+                f'app: gradio cannot be imported ({error}); install it with: pip install "tensorsim[app]"'
             ) from None
         from tensorsim.app.page import CSS, build
 

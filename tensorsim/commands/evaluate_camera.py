@@ -72,7 +72,7 @@ class EvaluateCamera:
                     print(f"| {tilt:.0f} | {height:.1f} m | {len(row)} | {self._errors(row)} |", flush=True)
                 found += row
         if not found:
-            raise TensorsimError("evaluate camera: got no camera that has a walk in its picture")
+            raise TensorsimError("evaluate camera: got no camera with a walk in view, expected at least one")
         for what, rows in (
             ("", found),
             ("before uncertain tilts are drawn towards a level camera: ", as_told),

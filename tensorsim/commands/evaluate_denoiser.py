@@ -47,9 +47,7 @@ class EvaluateDenoiser:
         check_distinct(self.scenes, "--scenes")
         check_ratios(self.snr, "--snr")
         if self.out is not None and (self.out.is_dir() or not self.out.parent.is_dir()):
-            raise TensorsimError(
-                f"--out: got {self.out}, expected the name of a file in a folder that is there"
-            )
+            raise TensorsimError(f"--out: got {self.out}, expected a file name in an existing folder")
         rivals: Denoisers = {"none": None}
         rivals |= {str(path): MapDenoiser.from_pretrained(path) for path in (self.weights, *self.against)}
         rivals["Perona-Malik"] = MapDenoiser(PeronaMalik())

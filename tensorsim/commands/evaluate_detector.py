@@ -42,7 +42,7 @@ class EvaluateDetector:
             groups[str(self.coco)] = read_coco_folder(self.coco)
         if not groups and not self.films:
             raise TensorsimError(
-                "evaluate detector: got nothing to look at, expected --data, --coco or --films"
+                "evaluate detector: got nothing to evaluate on, expected --data, --coco or --films"
             )
         if self.films and self.against is None:
             raise TensorsimError("--films needs --against, the detector to compare with")

@@ -90,7 +90,7 @@ class TrainPose(PeopleOptions):
             self.network == "cpm" or first_steps > 0 or teacher.input_size != self.size
         ):
             raise TensorsimError(
-                f"--teacher: got a network of crops of {teacher.input_size}, expected it with --network hrnet, "
+                f"--teacher: got a network for crops of {teacher.input_size}, expected --network hrnet, "
                 "--first-steps 0 and crops of the same --size"
             )
         loop = self.loop(steps=self.steps, batch=self.batch, validate_every=self.validate_every)

@@ -78,7 +78,7 @@ def _loader() -> Any:
             keys = [str(key.value) for key, _ in node.value]
             twice = sorted({key for key in keys if keys.count(key) > 1})
             if twice:
-                raise yaml.YAMLError(f"twice the key {', '.join(twice)}")
+                raise yaml.YAMLError(f"duplicate key {', '.join(twice)}")
             return super().construct_mapping(node, deep)
 
     decimal = r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?"

@@ -44,7 +44,7 @@ def load_keypoints(path: str | os.PathLike[str], size: tuple[int, int] | None = 
         return coco_of(path, contents)
     size = said if size is None else size
     if size is None:
-        raise TensorsimError(f"{path}: the file has no size of its pictures; give it (--image-size)")
+        raise TensorsimError(f"{path}: the file does not state the image size; give it (--image-size)")
     for side in size:
         check_range(side, "image side", f"{path}: size of the pictures")
     with reading(path, "JSON of BlazePose landmarks"):

@@ -57,7 +57,7 @@ class _Array:
         """The element of a zero-dimensional array of objects."""
         _, shape, dtype, _, content = self.state
         if dtype.code not in ("O", "O8") or shape != () or not isinstance(content, list):
-            raise pickle.UnpicklingError("it is no dictionary")
+            raise pickle.UnpicklingError("it is not a dictionary")
         (item,) = content
         return item
 
@@ -115,7 +115,7 @@ def clips_of_h36m(path: Path, arrays: Arrays) -> dict[str, Any]:
     except TensorsimError:
         raise
     except (AttributeError, EOFError, IndexError, TypeError, ValueError) as error:
-        raise TensorsimError(f"{path}: got positions_3d that hold no dictionary ({error})") from error
+        raise TensorsimError(f"{path}: got positions_3d that are not a dictionary ({error})") from error
 
 
 def read_h36m(path: Path, arrays: Arrays, key: str | None, fps: float | None) -> Motion:

@@ -74,7 +74,7 @@ def open_npz(path: Path) -> Iterator[Arrays]:
     """The arrays in an npz file; errors name the file."""
     with reading(path, "npz"):
         if not zipfile.is_zipfile(path):
-            raise ValueError("it is no archive of arrays")
+            raise ValueError("it is not an archive of arrays")
         with zipfile.ZipFile(path) as archive:
             yield Arrays(archive)
 

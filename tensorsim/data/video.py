@@ -244,7 +244,7 @@ class VideoReader:
                         break
                     if frame.shape != shape:
                         raise TensorsimError(
-                            f"{self.path}: frame {index} has shape {frame.shape}, expected {shape} as the first"
+                            f"{self.path}: frame {index} has shape {frame.shape}, expected {shape} like the first"
                         )
                     yield time_s, own_s, frame
                 index += 1

@@ -79,7 +79,7 @@ def ksvd_denoise(
         from sklearn.decomposition import MiniBatchDictionaryLearning, sparse_encode
     except ImportError as error:
         raise TensorsimError(
-            f"ksvd_denoise: scikit-learn cannot be imported ({error}), expected it installed: "
+            f"ksvd_denoise: scikit-learn cannot be imported ({error}); install it with: "
             'pip install "tensorsim[train]"'
         ) from error
     from torch.nn.functional import fold, unfold
@@ -145,7 +145,7 @@ class KSVD(nn.Module):
         super().__init__()
         if importlib.util.find_spec("sklearn") is None:
             raise TensorsimError(
-                'KSVD: scikit-learn cannot be imported, expected it installed: pip install "tensorsim[train]"'
+                'KSVD: scikit-learn cannot be imported; install it with: pip install "tensorsim[train]"'
             )
 
     def forward(self, maps: Tensor) -> Tensor:

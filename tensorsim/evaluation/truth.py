@@ -89,7 +89,7 @@ class TruthLoop:
         for path in self.motions:
             if path.stem in listed:
                 raise TensorsimError(
-                    f"motion: got {path} after another {path.stem}, expected files of different names"
+                    f"motion: got {path} after another {path.stem}, expected files with different names"
                 )
             listed[path.stem] = captured_clips(path, self.clips, self.motion_fps)
         return listed

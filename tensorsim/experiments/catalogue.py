@@ -140,7 +140,7 @@ def configuration(name: str, quick: bool, file: Path | None, options: dict[str, 
     config = from_document(name, experiment.config, document)
     for option, needed in config.unused().items() if isinstance(config, real.RealConfig) else ():
         if options.get(option, "") != "":
-            raise TensorsimError(f"--{option.replace('_', '-')}: got it without {needed}, which it is for")
+            raise TensorsimError(f"--{option.replace('_', '-')}: has no effect without {needed}")
     return config
 
 

@@ -42,7 +42,7 @@ class PaperConfig:
             raise TensorsimError("--settings: got a folder and --quick, expected one of them")
         if self.maps and not self.films:
             raise TensorsimError(
-                "--maps: got it without --films, which are labelled by networks that learnt it"
+                "--maps: has no effect without --films, which networks trained on these maps label"
             )
 
 

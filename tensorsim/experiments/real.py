@@ -84,7 +84,7 @@ class RealConfig:
         if len(self.group_clips) != 2:
             raise TensorsimError(
                 f"group_clips: got {list(self.group_clips)}, expected two numbers: of clips as the pipeline finds "
-                "them, and of the motion itself"
+                "them, and of clips of the true motion"
             )
         EverydaySettings(filmed=self.group_clips[0], true=self.group_clips[1])
         if self.size < 32 or self.size % 16:

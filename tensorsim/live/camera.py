@@ -67,7 +67,7 @@ class Camera:
         self.is_file = not source.isdecimal() and not source.lower().startswith(_STREAMS)
         if not self.is_file and every_frame:
             raise TensorsimError(
-                f"--every-frame: got the camera {source}, expected a file: others do not wait"
+                f"--every-frame: got the camera {source}, expected a file: a camera does not wait"
             )
         if self.is_file:
             self.reader = VideoReader(Path(source), fps=fps)

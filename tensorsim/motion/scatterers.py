@@ -134,8 +134,8 @@ class JointScatterers(nn.Module):
             )
         if learnable and min(rcs_m2) == 0:
             raise TensorsimError(
-                f"JointScatterers.rcs_m2: got {rcs_m2}, expected numbers > 0 to learn from: the logarithm of 0 "
-                "cannot be moved"
+                f"JointScatterers.rcs_m2: got {rcs_m2}, expected numbers > 0 if they are learned: the logarithm of 0 "
+                "is not finite"
             )
         table = torch.tensor(tuple(rcs_m2), dtype=torch.float64)
         self.register_buffer("rcs_m2", table, persistent=False)

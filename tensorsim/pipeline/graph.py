@@ -123,7 +123,7 @@ class VideoToDoppler(nn.Module):
         """
         if config.pose.calibrate:
             warnings.warn(
-                "pose.calibrate is ignored here, pose.camera is used; use "
+                "pose.calibrate is ignored here and pose.camera is used; use "
                 "tensorsim.streaming.people_of_film(..., calibrate=True) to estimate the camera",
                 TensorsimWarning,
                 stacklevel=2,

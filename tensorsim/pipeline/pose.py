@@ -228,7 +228,7 @@ class VideoToPose(nn.Module):
         check_positive(fps, "fps")
         if is_autocast(video):
             raise TensorsimError(
-                "video: got it under torch.autocast, expected that off: it would round positions in pixels and metres"
+                "video: got it under torch.autocast, expected it off: it would round positions in pixels and metres"
             )
         b, t, height, width = video.shape[0], video.shape[1], video.shape[3], video.shape[4]
         if b == 0 or t < 2:

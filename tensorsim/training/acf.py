@@ -127,7 +127,7 @@ def boost(
         from sklearn.ensemble import GradientBoostingClassifier
     except ImportError as error:
         raise TensorsimError(
-            f'ACF: scikit-learn cannot be imported ({error}), expected it installed: pip install "tensorsim[train]"'
+            f'ACF: scikit-learn cannot be imported ({error}); install it with: pip install "tensorsim[train]"'
         ) from error
     model = GradientBoostingClassifier(
         loss="exponential",

@@ -93,7 +93,7 @@ def average_precision(
         from pycocotools.cocoeval import COCOeval
     except ImportError as error:
         raise TensorsimError(
-            f"average precision: pycocotools cannot be imported ({error}), expected it installed: "
+            f"average precision: pycocotools cannot be imported ({error}); install it with: "
             'pip install "tensorsim[train]"'
         ) from error
 

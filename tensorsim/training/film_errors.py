@@ -124,7 +124,7 @@ def films_of(folder: Path) -> Iterator[tuple[str, Clip, Observed]]:
     for path in paths:
         activity, number = activity_of_folder(path), re.match(r"(\d+)-", path.name)
         if activity is None or number is None:
-            raise TensorsimError(f"{path}: got a name without a clip, expected one of evaluate truth")
+            raise TensorsimError(f"{path}: got a name without a clip, expected one from evaluate truth")
         name = ACTIVITIES[activity]
         clip = activity_clips((name,), 1, int(number[1]))[name][0]
         yield str(path.relative_to(folder)), clip, filmed(path, clip, nn.Identity(), nn.Identity()).found
@@ -162,9 +162,7 @@ class FilmErrors:
     def __init__(self, films: dict[str, Watched]) -> None:
         shortest = min((len(film.found) for film in films.values()), default=0)
         if shortest < _PIECE:
-            raise TensorsimError(
-                f"FilmErrors: got films from {shortest} frames on, expected {_PIECE} or more"
-            )
+            raise TensorsimError(f"FilmErrors: got a film of {shortest} frames, expected {_PIECE} or more")
         self.films = [one for film in films.values() for one in (film, film.mirrored())]
         content = hashlib.sha256()
         for name, film in films.items():

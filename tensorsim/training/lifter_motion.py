@@ -241,7 +241,7 @@ def build_pool(
             stored = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:
             raise TensorsimError(
-                f"{path}: damaged ({type(error).__name__}); remove it to make it anew"
+                f"{path}: damaged ({type(error).__name__}); remove it to generate it again"
             ) from error
         if stored.get("settings") != settings:
             raise TensorsimError(f"{path}: got motions of {stored.get('settings')}, expected {settings}")

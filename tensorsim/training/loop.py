@@ -194,7 +194,7 @@ def _events(out: Path, step: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise TensorsimError(
-            f"training logs: TensorBoard cannot be imported ({error}), expected it installed: "
+            f"training logs: TensorBoard cannot be imported ({error}); install it with: "
             'pip install "tensorsim[train]"'
         ) from error
     return SummaryWriter(str(out), purge_step=step + 1)
@@ -390,9 +390,7 @@ def _read(path: Path) -> dict[str, Any]:
         ) from error
     parts = {"step", "best", "loop", "recipe", "net", "averaged", "optimiser"}
     if not isinstance(state, dict) or not parts <= state.keys():
-        raise TensorsimError(
-            f"{path}: not a checkpoint of training, expected {', '.join(sorted(parts))} in it"
-        )
+        raise TensorsimError(f"{path}: not a training checkpoint, expected {', '.join(sorted(parts))} in it")
     return state
 
 

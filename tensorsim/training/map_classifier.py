@@ -51,7 +51,7 @@ def transfer(net: nn.Module, weights: dict[str, Tensor]) -> list[str]:
     fitting = {k: v for k, v in weights.items() if k in own and v.shape == own[k].shape}
     if sum(own[k].numel() for k in fitting) < 0.5 * sum(v.numel() for v in own.values()):
         raise TensorsimError(
-            "--init: got weights of another network, expected those of the one that is trained"
+            "--init: got weights of another network, expected those of the network being trained"
         )
     net.load_state_dict(own | fitting)
     return [name for name in own if name not in fitting]

@@ -229,7 +229,7 @@ def crop_person(
     frame = box.astype(np.float64)
     if augmentation is not None:
         if generator is None:
-            raise TensorsimError("crop_person: got an augmentation, expected a generator with it")
+            raise TensorsimError("crop_person: got an augmentation without a generator, expected both")
         mirrored = bool(generator.random() < 0.5)
         if generator.random() < augmentation.repeat:
             border = cv2.BORDER_REPLICATE

@@ -52,7 +52,7 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, tuple[Floats, Floats
             boxes.append(np.concatenate([box[:2], box[:2] + box[2:]]))
             points.append(np.array(entry["keypoints"], np.float32).reshape(17, 3))
             if not (np.isfinite(box).all() and np.isfinite(points[-1]).all()):
-                raise ValueError(f"numbers that are missing or not finite, of image_id {entry['image_id']}")
+                raise ValueError(f"missing or non-finite numbers for image_id {entry['image_id']}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TensorsimError(
             f"{path}: not a COCO file of keypoint results with image_id, bbox and 17 keypoints ({error})"

@@ -61,7 +61,7 @@ class OnnxEngine(nn.Module):
         package = "openvino" if runtime.startswith("openvino") else "onnxruntime"
         if find_spec(package) is None:
             raise TensorsimError(
-                f"--engine {package}: it is not installed, expected `pip install {package}` before"
+                f"--engine {package}: not installed; install it with `pip install {package}`"
             )
         # The exporter leaves a network in the mode that it says it is in, parts included.
         self.network, self.size, self.runtime = network.eval(), size, runtime

@@ -69,7 +69,7 @@ ALIASES = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" f
         ("a: !!timestamp 2001-01-01", "a tag"),
         ("a: " + "[" * 3000 + "]" * 3000, "line 1 is nested deeper than 20"),
         ("a: " + "9" * 5000, "a value of 5000 characters"),
-        ("a: 1\nb: 2\na: 3", "twice the key a"),
+        ("a: 1\nb: 2\na: 3", "duplicate key a"),
         ("a: [1", "not valid YAML"),
         ("a: b\n" * 30_000, "150000 characters, expected at most"),
         ("\x00", "not valid YAML"),

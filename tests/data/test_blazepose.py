@@ -127,7 +127,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, content: Callable[[], Any], m
 def test_a_size_is_needed(tmp_path: Path) -> None:
     path = tmp_path / "people.json"
     path.write_text(json.dumps([person()]))
-    with pytest.raises(TensorsimError, match="the file has no size of its pictures"):
+    with pytest.raises(TensorsimError, match="the file does not state the image size"):
         load_keypoints(path)
     with pytest.raises(TensorsimError, match="got 100000, expected image side"):
         load_keypoints(path, (100_000, 10))

@@ -476,7 +476,7 @@ def test_files_that_are_not_motion_are_refused(tmp_path: Path) -> None:
         "no frame rate": {"joints_m": walker()},
         "without names": {"joints_m": walker()[:, :9], "fps": 30.0},
         "cannot be read as npz": {"joints_m": walker(), "fps": np.array([30.0, 31.0])},
-        "hold no dictionary": {"positions_3d": np.array({"S1": 5}, dtype=object)},
+        "are not a dictionary": {"positions_3d": np.array({"S1": 5}, dtype=object)},
         "NaN": {"joints_m": np.full((2, 14, 3), np.nan), "fps": 30.0},
         "no frames": {"joints_m": np.zeros((0, 14, 3)), "fps": 30.0},
         r"other \[3\], expected one of shape": {"other": np.zeros(3)},

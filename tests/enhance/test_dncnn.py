@@ -307,5 +307,5 @@ def test_mixed_precision_casts_what_another_layer_gives() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         found = small()(images.bfloat16())
     assert torch.allclose(found.float(), small()(images), atol=0.1)
-    with pytest.raises(TensorsimError, match=r"expected torch\.float32 on cpu as the weights"):
+    with pytest.raises(TensorsimError, match=r"expected torch\.float32 on cpu like the weights"):
         small()(images.bfloat16())

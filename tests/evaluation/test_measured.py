@@ -212,7 +212,7 @@ def test_clips_to_learn_from_are_not_tested(folders, tmp_path, monkeypatch, caps
     monkeypatch.setattr(run.Experiment, "full", None)
     with pytest.raises(SystemExit):
         cli.main(words(same, tmp_path, "--sets", "radhar_points"))
-    assert "radhar_points: got the same clips to learn from and to test on" in capsys.readouterr().err
+    assert "radhar_points: got the same clips to train on and to test on" in capsys.readouterr().err
 
 
 def test_matrices_of_an_earlier_run_are_removed(tmp_path):

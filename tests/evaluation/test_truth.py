@@ -377,7 +377,7 @@ def test_bad_requests_are_refused(tmp_path: Path, tmp_path_factory: pytest.TempP
         ({"sources": ("c",)}, "setting c: got no networks"),
         ({"clips": 0}, "clips: got 0"),
         ({"scenes": ()}, "scenes: got 0"),
-        ({"motions": (walks("a"), walks("b"))}, "after another walk, expected files of different names"),
+        ({"motions": (walks("a"), walks("b"))}, "after another walk, expected files with different names"),
     ):
         with pytest.raises(TensorsimError, match=message):
             truth.TruthLoop(tmp_path, **options).run(quiet=True)

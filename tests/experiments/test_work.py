@@ -103,9 +103,9 @@ def test_settings_of_file_and_options(tmp_path: Path) -> None:
         ("real", {"networks": ()}, "networks: got 0, expected an integer of at least 1"),
         ("real", {"group_clips": (6,)}, r"group_clips: got \[6\], expected two numbers"),
         ("real", {"group_clips": (0, 0)}, "expected positive numbers"),
-        ("paper", {"maps": "maps"}, "--maps: got it without --films"),
-        ("real", {"films": "films", "steps": 3}, "--steps: got it without --data, which it is for"),
-        ("real", {"data": "data", "film_seeds": 3}, "--film-seeds: got it without --films"),
+        ("paper", {"maps": "maps"}, "--maps: has no effect without --films"),
+        ("real", {"films": "films", "steps": 3}, "--steps: has no effect without --data"),
+        ("real", {"data": "data", "film_seeds": 3}, "--film-seeds: has no effect without --films"),
         *(
             (name, {"seed": seed}, f"seed: got {seed}, expected an integer from 0 to 4294967295")
             for name in ("video-ablation", "echo-ablation", "denoiser-ablation", "real")

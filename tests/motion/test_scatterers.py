@@ -85,7 +85,7 @@ def test_a_learnable_table_starts_as_given_and_a_fixed_one_has_no_parameter() ->
     torch.testing.assert_close(learnable.table(), torch.tensor(JOINT_RCS_M2, dtype=torch.float64))
     assert list(learnable.state_dict()) == ["log_rcs_m2"]
     assert not JointScatterers().state_dict()
-    with pytest.raises(TensorsimError, match="expected numbers > 0 to learn from"):
+    with pytest.raises(TensorsimError, match="expected numbers > 0 if they are learned"):
         JointScatterers((1.0, 0.0), learnable=True)
 
 

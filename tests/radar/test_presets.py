@@ -175,7 +175,7 @@ def test_several_receivers_become_tuples(tmp_path: Path) -> None:
         ("radar: {}\nprf_hz: 4096", r"got prf_hz beside the section radar"),
         ("- 1\n- 2", r"yaml: got list, expected keys"),
         ("", r"yaml: got nothing, expected keys"),
-        ("prf_hz: 1\nprf_hz: 2", r"twice the key prf_hz"),
+        ("prf_hz: 1\nprf_hz: 2", r"duplicate key prf_hz"),
         ("prf_hz: [", r"radar.yaml: not valid YAML"),
         ("prf_hz: !!python/object/apply:os.getpid []", r"line 1 has an anchor, an alias or a tag"),
     ],

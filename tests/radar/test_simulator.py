@@ -318,7 +318,7 @@ def test_scene_is_that_of_the_echo_synthesizer():
     scene = {"floor": FloorConfig(), "direct": False}
     ready = RadarSimulator(SMALL, snr_db=None, echo=EchoSynthesizer(SMALL, **scene))
     assert_same(RadarSimulator(SMALL, snr_db=None, **scene)(p, rcs), ready(p, rcs))
-    with pytest.raises(TensorsimError, match="echo: got a ready one and direct, wall, expected"):
+    with pytest.raises(TensorsimError, match="echo: got a ready-made one and direct, wall, expected"):
         RadarSimulator(SMALL, WallConfig(), echo=EchoSynthesizer(SMALL), direct=False)
 
 

@@ -160,7 +160,7 @@ def test_refuses_what_is_too_short_or_not_there(tmp_path: Path) -> None:
     (tmp_path / "S13_Flying" / "0-0.npz").touch()
     with pytest.raises(TensorsimError, match="a name without a clip"):
         watched_films(tmp_path)
-    with pytest.raises(TensorsimError, match="got films from 0 frames on, expected 12 or more"):
+    with pytest.raises(TensorsimError, match="got a film of 0 frames, expected 12 or more"):
         FilmErrors({})
     errors = FilmErrors({"walk": watched(WALK)})
     with pytest.raises(TensorsimError, match="got 11 frames, expected at least 12"):

@@ -160,7 +160,7 @@ def test_a_damaged_checkpoint_is_told_in_one_line(tmp_path: Path, damage: str) -
             "changed": bytes(64) + data[64:],
         }
         last.write_bytes(changed[damage])
-    with pytest.raises(TensorsimError, match=r"last\.pt: (damaged|not a checkpoint)") as refused:
+    with pytest.raises(TensorsimError, match=r"last\.pt: (damaged|not a training checkpoint)") as refused:
         fit(Line(), config(tmp_path, steps=20))
     assert "\n" not in str(refused.value)
 

@@ -175,7 +175,7 @@ def test_most_steps_at_the_size_that_is_asked_for(
 def test_a_teacher_of_other_maps_is_refused(options: dict[str, object], data: Path) -> None:
     teacher = write_network(data / "teacher.onnx")  # crops of 64x32
     options = {"size": (64, 32), "first_steps": 0, "steps": 2, "teacher": teacher} | options
-    with pytest.raises(TensorsimError, match=r"--teacher: got a network of crops of \(64, 32\)"):
+    with pytest.raises(TensorsimError, match=r"--teacher: got a network for crops of \(64, 32\)"):
         TrainPose(data, out=data / "out", **options).run()  # type: ignore[arg-type]
     assert not (data / "out").exists()
 

@@ -102,7 +102,7 @@ def test_without_the_library_it_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, runtime: Runtime, package: str
 ) -> None:
     monkeypatch.setattr(onnx_engine, "find_spec", lambda _: None)
-    with pytest.raises(TensorsimError, match=f"--engine {package}: it is not installed"):
+    with pytest.raises(TensorsimError, match=f"--engine {package}: not installed"):
         OnnxPose(nn.Identity(), runtime)
 
 

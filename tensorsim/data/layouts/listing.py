@@ -25,7 +25,7 @@ CAPTURED = (".bvh", ".npz")
 def _folder(source: SourceConfig) -> Path:
     folder = Path(source.path or "")
     if not folder.is_dir():
-        raise TensorsimError(f"{folder}: got no such folder, expected one for the source {source.kind!r}")
+        raise TensorsimError(f"{folder}: no such folder, expected one for the source {source.kind!r}")
     return folder
 
 
@@ -99,7 +99,7 @@ def read_table(path: Path) -> list[dict[str, Any]]:
         TensorsimError: no such file, or one that cannot be read.
     """
     if not path.is_file():
-        raise TensorsimError(f"{path}: got no such file, expected a table (.csv or .parquet)")
+        raise TensorsimError(f"{path}: no such file, expected a table (.csv or .parquet)")
     with reading(path, "a table"):
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet as pq

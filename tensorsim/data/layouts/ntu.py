@@ -47,7 +47,9 @@ def ntu_name(path: Path) -> NtuName:
     """
     found = _NAME.match(path.stem)
     if found is None:
-        raise TensorsimError(f"{path}: got another name, expected one such as S001C001P001R001A001")
+        raise TensorsimError(
+            f"{path}: got an unknown kind of name, expected one such as S001C001P001R001A001"
+        )
     return NtuName(*(int(number) for number in found.groups()))
 
 
@@ -73,7 +75,7 @@ def read_ntu(path: Path) -> Motion:
                 rows = [[float(next(numbers)) for _ in range(12)] for _ in range(count)]
                 people.setdefault(body, {})[frame] = [row[:3] for row in rows]
         if not people:
-            raise ValueError("nobody in its frames")
+            raise ValueError("no people in its frames")
     positions = torch.zeros(len(people), frames, len(KINECT_JOINTS), 3, dtype=torch.float64)
     valid = torch.zeros(len(people), frames, dtype=torch.bool)
     for person, seen in enumerate(people.values()):

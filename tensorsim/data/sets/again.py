@@ -34,13 +34,13 @@ def sample_again(folder: Path, sample: str, cache: Path | None = None) -> Sample
     index, clip = row["clip_index"], row["clip"]
     if index >= plan.clips or plan.clip(index)[1].name != clip:
         raise TensorsimError(
-            f"{folder}: got sources in which {clip} is missing or has another place, expected those of the data set"
+            f"{folder}: got sources in which {clip} is missing or has moved, expected those of the data set"
         )
     made = sample_of_row(plan, row)
     if made.row["sha256"] != row["sha256"]:
         raise TensorsimError(
-            f"{folder}: got other arrays for {sample} than were stored, expected the same: is it another version of "
-            f"tensorsim ({there.get('version', 'an earlier one')} there, {here['version']} here), torch or the films, "
-            "or a processor of another kind?"
+            f"{folder}: got other arrays for {sample} than were stored, expected the same: has the version of "
+            f"tensorsim ({there.get('version', 'an earlier one')} there, {here['version']} here), "
+            "of torch, the films or the kind of processor changed?"
         )
     return made

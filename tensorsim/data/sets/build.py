@@ -143,7 +143,7 @@ def build_dataset(
     """
     if recipe.without_effect:
         warnings.warn(
-            f"recipe: got {', '.join(recipe.without_effect)}, which change nothing: no radar has a wall",
+            f"recipe: got {', '.join(recipe.without_effect)}, which have no effect: no radar has a wall",
             TensorsimWarning,
             stacklevel=2,
         )

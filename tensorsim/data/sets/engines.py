@@ -116,7 +116,7 @@ class RayCluster:
             import ray.data  # noqa: F401
         except ImportError as error:
             raise TensorsimError(
-                f'--engine ray: Ray cannot be imported ({error}), expected it installed: pip install "tensorsim[scale]"'
+                f'--engine ray: Ray cannot be imported ({error}); install it with: pip install "tensorsim[scale]"'
             ) from None
         self.address, self.workers = address, workers
 

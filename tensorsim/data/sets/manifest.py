@@ -63,7 +63,7 @@ def finish(out: Path, plan: Plan, made: dict[str, Any], finished: Sequence[Path]
             reason = failures[0]["reason"] if failures else "there are none"
             for path in finished:
                 path.unlink()  # to be tried again
-            raise TensorsimError(f"{out}: got no sample at all ({reason}), expected some")
+            raise TensorsimError(f"{out}: got no samples ({reason}), expected some")
     draw_sheet(out, plan.recipe)
     write_text(out / "README.md", card(plan, counts, len(failures), size))
     summary = {

@@ -83,7 +83,7 @@ class OutputConfig:
         if self.size is not None:
             if self.rate_hz not in (None, OutputConfig.rate_hz):
                 raise TensorsimError(
-                    f"OutputConfig.rate_hz: got {self.rate_hz} beside a size, which has the number of columns; "
+                    f"OutputConfig.rate_hz: got {self.rate_hz} together with a size, which sets the number of columns; "
                     "expected none"
                 )
             object.__setattr__(self, "rate_hz", None)

@@ -73,7 +73,7 @@ class Plan:
             other = there.setdefault(folder_name(label).casefold(), label)
             if other != label:
                 raise TensorsimError(
-                    f"recipe: got the classes {other!r} and {label!r}, which have the same folder of pictures "
+                    f"recipe: got the classes {other!r} and {label!r}, which would share a folder of pictures "
                     f"({folder_name(label)}), expected names that differ in letters or digits"
                 )
 

@@ -58,7 +58,7 @@ def chosen_names(recipe: DatasetRecipe, output: str | None, radars: Sequence[str
         output = there[0]
     if output not in there:
         raise TensorsimError(
-            f"MapDataset.output: got {output!r}, expected one of {', '.join(there) or 'no map, for there is none'}"
+            f"MapDataset.output: got {output!r}, expected one of {', '.join(there) or 'none, as it has no maps'}"
         )
     names = [view.name for view in recipe.radars]
     for name in radars or ():

@@ -256,7 +256,7 @@ class DatasetRecipe:
         names = [view.name for view in self.radars]
         if len({name.casefold() for name in names}) < len(names):  # WebDataset reads them in lower case
             raise TensorsimError(
-                f"DatasetRecipe.radars: got the names {names}, expected ones that differ not only in capitals"
+                f"DatasetRecipe.radars: got the names {names}, expected ones that differ in more than capitals"
             )
         if self.scene != replace(self.scene, radar=SceneConfig().radar, wall=None):
             raise TensorsimError("DatasetRecipe.scene: got a radar or a wall, expected them in radars")
@@ -278,8 +278,8 @@ class DatasetRecipe:
             if len({matlab_name(array) for array in arrays}) < len(arrays):
                 raise TensorsimError(
                     f"DatasetRecipe.radars: got the names {names}, expected ones that differ in the first 31 "
-                    "characters of RADAR_OUTPUT: names in .mat files are not longer, and have English letters, digits "
-                    "and '_' alone"
+                    "characters of RADAR_OUTPUT: names in .mat files are at most that long, and have only English "
+                    "letters, digits and '_'"
                 )
         if round(self.duration_s * self.motion_hz) < 2:
             raise TensorsimError(
@@ -293,7 +293,7 @@ class DatasetRecipe:
         unfit = self.outputs.needs_pair if radar.has_array else self.outputs.needs_array
         if unfit:
             raise TensorsimError(
-                f"DatasetRecipe.radars: {view.preset} is {'an' if radar.has_array else 'no'} array, the outputs "
+                f"DatasetRecipe.radars: {view.preset} is {'an' if radar.has_array else 'no'} array, but the outputs "
                 f"{', '.join(self.outputs.kinds)} need {'one' if self.outputs.needs_array else 'one antenna pair'}"
             )
 

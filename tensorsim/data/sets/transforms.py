@@ -23,7 +23,9 @@ class SpecAugment(nn.Module):
     def __init__(self, rows: float = 0.15, columns: float = 0.15) -> None:
         super().__init__()
         if not (0 <= rows <= 1 and 0 <= columns <= 1):
-            raise TensorsimError(f"SpecAugment: got parts {rows} and {columns}, expected numbers from 0 to 1")
+            raise TensorsimError(
+                f"SpecAugment: got shares {rows} and {columns}, expected numbers from 0 to 1"
+            )
         self.rows, self.columns = rows, columns
 
     def forward(self, maps: Tensor) -> Tensor:
@@ -53,7 +55,7 @@ class RandomShift(nn.Module):
     def __init__(self, rows: int = 4, columns: int = 8) -> None:
         super().__init__()
         if rows < 0 or columns < 0:
-            raise TensorsimError(f"RandomShift: got {rows} and {columns}, expected no negative numbers")
+            raise TensorsimError(f"RandomShift: got {rows} and {columns}, expected numbers >= 0")
         self.rows, self.columns = rows, columns
 
     def forward(self, maps: Tensor) -> Tensor:
@@ -85,7 +87,7 @@ class AddNoise(nn.Module):
     def __init__(self, deviation: float = 0.05) -> None:
         super().__init__()
         if not deviation >= 0:
-            raise TensorsimError(f"AddNoise: got the deviation {deviation}, expected no negative number")
+            raise TensorsimError(f"AddNoise: got the deviation {deviation}, expected a number >= 0")
         self.deviation = deviation
 
     def forward(self, maps: Tensor) -> Tensor:

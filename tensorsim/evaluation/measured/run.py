@@ -58,7 +58,7 @@ def lda_logits(train: Tensor, labels: Tensor, test: Tensor, classes: int) -> Ten
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     except ImportError as error:
         raise TensorsimError(
-            f'LDA: scikit-learn cannot be imported ({error}), expected it installed: pip install "tensorsim[train]"'
+            f'LDA: scikit-learn cannot be imported ({error}); install it with: pip install "tensorsim[train]"'
         ) from error
     features = [torch.nn.functional.avg_pool2d(x, 2).flatten(1).double().numpy() for x in (train, test)]
     model = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features[0], labels.numpy())
@@ -122,12 +122,12 @@ class Experiment:
         """
         if len(self.train_labels.unique()) < 2:
             raise TensorsimError(
-                f"{self.measured.name}: got clips of one class to learn from, expected at least two classes"
+                f"{self.measured.name}: got clips of one class to train on, expected at least two classes"
             )
         if torch.equal(self.train, self.test) and torch.equal(self.train_labels, self.test_labels):
             raise TensorsimError(
-                f"{self.measured.name}: got the same clips to learn from and to test on, expected others; without a "
-                "folder to test on the last 30 % of each class are kept for the test"
+                f"{self.measured.name}: got the same clips to train on and to test on, expected different ones; "
+                "without a test folder, the last 30 % of each class are kept for the test"
             )
 
     def full(self) -> dict[str, Tensor]:

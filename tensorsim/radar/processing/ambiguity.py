@@ -119,7 +119,7 @@ class SpeedCheck:
                 )
             warnings.warn(
                 f"positions: some scatterer is beyond {limit_m:.2f} m, {axis}: its beat frequency is above {rate}, "
-                "and it appears too near; leave out people that are so far away",
+                "and it appears too near; leave out people that far away",
                 TensorsimWarning,
                 stacklevel=3,
             )

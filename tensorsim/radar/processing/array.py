@@ -53,7 +53,7 @@ def row_spacing_m(radar: RadarConfig) -> float:
     if step_m <= 0 or bool((steps - steps.new_tensor([step_m, 0.0, 0.0])).abs().max() > 1e-6):
         raise TensorsimError(
             f"radar: got virtual elements at {[[round(v, 5) for v in place] for place in elements.tolist()]} m, "
-            "expected an even row along x, from left to right"
+            "expected an evenly spaced row along x, from left to right"
         )
     return step_m
 

@@ -144,7 +144,7 @@ class BoxCrop(nn.Module):
             )
         if not is_exporting() and not bool(((index >= 0) & (index < images.shape[0])).all()):
             raise TensorsimError(
-                f"BoxCrop index: got a number of no image, expected 0 to {images.shape[0] - 1}"
+                f"BoxCrop index: got a number that belongs to no image, expected 0 to {images.shape[0] - 1}"
             )
         scale, offset = crop_transform(boxes, self.height, self.width, self.padding)
         u = scale * torch.arange(self.width, dtype=boxes.dtype, device=boxes.device) + offset[:, 0:1]

@@ -89,8 +89,8 @@ class OnnxFile(nn.Module):
 
     def __prepare_scriptable__(self) -> NoReturn:
         raise TensorsimError(
-            f"{type(self).__name__}({self.path.name}): cannot be scripted: ONNX Runtime runs it, so it is an edge and "
-            "not a node of the graph; expected an HRNet (HRNet.from_pretrained) as the pose network"
+            f"{type(self).__name__}({self.path.name}): cannot be scripted, because ONNX Runtime runs "
+            "it and it is not part of the graph; expected an HRNet (HRNet.from_pretrained) as the pose network"
         )
 
 
@@ -109,10 +109,10 @@ def open_session(path: Path, threads: int | None = None) -> Any:
         import onnxruntime
     except ImportError as error:
         raise TensorsimError(
-            f"{path.name}: got no ONNX Runtime; install it with `pip install onnxruntime`"
+            f"{path.name}: ONNX Runtime is not installed; install it with `pip install onnxruntime`"
         ) from error
     if not path.is_file():
-        raise TensorsimError(f"{path}: got no such file, expected an ONNX network")
+        raise TensorsimError(f"{path}: no such file, expected an ONNX network")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 0 if threads is None else threads
     try:

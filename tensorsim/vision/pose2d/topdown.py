@@ -140,7 +140,7 @@ class TopDownPose(nn.Module):
         check_rank(boxes, 3, "TopDownPose boxes", "(B, P, 4) xyxy")
         if boxes.shape[0] != images.shape[0]:
             raise TensorsimError(
-                f"TopDownPose: got boxes for {boxes.shape[0]} images, expected for {images.shape[0]}"
+                f"TopDownPose: got boxes for {boxes.shape[0]} images, expected boxes for {images.shape[0]}"
             )
         check_mask(valid, list(boxes.shape[:2]), "TopDownPose valid")
         people = boxes[valid]

@@ -46,7 +46,9 @@ def to_even_time(
     check_shape(times_s, [clips, frames], "times_s")
     check_finite(times_s, "times_s")
     if bool((times_s.diff(dim=1) <= 0).any()):
-        raise TensorsimError("times_s: got times that do not increase from frame to frame, expected them to")
+        raise TensorsimError(
+            "times_s: got times that do not increase from frame to frame, expected increasing ones"
+        )
     since = (times_s - times_s[:, :1]).to(keypoints.device, torch.float64)
     count = int(even_count(since[:, -1].max(), fps))
     even = (torch.arange(count, dtype=torch.float64, device=since.device) / fps).expand(clips, count)

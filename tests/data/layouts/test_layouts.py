@@ -73,8 +73,8 @@ def test_ntu_skeletons(tmp_path: Path) -> None:
     ("change", "message"),
     [
         (lambda text: text[:2000], "cannot be read as NTU"),
-        (lambda text: "", "nobody in its frames"),
-        (lambda text: "3\n0\n0\n0\n", "nobody in its frames"),
+        (lambda text: "", "no people in its frames"),
+        (lambda text: "3\n0\n0\n0\n", "no people in its frames"),
         (lambda text: text.replace("\n25\n", "\n24\n", 1), "24 joints in frame 0"),
         (lambda text: text.replace(" 1036.0", " x", 1), "could not convert"),
     ],
@@ -376,7 +376,7 @@ def test_parts_of_films_are_cut_by_time() -> None:
 
 @pytest.mark.parametrize("kind", ["films", "keypoints", "motion", "ntu", "movi"])
 def test_empty_folders_are_refused(kind: str, tmp_path: Path) -> None:
-    for folder, message in ((tmp_path, "got no clips, expected"), (tmp_path / "none", "got no such folder")):
+    for folder, message in ((tmp_path, "got no clips, expected"), (tmp_path / "none", "no such folder")):
         fps = 30.0 if kind == "keypoints" else None
         source = SourceConfig(kind, str(folder), fps=fps)  # type: ignore[arg-type]
         with pytest.raises(TensorsimError, match=message):

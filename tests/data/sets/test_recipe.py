@@ -68,7 +68,7 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ),
         ("radars: [{preset: nothing}]", "got 'nothing', which is not a file"),
         ("radars: [{}, {}]", "got the names"),
-        ("radars: [{name: front}, {name: Front}]", "expected ones that differ not only in capitals"),
+        ("radars: [{name: front}, {name: Front}]", "expected ones that differ in more than capitals"),
         ("{radars: [{name: é}, {name: è}], storage: {format: mat}}", "English letters"),
         (
             f"{{radars: [{{name: {31 * 'a'}_1}}, {{name: {31 * 'a'}_2}}], storage: {{format: mat}}}}",
@@ -80,7 +80,7 @@ def test_yaml_and_back(tmp_path: Path) -> None:
         ("outputs: {kinds: [doppler]}", "OutputConfig.kinds: got"),
         ("outputs: {kinds: [point_cloud, ridges]}", "outputs of an array"),
         ("outputs: {size: [3]}", "OutputConfig.size"),
-        ("outputs: {size: [64, 64], rate_hz: 20.0}", "OutputConfig.rate_hz: got 20.0 beside a size"),
+        ("outputs: {size: [64, 64], rate_hz: 20.0}", "OutputConfig.rate_hz: got 20.0 together with a size"),
         ("sources: [{kind: keypoints, path: a}]", "SourceConfig.fps: got none for the kind 'keypoints'"),
         ("variations: {spacing_m: -1}", "VariationConfig.spacing_m: got -1"),
         ("split: {shares: [1.5, -0.5, 0.0]}", "SplitConfig.shares: got"),
@@ -382,7 +382,7 @@ def test_one_noise_for_each_radar() -> None:
     ("receivers", "message"),
     [
         (((0.01, 0.0, 1.0),), None),
-        (((0.01, 0.0, 1.0), (0.0, 0.0, 1.0)), "expected an even row along x, from left to right"),
+        (((0.01, 0.0, 1.0), (0.0, 0.0, 1.0)), "expected an evenly spaced row along x, from left to right"),
     ],
 )
 def test_points_of_one_antenna_and_of_a_row_from_right_to_left(
@@ -476,7 +476,7 @@ def test_classes_whose_pictures_have_one_folder_are_refused(tmp_path: Path) -> N
     recipe = small_recipe(sources=(SourceConfig("motion", str(tmp_path)),))
     assert Plan(recipe).labels == ("C", "C++")
     pictures = replace(recipe, storage=StorageConfig("png"), outputs=OutputConfig(kinds=("picture",)))
-    with pytest.raises(TensorsimError, match=r"the classes 'C' and 'C\+\+', which have the same folder"):
+    with pytest.raises(TensorsimError, match=r"the classes 'C' and 'C\+\+', which would share a folder"):
         Plan(pictures)
 
 
@@ -525,7 +525,7 @@ def test_settings_of_walls_without_any_wall_are_named(tmp_path: Path) -> None:
     recipe = small_recipe(**changes, radars=(free,), sources=(SourceConfig("motion", str(tmp_path)),))
     with (
         pytest.warns(
-            TensorsimWarning, match="scene.wall_echo, variations.wall_permittivity, which change nothing"
+            TensorsimWarning, match="scene.wall_echo, variations.wall_permittivity, which have no effect"
         ),
         pytest.raises(TensorsimError, match="got no clips"),
     ):

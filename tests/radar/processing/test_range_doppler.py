@@ -215,7 +215,7 @@ def test_points_of_a_radar_without_range() -> None:
 
 def test_refuses() -> None:
     corner = PRESETS["infineon-bgt60tr13c-array"].radar
-    with pytest.raises(TensorsimError, match="expected an even row along x"):
+    with pytest.raises(TensorsimError, match="expected an evenly spaced row along x"):
         PointDetector(corner)
     with pytest.raises(TensorsimError, match="azimuth_rad: got shape"):
         RangeDopplerAngle(ARRAY, torch.zeros(2, 2))

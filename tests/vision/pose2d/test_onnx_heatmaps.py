@@ -120,7 +120,7 @@ def test_gives_no_gradients(tmp_path: Path) -> None:
 def test_says_that_it_is_an_edge_when_scripted(tmp_path: Path) -> None:
     network = OnnxHeatmaps(write_network(tmp_path / "network.onnx"))
     for module in (network, TopDownPose(network), TopDownPose(network, flip_test=True)):
-        with pytest.raises(TensorsimError, match="an edge and not a node of the graph; expected an HRNet"):
+        with pytest.raises(TensorsimError, match="it is not part of the graph; expected an HRNet"):
             torch.jit.script(module)
 
 

@@ -179,7 +179,7 @@ def test_files_with_these_outputs_are_taken_for_rtmpose(tmp_path: Path) -> None:
     images, valid = picture(PLACES), torch.ones(2, 1, dtype=torch.bool)
     restored = pickle.loads(pickle.dumps(pose))
     assert torch.equal(restored(images, BOXES, valid)[0], pose(images, BOXES, valid)[0])
-    with pytest.raises(TensorsimError, match="an edge and not a node of the graph"):
+    with pytest.raises(TensorsimError, match="it is not part of the graph"):
         torch.jit.script(pose)
 
 

@@ -82,7 +82,7 @@ class TestTopDownPose(StageTester):
             ((images * float("nan"), boxes, valid), "NaN"),
             ((images, boxes[0], valid), "boxes: got shape"),
             ((images, boxes[..., :3], valid), "boxes: got shape"),
-            ((images[:2], boxes, valid), "boxes for 3 images, expected for 2"),
+            ((images[:2], boxes, valid), "boxes for 3 images, expected boxes for 2"),
             ((images, boxes * float("inf"), valid), "finite"),
             ((images, boxes * 0, valid), "without area"),
             ((images, boxes.long(), valid), "boxes: got dtype torch.int64"),
