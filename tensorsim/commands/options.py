@@ -231,12 +231,12 @@ def load_recognizer(config: "SimulationConfig") -> "ActivityRecognizer | None":
     resolution_m_s = radar.doppler_wavelength_m / 2 / config.processing.window_s
     if radar.unambiguous_speed_m_s < 0.9 * recognizer.speed_m_s:
         unlike = (
-            f"sees speeds up to {radar.unambiguous_speed_m_s:.2g} m/s, the classifier was trained on speeds up to "
+            f"sees speeds up to {radar.unambiguous_speed_m_s:.2g} m/s, but the classifier was trained on speeds up to "
             f"{recognizer.speed_m_s:.2g} m/s"
         )
     elif resolution_m_s > COARSEST_M_S:
         unlike = (
-            f"resolves speeds {resolution_m_s:.2g} m/s apart, the classifier was trained on radars that resolve "
+            f"resolves speeds {resolution_m_s:.2g} m/s apart, but the classifier was trained on radars that resolve "
             f"{COARSEST_M_S:.2g} m/s or less"
         )
     if unlike is not None:
@@ -254,10 +254,13 @@ def _unlike_training(config: "SimulationConfig", recognizer: "ActivityRecognizer
     unlike = []
     if config.processing.integration == "paper":
         unlike.append(
-            "integration 'paper' folds approaching and receding motion, the classifier was trained on signed Doppler"
+            "integration 'paper' folds approaching and receding motion, but the classifier was trained on signed "
+            "Doppler"
         )
     if config.scene.interference is not None:
-        unlike.append("another radar interferes, the shipped classifiers were trained without interference")
+        unlike.append(
+            "another radar interferes, but the shipped classifiers were trained without interference"
+        )
     one_channel = config.scene.receiver.real and config.scene.radar.range_resolution_m > COARSEST_M
     if one_channel and isinstance(recognizer.network, SPNet):
         unlike.append(
@@ -273,7 +276,7 @@ def warn_of_label(recognizer: "ActivityRecognizer | None", people: int, duration
         return
     if people > 0 and duration_s < SHORTEST_S:
         warnings.warn(
-            f"the label is unreliable: the scene lasts {duration_s:.3g} s, the shipped classifiers were trained on "
+            f"the label is unreliable: the scene lasts {duration_s:.3g} s, but the shipped classifiers were trained on "
             "clips of 2.4 to 5 s",
             TensorsimWarning,
             stacklevel=2,

@@ -82,7 +82,7 @@ class PanelOptions:
     min_detection_size: Option[float] = None
     """Minimum width and height of a detection in pixels. Default: 5."""
     detection_interval: Option[int] = None
-    """The detector runs on every n-th frame. Default: 2."""
+    """Run the detector on every n-th frame, less often from 45 frames per second. Default: 2."""
     max_tracks: Option[int] = None
     """Maximum number of people tracked at once. Default: 5."""
     confirmation_hits: Option[int] = None

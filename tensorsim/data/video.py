@@ -265,8 +265,8 @@ class VideoReader:
         self.uneven_times_s = times_s if late_s else None
         if late_s:
             warnings.warn(
-                f"{self.path}: its frames are up to {late_s:.2f} s away from even times, {self.fps:.4g} per second: "
-                "motion is interpolated to these; give fps to take the frames as evenly spaced",
+                f"{self.path}: its frames are up to {late_s:.2f} s away from even times at {self.fps:.4g} per second: "
+                "motion is interpolated to these times; give fps to treat the frames as evenly spaced",
                 TensorsimWarning,
                 stacklevel=3,
             )

@@ -324,7 +324,7 @@ def test_uneven_times_are_said(tmp_path: Path) -> None:
     durations[8] = 2000
     pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=durations)
     with pytest.warns(
-        TensorsimWarning, match=r"a\.gif: .* up to 1\.96 s away from even times, 25 per second"
+        TensorsimWarning, match=r"a\.gif: .* up to 1\.96 s away from even times at 25 per second"
     ):
         read(tmp_path / "a.gif")
     # Before the pause all is even, and a rate that is given is taken.

@@ -93,7 +93,7 @@ class VariationConfig:
             value = getattr(self, name)
             if value is not None and not (len(value) == 2 and least <= value[0] <= value[1] <= most):
                 raise TensorsimError(
-                    f"VariationConfig.{name}: got {list(value)}, expected two numbers that ascend within {least} to "
+                    f"VariationConfig.{name}: got {list(value)}, expected two ascending numbers within {least} to "
                     f"{most}"
                 )
         if not (is_finite(self.spacing_m) and 0 <= self.spacing_m <= 1000):
