@@ -270,7 +270,7 @@ def test_denoisers_of_one_name_are_two_rows(tmp_path: Path, capsys: pytest.Captu
         ({"scenes": ()}, "--scenes: got 0"),
         ({"seed": -1}, "--seed: got -1"),
         ({"out": Path("nowhere/table.csv")}, "--out: got nowhere/table.csv"),
-        ({"out": Path(".")}, "--out: got ., expected the name of a file"),
+        ({"out": Path(".")}, "--out: got ., expected a file name in an existing folder"),
     ],
 )
 def test_bad_options_of_denoisers_are_refused_before_work_starts(
