@@ -16,6 +16,7 @@ from tensorsim.exceptions import TensorsimWarning as TensorsimWarning
 from tensorsim.exceptions import check_choice as check_choice
 from tensorsim.exceptions import check_count as check_count
 from tensorsim.exceptions import check_distinct as check_distinct
+from tensorsim.exceptions import check_not_negative as check_not_negative
 from tensorsim.exceptions import check_positive as check_positive
 from tensorsim.exceptions import check_seed as check_seed
 from tensorsim.exceptions import collected_warnings as collected_warnings

@@ -25,6 +25,14 @@ def check_positive(value: float, name: str) -> None:
         raise TensorsimError(f"{name}: got {value}, expected a positive finite number")
 
 
+def check_not_negative(value: float, name: str) -> None:
+    """Refuse anything but a number that is finite and not below zero."""
+    if not isinstance(value, float):
+        value = _number(value, name)
+    if not (value >= 0.0 and value < float("inf")):
+        raise TensorsimError(f"{name}: got {value}, expected a finite number >= 0")
+
+
 def _number(value: Any, name: str) -> Any:
     """The value if it can be compared as a single number; refuses strings, None, booleans and several numbers."""
     try:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import TensorsimError, check_floating, check_positive
+from tensorsim.errors import TensorsimError, check_floating, check_not_negative, check_positive
 
 
 def sinusoids(time_s: Tensor, frequency_hz: Tensor, amplitude: Tensor, phase: Tensor) -> Tensor:
@@ -84,8 +84,7 @@ class RandomProcess(nn.Module):
         check_positive(band_hz[0], "band_hz")
         if not band_hz[0] < band_hz[1] < math.inf:
             raise TensorsimError(f"band_hz: got {band_hz}, expected ascending positive frequencies")
-        if not 0 <= rms < math.inf:
-            raise TensorsimError(f"rms: got {rms}, expected a finite number >= 0")
+        check_not_negative(rms, "rms")
         if copies < 1 or count < 1:
             raise TensorsimError(f"copies, count: got {copies} and {count}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)

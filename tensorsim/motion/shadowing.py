@@ -1,12 +1,10 @@
 """Shadowing of people by others in front of them."""
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from tensorsim.config import JOINTS, Vector
-from tensorsim.errors import TensorsimError, check_positive
+from tensorsim.errors import check_not_negative, check_positive
 from tensorsim.motion.scatterers import check_antenna, check_people, weights
 
 
@@ -94,8 +92,7 @@ class Shadowing(nn.Module):
         check_antenna("rx_m", rx_m)
         check_positive(radius_m, "radius_m")
         for name, value in (("attenuation_db", attenuation_db), ("edge_m", edge_m)):
-            if not 0 <= value < math.inf:
-                raise TensorsimError(f"{name}: got {value}, expected a finite number >= 0")
+            check_not_negative(value, name)
         self.scatterers = scatterers
         self.attenuation_db = attenuation_db
         self.radius_m = radius_m

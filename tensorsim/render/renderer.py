@@ -12,7 +12,14 @@ from torch import Tensor
 
 from tensorsim.config import CameraConfig
 from tensorsim.device import one_thread
-from tensorsim.errors import TensorsimError, check_finite, check_floating, check_mask, check_not_empty
+from tensorsim.errors import (
+    TensorsimError,
+    check_finite,
+    check_floating,
+    check_mask,
+    check_not_empty,
+    check_not_negative,
+)
 from tensorsim.progress import progress_bar
 from tensorsim.render.body import REFERENCE_HEIGHT_M, Body, build_body
 from tensorsim.render.cast import View, Volumes, cast
@@ -82,8 +89,7 @@ class PersonRenderer:
         if height < 16 or width < 16:
             raise TensorsimError(f"PersonRenderer: got {height} x {width} pixels, expected at least 16 x 16")
         for name, value in (("blur_px", blur_px), ("noise", noise)):
-            if not 0 <= value < math.inf:
-                raise TensorsimError(f"PersonRenderer.{name}: got {value}, expected a finite number >= 0")
+            check_not_negative(value, f"PersonRenderer.{name}")
         if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
             raise TensorsimError(
                 f"PersonRenderer.jpeg_quality: got {jpeg_quality}, expected 1 to 100 or None"

@@ -16,6 +16,7 @@ from tensorsim.errors import (
     TensorsimError,
     check_count,
     check_finite,
+    check_not_negative,
     check_points,
     check_positive,
     check_shape,
@@ -158,8 +159,7 @@ class NearestPoseLifter(nn.Module):
         for name, angle in (("pitch_rad", pitch_rad), ("roll_rad", roll_rad)):
             if not math.isfinite(angle):
                 raise TensorsimError(f"NearestPoseLifter.{name}: got {angle}, expected a finite angle")
-        if not 0 <= temporal < float("inf"):
-            raise TensorsimError(f"NearestPoseLifter.temporal: got {temporal}, expected a finite number >= 0")
+        check_not_negative(temporal, "NearestPoseLifter.temporal")
         self.neighbours, self.tolerance = neighbours, tolerance
         self.temporal, self.search_joints = temporal, search_joints
         # Per frame, at 30 frames a second: a limb that moves at 1.6 m/s, in body heights; somebody 4 m away who

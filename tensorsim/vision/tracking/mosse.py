@@ -21,6 +21,7 @@ from tensorsim.errors import (
     check_finite,
     check_floating,
     check_mask,
+    check_not_negative,
     check_positive,
     check_rank,
     check_shape,
@@ -101,10 +102,7 @@ class MosseTracker(nn.Module):
         check_positive(sigma, "MosseTracker.sigma")
         check_count(size, "MosseTracker.size", 16)
         check_count(max_tracks, "MosseTracker.max_tracks")
-        if not 0 <= least_ratio < math.inf:
-            raise TensorsimError(
-                f"MosseTracker.least_ratio: got {least_ratio}, expected a finite number >= 0"
-            )
+        check_not_negative(least_ratio, "MosseTracker.least_ratio")
         self.learning_rate, self.least_ratio, self.start_score = learning_rate, least_ratio, start_score
         self.size, self.max_tracks, self.epsilon = size, max_tracks, _EPSILON
         hann = torch.hann_window(size + 2, periodic=False)[1:-1]
