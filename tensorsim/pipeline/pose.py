@@ -23,10 +23,10 @@ from tensorsim.ops import times_as_fast
 from tensorsim.pipeline.networks import pretrained_detector, pretrained_lifter, pretrained_pose, top_down
 from tensorsim.protocols import check_detections, check_instance, check_part
 from tensorsim.types import Detections, Pose, Tracks
-from tensorsim.vision.lifting.hidden_legs import HiddenLegs
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
+from tensorsim.vision.lifting.walking_legs import WalkingLegs
 from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within, gaps_with, where_any
 from tensorsim.vision.smoothing.even_time import even_count, to_even_time
 from tensorsim.vision.smoothing.kalman import KalmanSmoother
@@ -121,7 +121,7 @@ class VideoToPose(nn.Module):
             check_instance(bone_fit, nn.Module, "bone_fit")
         self.bone_fit = bone_fit
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
-        self.hidden_legs = HiddenLegs()
+        self.walking_legs = WalkingLegs()
         self.keypoint_threshold = keypoint_threshold
         self.brief_gap_s = brief_gap_s
         #: People hidden for longer are absent until they are seen again.
@@ -425,7 +425,7 @@ class VideoToPose(nn.Module):
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = self.smoother(joints, measured, fps, noise)
         if self.temporal is not None:  # a matched pose brings its own legs
-            joints = self.hidden_legs(joints, reliable, there, fps)
+            joints = self.walking_legs(joints, reliable, there, fps)
         joints = limit_speed(joints, fps, self.top_speed_m_s)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)
 

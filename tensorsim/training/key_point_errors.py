@@ -1,7 +1,7 @@
 """Simulated key points as networks find them in films from any camera, and the motion that the pipeline makes of them.
 
 Networks do not err at random: a hidden arm stays in the wrong place for as long as it is hidden, left and right are
-mixed up for a while, a wrist or ankle jumps to something else for a moment, people who lie down are lost. Sizes of
+mixed up for a while, the leg that is ahead is called left at every step, a wrist or ankle jumps to something else for a moment, people who lie down are lost. Sizes of
 errors are fractions of the body's height in the picture.
 """
 
@@ -138,6 +138,13 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
     far = (depth > depth[:, list(MIRRORED)] + 0.06)[..., None] & (torch.arange(17) > 6)[:, None]
     merged = near & far & _spell(frames, 0.4, 0.2, 1.0, each).T[..., None]
     found = torch.where(merged, other, found)
+    # Where legs seen from the side pass each other, the one ahead in the picture is called left, or right, throughout.
+    side_on = (true[:, 11, 0] - true[:, 12, 0]).abs() < 0.06 * unit[:, 0, 0]
+    left_ahead = true[:, 15, 0] > true[:, 16, 0]
+    usual = (draw(0.0, 1.0) < 0.5)[0]
+    exchanged = side_on & (left_ahead != usual) & _spell(frames, 0.4, 0.3, 1.2, draw)[0]
+    legs = torch.arange(17) > 12
+    found = torch.where((exchanged[:, None] & legs)[..., None], found[:, list(MIRRORED)], found)
     for group in MIXED_UP:
         mixed = torch.zeros(17, dtype=torch.bool)
         mixed[list(group)] = True
@@ -152,9 +159,9 @@ def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filmin
     found = torch.where(jumps[..., None], landed, found)
 
     inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
-    usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
+    confidence = torch.tensor(USUAL_SCORES, dtype=torch.float64)
     # Networks are almost as confident of wrong points.
-    scores = usual - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
+    scores = confidence - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
     scores = (scores - jumps * each(0.15, 0.25, frames).T).clamp(0.35, 0.98)
     scores = torch.where(merged[..., 0], scores - 0.2, scores)
     hidden = _spell(frames, 0.06, 0.1, 1.0, each).T

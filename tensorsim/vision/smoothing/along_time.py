@@ -1,5 +1,7 @@
 """Filters along the time of tracks: gap filling, robust smoothing, running quantiles."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -111,6 +113,13 @@ def _convolved(rows: Tensor, kernels: Tensor, most: int = 2**23) -> Tensor:
         stop = min(start + piece, frames)
         parts.append(F.conv1d(padded[..., start : stop + 2 * radius], kernels))
     return torch.cat(parts, dim=-1)
+
+
+def gaussian_mean(x: Tensor, sigma: float) -> Tensor:
+    """Values (..., T) averaged with a Gaussian of ``sigma`` frames, truncated at 4 sigma; zero beyond the ends."""
+    kernel = _kernel(sigma, x.shape[-1], x)[1]
+    rows = x.reshape(-1, 1, x.shape[-1])
+    return _convolved(rows, (kernel / (sigma * math.sqrt(2 * math.pi)))[None, None]).reshape(x.shape)
 
 
 def local_linear(x: Tensor, weights: Tensor, sigma: float, ridge: Tensor | None = None) -> Tensor:

@@ -11,7 +11,7 @@ from tensorsim.body.gait import boulic_gait
 from tensorsim.body.kinematics import rotation
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
-from tensorsim.vision.lifting.hidden_legs import HiddenLegs
+from tensorsim.vision.lifting.walking_legs import WalkingLegs
 from tests.stage import StageTester
 
 FPS = 30.0
@@ -45,12 +45,12 @@ def speeds(joints: Tensor) -> Tensor:
     return (joints[1:, [10, 13]] - joints[:-1, [10, 13]]).norm(dim=-1) * FPS
 
 
-class TestHiddenLegs(StageTester):
+class TestWalkingLegs(StageTester):
     batched_arguments = (0, 1, 2)
     gradient_arguments = (0,)
 
     def make(self) -> nn.Module:
-        return HiddenLegs()
+        return WalkingLegs()
 
     def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
         generator = torch.Generator().manual_seed(0)
@@ -75,7 +75,7 @@ def test_hidden_legs_step_as_true_ones(heading: float) -> None:
     """Feet swing as fast, and one of them stands meanwhile, as the cadence belongs to the speed."""
     walk = generated("walking", heading)
     hung = hanging(walk)
-    legs = HiddenLegs()(hung, *masks(walk), FPS)
+    legs = WalkingLegs()(hung, *masks(walk), FPS)
     inner = slice(20, -20)  # blended at the ends
     assert torch.equal(legs[:, [0, 1, 2, 3, 4, 5, 6, 7, 8, 11]], walk[:, [0, 1, 2, 3, 4, 5, 6, 7, 8, 11]])
     true, found, glide = (speeds(joints[inner]) for joints in (walk, legs, hung))
@@ -92,7 +92,7 @@ def test_legs_of_unlike_lengths_keep_in_step() -> None:
     ahead = 1.2 * torch.arange(900, dtype=torch.float64)[:, None, None] / FPS
     walk = hanging(generated("walking"))[:1] + ahead * torch.tensor([0.0, 1.0, 0.0])
     walk[:, 12:14, 2] += 0.08
-    legs = HiddenLegs()(walk, *masks(walk), FPS)[-80:-20]
+    legs = WalkingLegs()(walk, *masks(walk), FPS)[-80:-20]
     swing = (legs[:, [10, 13]] - legs[:, [8, 11]])[..., 1]
     swing = swing - swing.mean(dim=0)
     assert float((swing[:, 0] * swing[:, 1]).sum()) < -0.5 * float(swing[:, 0].square().sum())
@@ -100,7 +100,7 @@ def test_legs_of_unlike_lengths_keep_in_step() -> None:
 
 def test_backwards_knees_bend_forwards_still() -> None:
     walk = hanging(generated("walking")).flip(0)
-    legs = HiddenLegs()(walk, *masks(walk), FPS)[20:-20]
+    legs = WalkingLegs()(walk, *masks(walk), FPS)[20:-20]
     right = (legs[:, 8] - legs[:, 11])[:, :2]
     facing = torch.nn.functional.normalize(torch.stack([-right[:, 1], right[:, 0]], dim=-1), dim=-1)
     for hip in (8, 11):
@@ -111,7 +111,7 @@ def test_backwards_knees_bend_forwards_still() -> None:
 @pytest.mark.parametrize("activity", ["punching", "sitting down", "grabbing", "rotating"])
 def test_who_stays_does_not_step(activity: str) -> None:
     still = hanging(generated(activity))
-    torch.testing.assert_close(HiddenLegs()(still, *masks(still), FPS), still)
+    torch.testing.assert_close(WalkingLegs()(still, *masks(still), FPS), still)
 
 
 @pytest.mark.parametrize("turned_deg", [-120.0, -50.0, 50.0, 90.0])
@@ -121,7 +121,7 @@ def test_who_seems_to_face_another_way_steps_along_the_path(turned_deg: float) -
     middle = walk[:, [8, 11]].mean(dim=1, keepdim=True)
     turn = rotation(2, torch.tensor(math.radians(turned_deg), dtype=torch.float64))
     glides = (hanging(walk) - middle) @ turn.mT + middle
-    legs = HiddenLegs()(glides, *masks(glides), FPS)[20:-20]
+    legs = WalkingLegs()(glides, *masks(glides), FPS)[20:-20]
     swing = (legs[:, [10, 13]] - legs[:, [8, 11]]).var(dim=0)
     assert float(swing[:, 1].amin()) > 0.01 > 4 * float(swing[:, 0].amax())  # m^2; the path is along y
     assert float(speeds(legs).amax()) == pytest.approx(float(speeds(walk[20:-20]).amax()), rel=0.1)
@@ -132,7 +132,7 @@ def test_legs_of_who_turns_round_on_the_way_do_not_jump() -> None:
     middle = walk[:, [8, 11]].mean(dim=1, keepdim=True)
     turns = rotation(2, torch.linspace(0, math.pi, len(walk), dtype=torch.float64))
     turning = (walk - middle) @ turns.mT + middle
-    legs = HiddenLegs()(turning, *masks(turning), FPS)
+    legs = WalkingLegs()(turning, *masks(turning), FPS)
     assert not torch.equal(legs[20:40], turning[20:40])
     assert not torch.equal(legs[-40:-20], turning[-40:-20])
     assert float(speeds(legs).amax()) < 1.3 * float(speeds(generated("walking")).amax())
@@ -140,7 +140,7 @@ def test_legs_of_who_turns_round_on_the_way_do_not_jump() -> None:
 
 def test_only_hidden_legs_of_upright_people_change() -> None:
     walk = generated("walking")
-    legs, (seen, valid) = HiddenLegs(), masks(walk)
+    legs, (seen, valid) = WalkingLegs(), masks(walk)
     assert torch.equal(legs(walk, *masks(walk, hidden=False), FPS), walk)
     assert torch.equal(legs(walk, seen, torch.zeros_like(valid), FPS), walk)
     lying = walk @ rotation(0, torch.tensor(math.pi / 2, dtype=torch.float64)).mT
@@ -161,13 +161,13 @@ def test_angles_are_those_of_the_gait_model() -> None:
     phase = torch.linspace(0, 2, 101, dtype=torch.float64)
     for relative_speed in (0.4, 1.25, 2.0):
         gait = boulic_gait(torch.tensor(relative_speed, dtype=torch.float64), phase)
-        hip, knee = HiddenLegs()._angles(torch.full_like(phase, relative_speed), phase).unbind(-1)
+        hip, knee = WalkingLegs()._angles(torch.full_like(phase, relative_speed), phase).unbind(-1)
         assert float((hip - gait.hip[..., 0]).abs().amax()) < math.radians(1.0)
         assert float((knee - gait.knee[..., 0]).abs().amax()) < math.radians(2.5)
 
 
 def test_refuses_speeds_out_of_order() -> None:
     with pytest.raises(TensorsimError, match="walking_m_s"):
-        HiddenLegs(slow_m_s=0.6, walking_m_s=0.5)
+        WalkingLegs(slow_m_s=0.6, walking_m_s=0.5)
     with pytest.raises(TensorsimError, match="slow_m_s"):
-        HiddenLegs(slow_m_s=0.0)
+        WalkingLegs(slow_m_s=0.0)
