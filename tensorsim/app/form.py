@@ -34,6 +34,7 @@ _MORE = {
         "end",
         "stride",
         "flip_test",
+        "walking_legs",
         "image_size",
     ],
     "MOTION CAPTURE": ["clip", "heading"],
@@ -50,6 +51,7 @@ _OTHERWISE: dict[str, dict[str, Any]] = {
     "wall_echo": _OFF,
     "calibrate": _ON,
     "flip_test": _ON,
+    "walking_legs": _ON,
     # The command also takes weight files; users of the app must not read files on the machine that runs it.
     "denoiser": {
         "label": "Denoiser",

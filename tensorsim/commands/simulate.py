@@ -50,6 +50,7 @@ _MEANT_FOR = {
     "position": ("video", "keypoints"),
     "lifter": ("video", "keypoints"),
     "library": ("video", "keypoints"),
+    "walking_legs": ("video", "keypoints"),
     "image_size": ("keypoints",),
     "clip": ("motion",),
     "heading": ("motion",),
@@ -88,6 +89,9 @@ class Simulate(NetworkOptions, ClipOptions):
     library. Default: temporal."""
     library: Option[Path] = None
     """Pose library for the nearest lifter, as written by `tensorsim library build`. Default: the shipped one."""
+    walking_legs: Option[bool] = None
+    """Give the legs of people who walk the steps of a gait model where the film shows too little of them (temporal
+    lifter only). Default: on."""
     per_person: bool = False
     """With several people in the scene, also simulate and label each one alone: maps_person_N.npz and
     doppler_time_person_N.png, with N as in the overlay."""
@@ -177,6 +181,7 @@ class Simulate(NetworkOptions, ClipOptions):
             ("pose__position", self.position),
             ("pose__lifter", self.lifter if self.library is None or self.lifter is not None else "nearest"),
             ("pose__library", None if self.library is None else str(self.library)),
+            ("pose__walking_legs", self.walking_legs),
         ):
             if value is not None:
                 config = config.replace(**{field: value})

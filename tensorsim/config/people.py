@@ -99,6 +99,8 @@ class PoseConfig:
         temporal: nearest lifter only: weight of the change between frames when choosing poses; 0 matches each frame
             on its own.
         fewest_joints: how many of the 14 joints must be seen for a frame to be used.
+        walking_legs: temporal lifter only: give the legs of people who walk the steps of a gait model where the film
+            shows too little of them; see :class:`tensorsim.vision.WalkingLegs`.
         people: who is simulated: ``"all"``, ``"moving"``, ``"nearest"`` or a person's number from 1.
 
     Raises:
@@ -120,6 +122,7 @@ class PoseConfig:
     neighbours: int = 128
     temporal: float = 1.0
     fewest_joints: int = 5
+    walking_legs: bool = True
     people: str = "all"
 
     def __post_init__(self) -> None:

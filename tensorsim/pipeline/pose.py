@@ -61,6 +61,8 @@ class VideoToPose(nn.Module):
             camera.
         bone_fit: a :class:`~tensorsim.vision.lifting.bone_fit.BoneFit` between ``metric_pose`` and ``smoother``, for
             exact keypoints; None leaves it out.
+        walking_legs: with a :class:`~tensorsim.vision.TemporalLifter`, give the legs of people who walk the steps of a
+            gait model where they are seen too little; see :class:`~tensorsim.vision.WalkingLegs`.
 
     Raises:
         TensorsimError: numbers out of range; a ``metric_pose`` together with heights, distances or a camera; parts that
@@ -86,6 +88,7 @@ class VideoToPose(nn.Module):
         metric_pose: nn.Module | None = None,
         smoother: nn.Module | None = None,
         bone_fit: nn.Module | None = None,
+        walking_legs: bool = True,
     ) -> None:
         super().__init__()
         self.detection_interval = check_count(detection_interval, "detection_interval")
@@ -121,7 +124,8 @@ class VideoToPose(nn.Module):
             check_instance(bone_fit, nn.Module, "bone_fit")
         self.bone_fit = bone_fit
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
-        self.walking_legs = WalkingLegs()
+        # A matched pose brings its own legs.
+        self.walking_legs = WalkingLegs() if walking_legs and self.temporal is not None else None
         self.keypoint_threshold = keypoint_threshold
         self.brief_gap_s = brief_gap_s
         #: People hidden for longer are absent until they are seen again.
@@ -159,6 +163,7 @@ class VideoToPose(nn.Module):
             keypoint_threshold=people.keypoint_threshold,
             detection_interval=tracking.detection_interval,
             fewest_joints=people.fewest_joints,
+            walking_legs=people.walking_legs,
             brief_gap_s=smoothing.brief_gap_s,
             tracker=GNNTracker(
                 max_tracks=tracking.max_tracks,
@@ -424,7 +429,7 @@ class VideoToPose(nn.Module):
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = self.smoother(joints, measured, fps, noise)
-        if self.temporal is not None:  # a matched pose brings its own legs
+        if self.walking_legs is not None:
             joints = self.walking_legs(joints, reliable, there, fps)
         joints = limit_speed(joints, fps, self.top_speed_m_s)
         return Pose(tracks.boxes, keypoints, scores, joints, tracks.valid & there)

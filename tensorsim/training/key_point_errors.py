@@ -1,8 +1,8 @@
 """Simulated key points as networks find them in films from any camera, and the motion that the pipeline makes of them.
 
 Networks do not err at random: a hidden arm stays in the wrong place for as long as it is hidden, left and right are
-mixed up for a while, the leg that is ahead is called left at every step, a wrist or ankle jumps to something else for a moment, people who lie down are lost. Sizes of
-errors are fractions of the body's height in the picture.
+mixed up for a while, the leg that is ahead is called left at every step, a wrist or ankle jumps to something else for a
+moment, people who lie down are lost. Sizes of errors are fractions of the body's height in the picture.
 """
 
 import math

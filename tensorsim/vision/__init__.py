@@ -9,6 +9,7 @@ from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
+from tensorsim.vision.lifting.walking_legs import WalkingLegs
 from tensorsim.vision.pose2d.cpm import CPM
 from tensorsim.vision.pose2d.hrnet import HRNet
 from tensorsim.vision.pose2d.onnx_heatmaps import OnnxHeatmaps
@@ -37,5 +38,6 @@ __all__ = [
     "TopDownPose",
     "VideoPose3D",
     "VideoPoseLifter",
+    "WalkingLegs",
     "coco_to_body",
 ]

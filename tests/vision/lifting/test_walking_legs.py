@@ -1,4 +1,4 @@
-"""Hidden legs: they step as those of the gait model do, and all that is seen, or does not walk, stays as it is."""
+"""Legs of walkers step as those of the gait model do; what swings by itself, or does not walk, stays as it is."""
 
 import math
 from typing import Any
@@ -16,6 +16,7 @@ from tests.stage import StageTester
 
 FPS = 30.0
 LEGS = [9, 10, 12, 13]
+MIRRORED_LEGS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 13, 11, 9, 10]
 
 
 def generated(activity: str, heading_deg: float = 0.0, seed: int = 3) -> Tensor:
@@ -38,6 +39,24 @@ def masks(joints: Tensor, hidden: bool = True) -> tuple[Tensor, Tensor]:
     seen = torch.ones(joints.shape[:-1], dtype=torch.bool)
     seen[..., LEGS] = not hidden
     return seen, torch.ones(joints.shape[:-2], dtype=torch.bool)
+
+
+def swinging(joints: Tensor, share: float) -> Tensor:
+    """The same people with legs that swing ``share`` times as far from straight ones."""
+    straight = hanging(joints)
+    legs = straight + share * (joints - straight)
+    return torch.where(torch.isin(torch.arange(14), torch.tensor(LEGS))[:, None], legs, joints)
+
+
+def exchanged(joints: Tensor, frames: Tensor) -> Tensor:
+    """The same people with knees and ankles of the other side in some frames (T,)."""
+    return torch.where(frames[:, None, None], joints[:, MIRRORED_LEGS], joints)
+
+
+def nearest_way(found: Tensor, true: Tensor) -> float:
+    """Mean distance in m of knees and ankles from true ones, about their hips, whichever leg is called right."""
+    found, true = (joints[:, LEGS] - joints[:, [8, 8, 11, 11]] for joints in (found, true))
+    return min(float((found - one).norm(dim=-1).mean()) for one in (true, true[:, [2, 3, 0, 1]]))
 
 
 def speeds(joints: Tensor) -> Tensor:
@@ -85,6 +104,64 @@ def test_hidden_legs_step_as_true_ones(heading: float) -> None:
     for first, second in ((8, 9), (9, 10), (11, 12), (12, 13)):
         bone = (legs[inner, first] - legs[inner, second]).norm(dim=-1)
         torch.testing.assert_close(bone, (hung[inner, first] - hung[inner, second]).norm(dim=-1))
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("heading", [0.0, 90.0, 200.0])
+def test_legs_that_swing_too_little_step_in_phase(heading: float, seed: int) -> None:
+    walk = generated("walking", heading, seed)
+    seen, valid = masks(walk, hidden=False)
+    shrunk = swinging(walk, 0.4)
+    legs = WalkingLegs()(shrunk, seen, valid, FPS)
+    inner = slice(20, -20)
+    assert nearest_way(legs[inner], walk[inner]) < 0.6 * nearest_way(shrunk[inner], walk[inner])
+    true, found = speeds(walk[inner]), speeds(legs[inner])
+    assert found.amax() == pytest.approx(float(true.amax()), rel=0.15)
+    assert (found - true).square().mean().sqrt() < 0.4 * true.square().mean().sqrt()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_phase_does_not_depend_on_which_leg_is_called_right(share: float) -> None:
+    """The leading leg is called left at every step, or any leg is called any: the same two legs step."""
+    walk = generated("walking", 70.0)
+    masked = masks(walk, hidden=False)
+    legs = WalkingLegs()(swinging(walk, share), *masked, FPS)
+    ahead = walk[-1, 8] - walk[0, 8]
+    leading = ((walk[:, 10] - walk[:, 13]) @ ahead) > 0
+    random = torch.rand(len(walk), generator=torch.Generator().manual_seed(1)) < 0.5
+    for frames in (leading, random):
+        confused = WalkingLegs()(exchanged(swinging(walk, share), frames), *masked, FPS)
+        assert nearest_way(confused[20:-20], legs[20:-20]) < 0.05
+        assert nearest_way(confused[20:-20], walk[20:-20]) < 0.1
+
+
+def test_hidden_legs_step_in_phase_with_seen_ones() -> None:
+    """For a second they are beyond the picture; the phase carries on from before and after."""
+    walk = generated("walking", 30.0)
+    hides = (torch.arange(len(walk)) >= 50) & (torch.arange(len(walk)) < 80)
+    joints = torch.where(hides[:, None, None], hanging(walk), swinging(walk, 0.5))
+    seen, valid = masks(walk, hidden=False)
+    seen[..., LEGS] &= ~hides[:, None]
+    legs = WalkingLegs()(joints, seen, valid, FPS)
+    assert nearest_way(legs[50:80], walk[50:80]) < 0.12
+    assert nearest_way(legs[20:-20], walk[20:-20]) < 0.1
+
+
+def test_legs_that_do_not_swing_at_all_are_left() -> None:
+    """Somebody on a skateboard, or carried."""
+    walk = generated("walking")
+    glides = hanging(walk)
+    torch.testing.assert_close(WalkingLegs()(glides, *masks(walk, hidden=False), FPS), glides)
+
+
+def test_runners_are_left() -> None:
+    walk = generated("walking")
+    seen, valid = masks(walk, hidden=False)
+    shrunk = swinging(walk, 0.5)
+    assert not torch.equal(WalkingLegs()(shrunk, seen, valid, FPS), shrunk)
+    hips = shrunk[:, [8, 11]].mean(dim=1, keepdim=True) * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    run = shrunk + 2.0 * (hips - hips[:1])
+    torch.testing.assert_close(WalkingLegs()(run, seen, valid, FPS), run)
 
 
 def test_legs_of_unlike_lengths_keep_in_step() -> None:
@@ -169,5 +246,8 @@ def test_angles_are_those_of_the_gait_model() -> None:
 def test_refuses_speeds_out_of_order() -> None:
     with pytest.raises(TensorsimError, match="walking_m_s"):
         WalkingLegs(slow_m_s=0.6, walking_m_s=0.5)
-    with pytest.raises(TensorsimError, match="slow_m_s"):
-        WalkingLegs(slow_m_s=0.0)
+    with pytest.raises(TensorsimError, match="running_m_s"):
+        WalkingLegs(running_m_s=0.5)
+    for name in ("slow_m_s", "blend_s", "mean_s"):
+        with pytest.raises(TensorsimError, match=name):
+            WalkingLegs(**{name: 0.0})
