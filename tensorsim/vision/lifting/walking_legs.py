@@ -31,7 +31,7 @@ class WalkingLegs(nn.Module):
     which change as Re(g exp(2 pi i p)) in the first harmonic of the gait, p in cycles. They are projected onto
     conj(g): z(t). With n(t) the cycles at the cadence of the speed, the mean of z^2 exp(-4 pi i n) over about a second
     has the phase 4 pi (p - n). It does not depend on which leg is called right; that is then chosen once for all
-    frames. Legs that are seen follow the gait where they swing at least a little, but less than 0.7 to 0.9 times as far
+    frames. Legs that are seen follow the gait where they swing at least a little, but less than 0.6 to 0.8 times as far
     as in the gait: legs that swing as far are left as they are, and so are those of runners. Hidden legs follow it
     wherever the body moves.
 
@@ -175,11 +175,12 @@ class WalkingLegs(nn.Module):
 
         Returns:
             Cycles (..., T); from 0 to 1, whether legs swing at all (0.1 to 0.2 times as far as in the gait), whichever
-            is called right, and whether they swing as far as in the gait (0.7 to 0.9 times).
+            is called right, and whether they swing as far as in the gait (0.6 to 0.8 times).
         """
         sigma = self.mean_s * fps
-        swing = weights.unsqueeze(-1) * self._between(self.swing, relative_speed)
-        far = (swing * self._between(self.swing, relative_speed)).sum(dim=[-2, -1]) / 2  # |z| in the gait
+        gait = self._between(self.swing, relative_speed)
+        swing = weights.unsqueeze(-1) * gait
+        far = (swing * gait).sum(dim=[-2, -1]) / 2  # |z| in the gait
         # z(t) and the mean of z^2 exp(-4 pi i n), as real and imaginary parts.
         z = (swing * apart.unsqueeze(-1)).sum(dim=-2)
         real, imaginary = z[..., 0].square() - z[..., 1].square(), 2 * z[..., 0] * z[..., 1]
@@ -199,7 +200,7 @@ class WalkingLegs(nn.Module):
         return (
             cycles + other / 2,
             ((some - 0.1) / 0.1).clamp(0.0, 1.0),
-            ((enough - 0.7) / 0.2).clamp(0.0, 1.0),
+            ((enough - 0.6) / 0.2).clamp(0.0, 1.0),
         )
 
     def _velocity(self, position: Tensor, valid: Tensor, fps: float) -> Tensor:
