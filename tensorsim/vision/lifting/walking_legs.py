@@ -32,11 +32,10 @@ class WalkingLegs(nn.Module):
     conj(g): z(t). With n(t) the cycles at the cadence of the speed, the mean of z^2 exp(-4 pi i n) over about a second
     has the phase 4 pi (p - n). It does not depend on which leg is called right; that is then chosen once for all
     frames. Legs that are seen follow the gait where they swing at least a little, but less than 0.6 to 0.8 times as far
-    as in the gait: legs that swing as far are left as they are, and so are those of runners. Hidden legs follow it
-    wherever the body moves.
-
-    Which way a body with hidden legs faces is poorly known, so it matters only where the person clearly walks
-    backwards. Bones keep their lengths except for half a second at both ends, where old and new legs are blended.
+    as in the gait: legs that swing as far are left as they are, and so are those of people who run, or go sideways or
+    backwards. Hidden legs follow it wherever the body moves: which way a body faces is poorly known where no ankle is
+    seen, so it matters there only if the person clearly walks backwards. Bones keep their lengths except for half a
+    second at both ends, where old and new legs are blended.
 
     Args:
         slow_m_s, walking_m_s: speeds of the hips below which nothing changes, and from which legs follow the gait only.
@@ -144,6 +143,9 @@ class WalkingLegs(nn.Module):
 
         hidden = valid & ~(seen[..., 9:11].any(dim=-1) | seen[..., 12:14].any(dim=-1))
         shown = walks * some * (1.0 - enough) * ((self.running_m_s - speed) / 0.3).clamp(0.0, 1.0)
+        # Near the camera, where no ankle is in the picture, which way the body faces is poorly known.
+        sideways = ((0.5 - forwards) / 0.3).clamp(0.0, 1.0)
+        shown = shown * (1.0 - (seen[..., 10] | seen[..., 13]).to(joints.dtype) * sideways)
         share = torch.maximum(
             self._blended(hidden.to(joints.dtype) * walks, fps), self._blended(shown, fps)
         ).unsqueeze(-1)

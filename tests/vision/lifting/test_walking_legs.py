@@ -154,6 +154,17 @@ def test_legs_that_do_not_swing_at_all_are_left() -> None:
     torch.testing.assert_close(WalkingLegs()(glides, *masks(walk, hidden=False), FPS), glides)
 
 
+@pytest.mark.parametrize("turned_deg", [-90.0, 90.0, 180.0])
+def test_legs_seen_of_who_goes_sideways_or_backwards_are_left(turned_deg: float) -> None:
+    walk = swinging(generated("walking"), 0.5)
+    middle = walk[:, [8, 11]].mean(dim=1, keepdim=True)
+    turn = rotation(2, torch.tensor(math.radians(turned_deg), dtype=torch.float64))
+    turned = (walk - middle) @ turn.mT + middle
+    seen, valid = masks(walk, hidden=False)
+    assert not torch.equal(WalkingLegs()(walk, seen, valid, FPS), walk)
+    torch.testing.assert_close(WalkingLegs()(turned, seen, valid, FPS), turned)
+
+
 def test_runners_are_left() -> None:
     walk = generated("walking")
     seen, valid = masks(walk, hidden=False)
