@@ -140,8 +140,8 @@ def check_points(x: Tensor, rank: int, count: int, coordinates: int, name: str, 
     check_size(x, -1, coordinates, name, layout)
 
 
-def check_key_points(keypoints: Tensor, scores: Tensor, valid: Tensor, rank: int, layout: str) -> None:
-    """Refuse anything but finite key points (..., T, 17, 2), scores (..., T, 17) and valid (..., T), bool."""
+def check_keypoints(keypoints: Tensor, scores: Tensor, valid: Tensor, rank: int, layout: str) -> None:
+    """Refuse anything but finite keypoints (..., T, 17, 2), scores (..., T, 17) and valid (..., T), bool."""
     check_points(keypoints, rank, 17, 2, "keypoints", layout)
     check_shape(scores, list(keypoints.shape[:-1]), "scores")
     check_mask(valid, list(keypoints.shape[:-2]), "valid")

@@ -154,7 +154,7 @@ def _check_size(found: Keypoints2D, size: tuple[int, int]) -> None:
     seen = found.keypoints[(found.scores > 0.3) & found.valid[..., None]]
     if len(seen) and float(seen.abs().quantile(0.95)) <= 2.0:
         raise TensorsimError(
-            f"key points: got coordinates up to {float(seen.abs().quantile(0.95)):.2g}, expected pixels, not shares of "
+            f"keypoints: got coordinates up to {float(seen.abs().quantile(0.95)):.2g}, expected pixels, not shares of "
             f"the picture"
         )
     inside = ((seen >= 0) & (seen < seen.new_tensor([size[1], size[0]]))).all(dim=-1)
@@ -162,7 +162,7 @@ def _check_size(found: Keypoints2D, size: tuple[int, int]) -> None:
         right, low = seen.quantile(0.95, dim=0).tolist()
         raise TensorsimError(
             f"--image-size: got {size[1]} x {size[0]} pixels, expected the width and height of the pictures in which "
-            f"the key points were found, which reach to ({right:.0f}, {low:.0f})"
+            f"the keypoints were found, which reach to ({right:.0f}, {low:.0f})"
         )
 
 

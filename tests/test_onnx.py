@@ -63,7 +63,7 @@ class Lifting(nn.Module):
 
 
 def tracks(clips: int) -> tuple[Tensor, ...]:
-    """Key points, scores, boxes and validity of a person in 20 frames of each clip."""
+    """Keypoints, scores, boxes and validity of a person in 20 frames of each clip."""
     generator = torch.Generator().manual_seed(clips)
     keypoints = 100 + 100 * torch.rand(clips, 1, 20, 17, 2, generator=generator)
     boxes = torch.cat([keypoints.amin(-2), keypoints.amax(-2)], -1)

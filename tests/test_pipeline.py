@@ -455,7 +455,7 @@ def test_gradients_flow_from_maps_to_joints() -> None:
 
 
 def test_gradients_flow_from_maps_to_frames() -> None:
-    """Through crops, heat maps and key points; people are detected and tracked without gradients."""
+    """Through crops, heat maps and keypoints; people are detected and tracked without gradients."""
     motion = ts.motion.ActivityGenerator().generate("walking", batch=1, seed=1, duration_s=0.4, rate_hz=20.0)
     frames = ts.data.PersonRenderer(height=180, width=240)(motion.joints[:1], seed=1).frames
     frames = (frames.reshape(1, -1, 3, 180, 240) / (255 if frames.dtype == torch.uint8 else 1)).float()

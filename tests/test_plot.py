@@ -79,7 +79,7 @@ def test_people_are_drawn_where_they_are_on_a_copy() -> None:
     assert not drawn[2:4, 0:5].any(), "an invalid person is not drawn"
 
 
-def test_a_key_point_at_infinity_is_drawn_as_far_outside() -> None:
+def test_a_keypoint_at_infinity_is_drawn_as_far_outside() -> None:
     keypoints = np.full((1, 17, 2), 50.0)
     keypoints[0, 9] = 1e11, 5.0
     image, scores = np.zeros((100, 100, 3), np.uint8), np.ones((1, 17))

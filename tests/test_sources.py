@@ -260,7 +260,7 @@ def test_people_without_track_id_have_the_numbers_in_which_they_come(tmp_path: P
     assert left.tolist() == pytest.approx([0.0, 200.0, 400.0, 600.0, 800.0], abs=1e-3)
 
 
-def test_somebody_of_whom_one_key_point_is_seen_keeps_the_place(tmp_path: Path) -> None:
+def test_somebody_of_whom_one_keypoint_is_seen_keeps_the_place(tmp_path: Path) -> None:
     body = np.random.default_rng(0).uniform(0, 100, (17, 2))
     keypoints = np.stack([np.stack([body + (200.0 * p + 8.0 * t) for t in range(3)]) for p in range(3)])
     scores = np.full((3, 3, 17), 0.9)
@@ -282,7 +282,7 @@ def test_somebody_far_from_everybody_before_is_somebody_new(tmp_path: Path) -> N
     torch.testing.assert_close(found.keypoints[50, 0], torch.tensor(keypoints[0, 50]).float())
 
 
-def test_hidden_key_points_make_nobody_new(tmp_path: Path) -> None:
+def test_hidden_keypoints_make_nobody_new(tmp_path: Path) -> None:
     """Of a walking person only the ankles are seen for a while, then only the head, then nothing."""
     body = np.random.default_rng(0).uniform(0, 100, (17, 2))
     body[15:] = [[40.0, 90.0], [42.0, 91.0]]
@@ -315,7 +315,7 @@ def test_scores_above_one_count_as_one_and_percents_are_refused(
     write_results(tmp_path / "walk.json", keypoints, 0 * scores + 1.04, [(0,)] * 45)
     assert torch.equal(load_coco_keypoints(tmp_path / "walk.json").scores, torch.ones(45, 1, 17))
     write_results(tmp_path / "walk.json", keypoints, 0 * scores + 87.5, [(0,)] * 45)
-    with pytest.raises(TensorsimError, match=r"got a score of 87\.5 for a key point, expected 0 to 1"):
+    with pytest.raises(TensorsimError, match=r"got a score of 87\.5 for a keypoint, expected 0 to 1"):
         load_coco_keypoints(tmp_path / "walk.json")
 
 
@@ -324,7 +324,7 @@ def test_shares_of_the_picture_are_no_pixels(
 ) -> None:
     camera, keypoints, scores = filmed
     (tmp_path / "walk.json").write_text(json.dumps(coco_json(keypoints / CANVAS[::-1], scores)))
-    with pytest.raises(TensorsimError, match=r"key points: got coordinates up to 0\.\d+, expected pixels"):
+    with pytest.raises(TensorsimError, match=r"keypoints: got coordinates up to 0\.\d+, expected pixels"):
         keypoint_source(tmp_path / "walk.json", lifter(camera, 1.75), FPS, CANVAS)
 
 

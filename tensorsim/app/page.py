@@ -39,7 +39,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
 
     Args:
         runs: where simulations run.
-        longest_s: longest film, motion capture or key points in seconds.
+        longest_s: longest film, motion capture or keypoints in seconds.
     """
     # Long because it declares the page from top to bottom, in reading order.
     made = controls()

@@ -1,7 +1,7 @@
 """Lengths of the segments of a body as fractions of its height: the one place for these numbers.
 
 Winter, *Biomechanics and Motor Control of Human Movement*, after Drillis and Contini, except the half widths of
-shoulders and hips and the position of the nose, which are those of key points in pictures.
+shoulders and hips and the position of the nose, which are those of keypoints in pictures.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The 14 joints of the radar body and the 17 key points of COCO: each from the other, roots and mirror images."""
+"""The 14 joints of the radar body and the 17 keypoints of COCO: each from the other, roots and mirror images."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def other_sides(names: Sequence[str]) -> tuple[int, ...]:
     )
 
 
-#: For each joint and each COCO key point, the one that takes its place in a mirror image.
+#: For each joint and each COCO keypoint, the one that takes its place in a mirror image.
 MIRRORED_JOINTS, MIRRORED = other_sides(JOINTS), other_sides(COCO_KEYPOINTS)
 
 
@@ -88,7 +88,7 @@ class Marks(NamedTuple):
     """Where people, and networks trained on their marks, see joints in pictures, relative to the joint centres.
 
     Hips, knees, ankles and elbows of COCO are not where the bones turn. Offsets are shares of a segment, the means of
-    two networks trained on people's marks, to half a percent (``python -m tests.benchmarks.eval_key_points``).
+    two networks trained on people's marks, to half a percent (``python -m tests.benchmarks.eval_keypoints``).
 
     Attributes:
         elbow: above the joint, of the upper arm.
@@ -104,10 +104,10 @@ class Marks(NamedTuple):
 
 
 def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> tuple[Tensor, Tensor]:
-    """The 14 joints of ``tensorsim.JOINTS`` from the 17 key points of COCO.
+    """The 14 joints of ``tensorsim.JOINTS`` from the 17 keypoints of COCO.
 
     Elbows, hips, knees and ankles move from where COCO marks them to the joints (:class:`Marks`): fully if the other
-    key points that this needs score ``threshold`` or more, less the lower they score.
+    keypoints that this needs score ``threshold`` or more, less the lower they score.
 
     The head is the nose. From behind, the nose is hidden and its score low: as the score falls below
     ``threshold``, the head moves to the score-weighted mean of eyes and ears, which from behind lies where
@@ -116,7 +116,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
     Args:
         keypoints: (..., 17, 2) pixels, order of ``tensorsim.COCO_KEYPOINTS``.
         scores: (..., 17).
-        threshold: score from which the nose, and the key points that others are moved by, count as visible.
+        threshold: score from which the nose, and the keypoints that others are moved by, count as visible.
 
     Returns:
         joints (..., 14, 2) in pixels and scores (..., 14). Differentiable.
@@ -124,7 +124,7 @@ def coco_to_body(keypoints: Tensor, scores: Tensor, threshold: float = 0.3) -> t
     Raises:
         TensorsimError: other shapes, NaN, or a threshold that is not positive.
     """
-    layout = "(..., 17, 2) COCO key points in pixels"
+    layout = "(..., 17, 2) COCO keypoints in pixels"
     check_points(keypoints, 2, 17, 2, "keypoints", layout)
     check_shape(scores, list(keypoints.shape[:-1]), "scores")
     check_finite(keypoints, "keypoints")
@@ -175,7 +175,7 @@ _EAR = (0.043, 0.060, 0.010)
 
 
 def body_to_coco(joints: Tensor) -> Tensor:
-    """The 17 key points of COCO from the 14 joints of the radar body.
+    """The 17 keypoints of COCO from the 14 joints of the radar body.
 
     Eyes and ears are placed about the nose in a frame spanned by the line from neck to nose (which also sets its
     size) and that of the shoulders: they follow only part of a rotation of the head relative to the trunk.

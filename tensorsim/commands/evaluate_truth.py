@@ -31,7 +31,7 @@ class EvaluateTruth:
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
     """Scenes to evaluate in."""
     settings: tuple[Literal["a", "b", "c"], ...] = ("a", "b")
-    """Start from true 3D joints at video rate (a), true 2D key points (b), or the rendered film and networks (c)."""
+    """Start from true 3D joints at video rate (a), true 2D keypoints (b), or the rendered film and networks (c)."""
     stages: bool = True
     """Also replace each stage in turn with the truth."""
     detector: Option[str] = None

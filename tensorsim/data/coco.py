@@ -139,7 +139,7 @@ def coco_of(path: Path, contents: list[tuple[Path, Any]]) -> Keypoints2D:
     scores = data[..., 2]
     if float(scores.max()) > 2:
         raise TensorsimError(
-            f"{path}: got a score of {float(scores.max()):g} for a key point, expected 0 to 1, or visibility 0, 1 or 2"
+            f"{path}: got a score of {float(scores.max()):g} for a keypoint, expected 0 to 1, or visibility 0, 1 or 2"
         )
     scores = (scores > 0).float() if bool((scores == scores.round()).all()) else scores.clamp(0, 1)
     return Keypoints2D(data[..., :2], scores, valid, size)

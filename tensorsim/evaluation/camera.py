@@ -18,7 +18,7 @@ from tensorsim.vision.calibration.upright import STANDING, WALKING, ends_of_body
 
 FPS = 30.0
 HEIGHT, WIDTH = 480, 640
-#: Walks with all key points in the picture in less than this share of the frames are skipped.
+#: Walks with all keypoints in the picture in less than this share of the frames are skipped.
 LEAST_SEEN = 0.5
 
 
@@ -39,7 +39,7 @@ class Walk(NamedTuple):
 
     @property
     def seen(self) -> float:
-        """Share of the frames with all key points in the picture."""
+        """Share of the frames with all keypoints in the picture."""
         return float(self.scores.all(dim=-1).double().mean())
 
 
@@ -98,7 +98,7 @@ def walk_before(camera: CameraConfig, seed: int, turn_deg: float = 80.0, seconds
 
 
 def _seen_by(camera: CameraConfig, joints: Tensor) -> tuple[Tensor, Tensor]:
-    """COCO key points of joints (T, 14, 3): pixels (T, 17, 2), and 1.0 for those in the picture (T, 17)."""
+    """COCO keypoints of joints (T, 14, 3): pixels (T, 17, 2), and 1.0 for those in the picture (T, 17)."""
     pose = camera_to_world(camera)
     local = (body_to_coco(joints) - pose[:, 3]) @ pose[:, :3]
     focal = WIDTH / 2 / math.tan(camera.horizontal_fov_rad / 2)
@@ -111,7 +111,7 @@ def _seen_by(camera: CameraConfig, joints: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def estimate(walk: Walk, noise_px: float, known_height: bool, seed: int = 0) -> CameraEstimate:
-    """The camera estimated from key points of a walk with Gaussian errors of ``noise_px``, before :func:`used`."""
+    """The camera estimated from keypoints of a walk with Gaussian errors of ``noise_px``, before :func:`used`."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(walk.keypoints.shape, generator=generator, dtype=torch.float64)
     keypoints = walk.keypoints + noise_px * noise
@@ -126,7 +126,7 @@ def used(told: CameraEstimate) -> CameraEstimate:
 
 
 def errors_of(found: CameraEstimate, camera: CameraConfig, walk: Walk) -> CameraErrors:
-    """Errors of an estimate; ranges follow from the true key points and the estimated camera.
+    """Errors of an estimate; ranges follow from the true keypoints and the estimated camera.
 
     Raises:
         TensorsimError: no frame of the walk shows an upright body.

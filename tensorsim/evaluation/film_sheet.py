@@ -38,7 +38,7 @@ def contact_sheet(
         film: the labelled film.
         reader: reads the frames that ``found.pose`` belongs to.
         found: the people of one clip, and the camera whose floor is drawn; a camera of None draws no floor.
-        threshold: score from which a key point is drawn.
+        threshold: score from which a keypoint is drawn.
         scenes: for each scene, the verdict, and its maps with their axes if there are any.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

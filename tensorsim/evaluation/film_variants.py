@@ -2,7 +2,7 @@
 
 With few labelled films, a single one that is nearly tied between two labels can sway an overall score. The variants
 of a film are its mirror image, the film without its first or last quarter of a second, and the film with slightly
-displaced key points. They are made from the networks' results, so the networks run only once.
+displaced keypoints. They are made from the networks' results, so the networks run only once.
 """
 
 import math
@@ -17,8 +17,8 @@ from tensorsim.types import Tracks
 
 #: Seconds left out at the beginning or at the end.
 CUT_S = 0.25
-#: Standard deviation of the displacement of key points, as a share of the diagonal of the box.
-KEY_POINT_ERROR = 0.007
+#: Standard deviation of the displacement of keypoints, as a share of the diagonal of the box.
+KEYPOINT_ERROR = 0.007
 #: Lower bound of the probability of the right label; also counts where the simulation refuses the film.
 LEAST_PROBABILITY = 1e-3
 
@@ -57,7 +57,7 @@ def variants(seen: Observed, fps: float) -> dict[str, Observed]:
         found["begins later"] = _part(seen, slice(cut, None))
         found["ends earlier"] = _part(seen, slice(None, frames - cut))
     for seed in (0, 1):
-        found[f"key points off, seed {seed}"] = _displaced(seen, seed)
+        found[f"keypoints off, seed {seed}"] = _displaced(seen, seed)
     return found
 
 
@@ -93,7 +93,7 @@ def _displaced(seen: Observed, seed: int) -> Observed:
     boxes = seen.tracks.boxes
     diagonal = (boxes[..., 2:] - boxes[..., :2]).norm(dim=-1)
     noise = torch.randn(seen.keypoints.shape, generator=torch.Generator().manual_seed(seed))
-    error = KEY_POINT_ERROR * diagonal[..., None, None] * noise.to(seen.keypoints)
+    error = KEYPOINT_ERROR * diagonal[..., None, None] * noise.to(seen.keypoints)
     return seen._replace(keypoints=seen.keypoints + error)
 
 

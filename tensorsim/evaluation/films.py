@@ -44,7 +44,7 @@ class Observed(NamedTuple):
         return Tracks(self.boxes[None], self.valid[None], self.valid[None])
 
     def lifted_by(self, stage: VideoToPose) -> tuple[Tensor, Tensor]:
-        """Joints (P, T, 14, 3) m that a stage makes from these key points, and whether people are present (P, T)."""
+        """Joints (P, T, 14, 3) m that a stage makes from these keypoints, and whether people are present (P, T)."""
         pose = stage.lift(self.tracks(), self.keypoints[None], self.scores[None], HEIGHT, WIDTH, FPS)
         return pose.joints[0], pose.valid[0]
 

@@ -151,7 +151,7 @@ def whole_films(films: Iterable[LabelledFilm]) -> list[LabelledFilm]:
 class FilmReader:
     """Finds the people in films; the networks' outputs are cached in a folder and reused.
 
-    Detections are keyed by film, cut and detector; key points by these, the tracks and the pose network; networks by
+    Detections are keyed by film, cut and detector; keypoints by these, the tracks and the pose network; networks by
     their file and what runs them; and everything by the version of this package. Tracking, lifting and smoothing are
     computed anew.
 

@@ -64,7 +64,7 @@ class Setting:
 
 
 def lifting_files() -> dict[str, str]:
-    """Digests of the shipped files used to lift key points: weights, and the poses for nearest matching."""
+    """Digests of the shipped files used to lift keypoints: weights, and the poses for nearest matching."""
     poses = {entry["name"]: entry["sha256"] for entry in manifest() if entry["file"] == SHIPPED_LIBRARY}
     return shipped_weights("TemporalLifter") | poses
 

@@ -17,7 +17,7 @@ class DenseSearch(nn.Module):
         search: the pool, its headings and the number of neighbours.
 
     Shapes:
-        key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, best first.
+        keypoints (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, best first.
     """
 
     table: Tensor

@@ -1,4 +1,4 @@
-"""Causal poses: from the key points of a frame to joints in the world, filtered with past frames only."""
+"""Causal poses: from the keypoints of a frame to joints in the world, filtered with past frames only."""
 
 from typing import NamedTuple
 
@@ -74,7 +74,7 @@ class CausalPose(nn.Module):
         # Gain -3 dB at 1 Hz: for sizes with 4 % error and people who start to walk within half a second.
         self.size_density, self.size_noise, self.size_speed = 0.1, 0.04**2, 0.3
         self.unknown = 0.1 * _WIDE * self.size_noise  # variance from which a size counts as unknown
-        # Gain -3 dB at 4 Hz: m^2/s^3, and 3 cm of key point error, see noise.keypoint_noise.
+        # Gain -3 dB at 4 Hz: m^2/s^3, and 3 cm of keypoint error, see noise.keypoint_noise.
         self.joint_density, self.joint_noise, self.initial_speed = 27.0, 0.03**2, 3.0
 
     def begin(self, people: int) -> PoseState:
@@ -110,7 +110,7 @@ class CausalPose(nn.Module):
             scores: (P, 17).
             boxes: (P, 4) pixels, ``xyxy``; the size of a body cut by the left or right edge of the picture has a low
                 weight.
-            there: (P,) bool, the people with key points; the others are predicted.
+            there: (P,) bool, the people with keypoints; the others are predicted.
             height, width: size of the picture.
         """
         if not bool(there.any()):

@@ -27,8 +27,8 @@ class LivePerson(NamedTuple):
     Attributes:
         number: in order of appearance, from 1.
         box: (4,) ``xyxy`` pixels.
-        keypoints: (17, 2) COCO key points in pixels.
-        scores: (17,) of the key points, from 0.
+        keypoints: (17, 2) COCO keypoints in pixels.
+        scores: (17,) of the keypoints, from 0.
         joints: (14, 3) world metres, filtered.
         present: whether the person is in the radar's scene.
     """
@@ -70,7 +70,7 @@ class LiveFrame(NamedTuple):
 class LiveSimulator:
     """Processes camera frames one at a time and returns people and new map columns. Causal, with bounded memory.
 
-    Detection in every n-th frame, tracking (:class:`~tensorsim.live.tracking.OnlineTracker`), key points, lifting and
+    Detection in every n-th frame, tracking (:class:`~tensorsim.live.tracking.OnlineTracker`), keypoints, lifting and
     the forward Kalman filter (:class:`~tensorsim.live.pose.CausalPose`), a spline and the radar
     (:class:`~tensorsim.live.radar.LiveRadar`). Map columns are returned one frame after their last pulse.
 
@@ -154,7 +154,7 @@ class LiveSimulator:
             frame: (3, H, W) uint8 RGB.
 
         Returns:
-            What the frame adds: people with key points in pixels and joints in metres, and new columns (F, k), (R, c)
+            What the frame adds: people with keypoints in pixels and joints in metres, and new columns (F, k), (R, c)
             and (R, c') of the maps, of any number including 0; see :class:`LiveFrame`.
 
         Raises:
@@ -178,7 +178,7 @@ class LiveSimulator:
         """Register a missing frame; people continue at their last velocity.
 
         Returns:
-            As :meth:`push`; the people have key points and scores of 0.
+            As :meth:`push`; the people have keypoints and scores of 0.
         """
         self.index += 1
         self.missed += 1

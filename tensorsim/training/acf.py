@@ -25,7 +25,7 @@ from tensorsim.vision.detection.acf_features import CELL, CHANNELS, aggregate_ch
 #: Margin of cells around a window for computing its channels.
 _MARGIN = 4
 _SHAPE = (CELL * (ROWS + 2 * _MARGIN), CELL * (COLUMNS + 2 * _MARGIN))
-#: Key points at the ends of a body; of an upright person, at least one of each group is labelled.
+#: Keypoints at the ends of a body; of an upright person, at least one of each group is labelled.
 _UPPER, _LOWER = ("nose", "left_ear", "right_ear", "head_top"), ("left_ankle", "right_ankle")
 #: Lowest and highest ratio of width to height of an upright person.
 _SLIM = (0.2, 0.65)

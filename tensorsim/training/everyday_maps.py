@@ -33,7 +33,7 @@ from tensorsim.radar.synthesis.echo import EchoSynthesizer
 from tensorsim.recognition.map_image import MapToImage
 from tensorsim.training.everyday import at_rate, bystander, everyday_motion
 from tensorsim.training.expected_map import ExpectedMap, noise_rows
-from tensorsim.training.key_point_errors import FilmedMotion
+from tensorsim.training.keypoint_errors import FilmedMotion
 from tensorsim.training.maps import SCENES, from_bytes, to_bytes
 
 #: Frame rates of films, and the rate at which true motion is sampled.

@@ -26,7 +26,7 @@ from tensorsim.evaluation.films import FPS, Observed, filmed, project
 _PIECE, _STEP, _COMPARED = 12, 6, (0, 4, 8, 11)
 #: Frames between the starts of segments within a film.
 _EVERY = 2
-#: Dissimilarity, in body heights, of a key point outside the picture to one inside, and the penalty for changing to
+#: Dissimilarity, in body heights, of a keypoint outside the picture to one inside, and the penalty for changing to
 #: another film.
 _EDGE, _LEAVE = 0.15, 0.15
 #: Share of the films from which a motion takes errors, drawn anew for each motion, so that results vary.
@@ -37,7 +37,7 @@ class Look(NamedTuple):
     """A motion as it appears in the picture.
 
     Attributes:
-        pixels: (T, 17, 2) true COCO key points.
+        pixels: (T, 17, 2) true COCO keypoints.
         inside: (T, 17) whether they are in the picture.
         unit_px: (T,) standing height of the body in pixels at the distance of the hips.
     """
@@ -56,7 +56,7 @@ class Look(NamedTuple):
 
     @property
     def shape(self) -> Tensor:
-        """(T, 17, 2) key points about the middle of the hips, in body heights."""
+        """(T, 17, 2) keypoints about the middle of the hips, in body heights."""
         return (self.pixels - self.pixels[:, 11:13].mean(1, keepdim=True)) / self.unit_px[:, None, None]
 
 
@@ -65,7 +65,7 @@ class Watched(NamedTuple):
 
     Attributes:
         shape, inside: see :class:`Look`.
-        error: (T, 17, 2) found minus true key points, in body heights.
+        error: (T, 17, 2) found minus true keypoints, in body heights.
         scores: (T, 17).
         found: (T,) whether the person was tracked.
     """

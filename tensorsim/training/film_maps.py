@@ -24,12 +24,12 @@ from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
 
 class FilmLoss:
-    """Motion as the pipeline estimates it from a film: key points with errors, lifted, placed and smoothed.
+    """Motion as the pipeline estimates it from a film: keypoints with errors, lifted, placed and smoothed.
 
     The camera is that of ``tensorsim.evaluation.films``; nothing is rendered.
 
     Args:
-        errors: errors of the key points.
+        errors: errors of the keypoints.
     """
 
     def __init__(self, errors: FilmErrors) -> None:

@@ -1,4 +1,4 @@
-"""The recipes of the lifters: windows of motion, seen by random cameras with key point errors, to joints."""
+"""The recipes of the lifters: windows of motion, seen by random cameras with keypoint errors, to joints."""
 
 import math
 from typing import Any

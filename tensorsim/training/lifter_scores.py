@@ -1,4 +1,4 @@
-"""How well people are lifted, from key points to smoothed joints, with known camera and height."""
+"""How well people are lifted, from keypoints to smoothed joints, with known camera and height."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -55,7 +55,7 @@ class LiftErrors(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """People in front of one camera: key points as :class:`~tensorsim.evaluation.films.Observed`, and the truth.
+    """People in front of one camera: keypoints as :class:`~tensorsim.evaluation.films.Observed`, and the truth.
 
     Attributes:
         camera: the camera.
@@ -131,7 +131,7 @@ def video_pose(network: VideoPose3D) -> MakeLifter:
 
 @torch.inference_mode()
 def lifted(make: MakeLifter, seen: Seen) -> tuple[Tensor, Tensor]:
-    """Joints (P, T, 14, 3) that the pipeline makes of key points, and the frames (P, T) where they are valid."""
+    """Joints (P, T, 14, 3) that the pipeline makes of keypoints, and the frames (P, T) where they are valid."""
     nothing = nn.Identity()
     stage = VideoToPose(
         nothing,

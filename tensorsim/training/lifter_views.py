@@ -1,4 +1,4 @@
-"""Training data of a lifter: motion seen by random cameras, with key point errors like those of networks.
+"""Training data of a lifter: motion seen by random cameras, with keypoint errors like those of networks.
 
 Everything is computed for a whole batch at once: B windows of T frames.
 """
@@ -16,18 +16,18 @@ from tensorsim.geometry.camera import camera_to_world, focal_length
 from tensorsim.training.lifter_motion import RATE_HZ, MotionPool
 from tensorsim.vision.lifting.sight import Sight, level_sight
 
-#: Score below which a key point counts as hidden.
+#: Score below which a keypoint counts as hidden.
 THRESHOLD = 0.3
-#: Share of the windows whose key points are exact, and of those whose camera is known.
+#: Share of the windows whose keypoints are exact, and of those whose camera is known.
 _LABELLED, _KNOWN = 0.1, 0.4
-#: Relative size of the errors of each COCO key point: face, shoulders, elbows, wrists, hips, knees, ankles.
+#: Relative size of the errors of each COCO keypoint: face, shoulders, elbows, wrists, hips, knees, ankles.
 _ERROR = (0.7,) * 5 + (0.9,) * 2 + (1.2,) * 2 + (1.5,) * 2 + (1.2,) * 2 + (1.0,) * 2 + (1.2,) * 2
-#: Scores of well-found key points, measured on films: head, then shoulders to ankles.
+#: Scores of well-found keypoints, measured on films: head, then shoulders to ankles.
 USUAL_SCORES = (0.92,) * 5 + (0.80,) * 12
-#: Distances in body heights from the outermost key points to the left, top, right and bottom of the detector's boxes,
+#: Distances in body heights from the outermost keypoints to the left, top, right and bottom of the detector's boxes,
 #: measured on rendered films: for upright people, and for people lying down.
 _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
-#: Key points that are mistaken for one another: (right, left) of arms, of legs, and all.
+#: Keypoints that are mistaken for one another: (right, left) of arms, of legs, and all.
 _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
 
 
@@ -196,7 +196,7 @@ def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int],
 def _missed(
     points: Tensor, unit: Tensor, depth: Tensor, tilted: Tensor, scores: Tensor, fps: Tensor, draw: Draw
 ) -> tuple[Tensor, Tensor]:
-    """Key points (B, T, 17, 2) with errors like those of networks, and their scores.
+    """Keypoints (B, T, 17, 2) with errors like those of networks, and their scores.
 
     Args:
         points: true ones in pixels.
@@ -253,7 +253,7 @@ def _missed(
 def _followed(
     found: Tensor, scores: Tensor, unit: Tensor, tilted: Tensor, draw: Draw, gaps: bool
 ) -> tuple[Tensor, Tensor]:
-    """Boxes (B, T, 4) of key points, like those of detectors and trackers, and the frames (B, T) that have one."""
+    """Boxes (B, T, 4) of keypoints, like those of detectors and trackers, and the frames (B, T) that have one."""
     frames = found.shape[1]
     seen = scores >= THRESHOLD
     low = torch.where(seen[..., None], found, torch.inf).amin(dim=-2)
@@ -273,7 +273,7 @@ def film(pool: MotionPool, count: int, frames: int, generator: torch.Generator) 
     """``count`` windows of motion from the pool, at random places in front of random cameras.
 
     Four in ten cameras are known to within a percent, the others only as well as one estimated from the film; one
-    window in ten has exact key points.
+    window in ten has exact keypoints.
     """
     draw = Draw(count, generator)
     joints, height, fps = windows_of(pool, frames, draw)
@@ -315,7 +315,7 @@ def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = 
         height: (B) standing heights, metres.
         fps: (B) frames per second.
         draw: random numbers.
-        errors: False gives the exact key points, those outside the picture with a score of 0.
+        errors: False gives the exact keypoints, those outside the picture with a score of 0.
     """
     frames, extent = view.joints.shape[1], view.extent
     center = (extent - 1) / 2

@@ -1,4 +1,4 @@
-"""The recipe of HRNet's presence head, which predicts which key points are in the picture; the rest is frozen."""
+"""The recipe of HRNet's presence head, which predicts which keypoints are in the picture; the rest is frozen."""
 
 from dataclasses import replace
 
@@ -15,15 +15,15 @@ from tensorsim.vision.pose2d.hrnet import HRNet, PresenceHead
 
 #: Shares of people in pictures, in films, with confused sides, and rendered: most where hidden points are best known.
 SHARES_PRESENCE = (0.8, 0.2, 0.0, 0.0)
-#: Score at which a key point is in the picture with even odds; averaging with the mirror image lowers it to 0.3.
+#: Score at which a keypoint is in the picture with even odds; averaging with the mirror image lowers it to 0.3.
 EVEN_ODDS = 0.34
 
 
 def presence_loss(scores: Tensor, known: Tensor, gone: Tensor, sharpness: float = 4.0) -> Tensor:
-    """Cross-entropy of classifying key points by score as in the picture or beyond its edge.
+    """Cross-entropy of classifying keypoints by score as in the picture or beyond its edge.
 
     The probability of being in the picture is a logistic function of the logarithm of the score, one half at
-    :data:`EVEN_ODDS`; key points that are neither known nor gone do not count.
+    :data:`EVEN_ODDS`; keypoints that are neither known nor gone do not count.
 
     Args:
         scores: (N, 17) heights of the peaks.
@@ -52,8 +52,8 @@ class PresenceRecipe(PoseRecipe):
     Args:
         net: trained network with such a head.
         persons, seed, learning_rate: as for :class:`~tensorsim.training.pose.PoseRecipe`.
-        validation: held-out people; the score is the share of seen key points in the picture minus the share of seen
-            key points beyond its edge.
+        validation: held-out people; the score is the share of seen keypoints in the picture minus the share of seen
+            keypoints beyond its edge.
 
     Raises:
         TensorsimError: a network without such a head, a source without people.
@@ -96,7 +96,7 @@ class PresenceRecipe(PoseRecipe):
         return torch.optim.AdamW(self.head.parameters(), lr=self.learning_rate, weight_decay=0.02)
 
     def validate(self, net: nn.Module) -> dict[str, float]:
-        """Shares of key points seen in the picture and beyond its edge, of every held-out group."""
+        """Shares of keypoints seen in the picture and beyond its edge, of every held-out group."""
         figures = {name: evaluate_cut(net, persons, EVEN_ODDS) for name, persons in self.validation.items()}
         score = sum(figure["seen"] - figure["ghosts"] for figure in figures.values()) / max(len(figures), 1)
         return by_group(figures) | {"score": score}

@@ -9,7 +9,7 @@ from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 #: What runs the detector and the pose network, by engine. The detector stays in float32: in bfloat16 or in integers its
-#: boxes would shift, and key points would be several times as far off.
+#: boxes would shift, and keypoints would be several times as far off.
 _RUNTIMES: dict[str, tuple[Runtime, Runtime]] = {
     "onnxruntime": ("onnxruntime", "onnxruntime"),
     "openvino": ("openvino", "openvino-bfloat16"),

@@ -6,7 +6,7 @@ Without a film, a generated person is rendered at half the size and enlarged. Ti
 a busy machine changes little; set OMP_NUM_THREADS=1, because threads of libraries count for no stage. Wall time is
 printed beside them. A stage does not count what another stage in it takes. Other options go to ``simulate``.
 
-The peer is ONNX Runtime running the same networks on every frame, one by one: detection, then key points with the
+The peer is ONNX Runtime running the same networks on every frame, one by one: detection, then keypoints with the
 mirror test in the boxes that were tracked.
 """
 
@@ -46,7 +46,7 @@ from tensorsim.types import Detections
 STAGES: tuple[tuple[Any, str, str], ...] = (
     (VideoToPose, "detect", "detection"),
     (VideoToPose, "follow", "tracking"),
-    (VideoToPose, "estimate", "key points"),
+    (VideoToPose, "estimate", "keypoints"),
     (VideoToPose, "lift", "lifting, position, smoothing"),
     (streaming, "maps_of_pose", "radar"),
     (results, "maps_of_pose", "radar"),
@@ -58,7 +58,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (ClipOptions, "write_report", "report"),
 )
 #: Stages that the peer has as well.
-FOUND = ("decoding", "detection", "tracking", "key points")
+FOUND = ("decoding", "detection", "tracking", "keypoints")
 
 
 class Clock(threading.local):
@@ -117,7 +117,7 @@ def simulate(film: Path, options: list[str]) -> tuple[dict[str, float], float]:
 
 
 def peer(film: Path) -> float:
-    """Processor seconds of decoding, detection and key points of every frame alone."""
+    """Processor seconds of decoding, detection and keypoints of every frame alone."""
     networks = load_networks(*default_networks(None, None), flip_test=True, engine="onnxruntime")
     stage = VideoToPose.from_config(SimulationConfig().replace(tracking__detection_interval=1), *networks)
     reader = video.VideoReader(film)
@@ -167,7 +167,7 @@ def main() -> None:
         ours = statistics.median(sum(run[stage] for stage in FOUND) for run, _ in runs)
         theirs = statistics.median(others)
         print(
-            f"decoding, detection, key points {ours:.2f} s; of the peer {theirs:.2f} s: {theirs / ours:.2f} times"
+            f"decoding, detection, keypoints {ours:.2f} s; of the peer {theirs:.2f} s: {theirs / ours:.2f} times"
         )
 
 

@@ -1,6 +1,6 @@
-"""Key points and maps of ``simulate`` by engine, against torch: ``python -m tests.benchmarks.eval_engines [FILM ...]``.
+"""Keypoints and maps of ``simulate`` by engine, against torch: ``python -m tests.benchmarks.eval_engines [FILM ...]``.
 
-On a rendered film of somebody who walks, and on the films given. Prints by how many pixels key points with a score of
+On a rendered film of somebody who walks, and on the films given. Prints by how many pixels keypoints with a score of
 0.3 or more are off, and by how many decibels the energy of the Doppler-time map and its cells within 40 dB of the peak.
 """
 

@@ -5,7 +5,7 @@ of the wavelength, 3.9 mm at 77 GHz and 15 cm at 2 GHz. Errors are put on the tr
 maps are compared with the true ones as the truth loop compares them: linear PSNR in dB, mean over the activities.
 
 - depth: the true joints are moved along the line of sight from the camera;
-- key points: the true ones are moved in the picture of 640x360 pixels, lifted and placed by the pipeline; the better of
+- keypoints: the true ones are moved in the picture of 640x360 pixels, lifted and placed by the pipeline; the better of
   what it makes of them when told that they are exact (setting b of the truth loop) and when not (c).
 
 Each joint has its own Gaussian error, which changes within about half a second, as those of pose networks do.
@@ -91,8 +91,8 @@ def main() -> None:
         for size in PIXELS:
             observed = seen._replace(keypoints=seen.keypoints + size * shift)
             poses = [pipelines.lifted(Setting(source), clip, observed) for source in ("b", "c")]
-            figures.add("key points, px", size, clip, truths, *poses)
-    print(figures.table("depth, mm", DEPTH_MM), figures.table("key points, px", PIXELS), sep="\n\n")
+            figures.add("keypoints, px", size, clip, truths, *poses)
+    print(figures.table("depth, mm", DEPTH_MM), figures.table("keypoints, px", PIXELS), sep="\n\n")
 
 
 if __name__ == "__main__":

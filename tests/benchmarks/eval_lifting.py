@@ -3,7 +3,7 @@
 python -m tests.benchmarks.eval_lifting [--tune] [LIBRARY.safetensors]
 
 Clips with an even number (in the order of the files) are those that settings were tuned on; without --tune the
-others are judged. Bodies of 1.75 m stay 4 m in front of a pinhole camera, key points have 2 px of noise at a height
+others are judged. Bodies of 1.75 m stay 4 m in front of a pinhole camera, keypoints have 2 px of noise at a height
 of 300 px; 30 frames a second, at most 45 frames, without the first, which is a calibration jump in the CMU clips.
 Joints lie on their lines of sight at the lifted depth, and are compared with the true ones relative to the hips.
 """
@@ -67,7 +67,7 @@ def everyday_clips(seed: int) -> dict[str, Tensor]:
 
 
 def film(joints: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Key points (T, 14, 2) in pixels and true joints (T, 14, 3) in metres relative to the hips."""
+    """Keypoints (T, 14, 2) in pixels and true joints (T, 14, 3) in metres relative to the hips."""
     body = HEIGHT_M * (joints - mid_hips(joints)[:, None]) / body_height(joints).mean()
     body = turn(body, torch.full((len(body),), 2 * math.pi * side / SIDES))
     across = torch.stack([body[..., 0], -body[..., 2]], dim=-1)

@@ -22,13 +22,13 @@ from tensorsim.recognition import ActivityRecognizer
 from tensorsim.recognition.map_image import scaled
 from tensorsim.training.everyday import at_rate, everyday_motion
 from tensorsim.training.everyday_maps import BODIES, Radars, Watched
-from tensorsim.training.key_point_errors import (
+from tensorsim.training.keypoint_errors import (
     FilmedMotion,
     Filming,
     Seen,
     draw_camera,
-    find_key_points,
-    project_key_points,
+    find_keypoints,
+    project_keypoints,
 )
 from tensorsim.training.maps import SCENES
 
@@ -39,9 +39,9 @@ RATES_HZ = (15.0, 18.0, 20.0, 25.0)
 Motion = tuple[Tensor, Tensor]
 
 
-def exact_key_points(joints: Tensor, filming: Filming) -> Seen:
-    """Where the key points of joints (T, 14, 3) are, all those in the picture."""
-    where, depth = project_key_points(joints, filming)
+def exact_keypoints(joints: Tensor, filming: Filming) -> Seen:
+    """Where the keypoints of joints (T, 14, 3) are, all those in the picture."""
+    where, depth = project_keypoints(joints, filming)
     size = torch.tensor([filming.width, filming.height])
     inside = ((where >= -0.5) & (where < size)).all(-1) & (depth > NEAR_M)
     return Seen(where, 0.9 * inside.double(), inside.sum(-1) >= 4)
@@ -54,7 +54,7 @@ def ways(activity: int, fps: float, generator: torch.Generator, films: FilmedMot
     truth = torch.stack([at_rate(joints, round(SECONDS * fps), fps) for joints in motion])
     filming = draw_camera(mid_hips(truth).mean(0), draw)
     seen = [
-        find_key_points(joints, height, fps, filming, draw)
+        find_keypoints(joints, height, fps, filming, draw)
         for joints, height in zip(truth, heights.tolist(), strict=True)
     ]
     found, valid = films.lifted(seen, filming, fps)
@@ -62,7 +62,7 @@ def ways(activity: int, fps: float, generator: torch.Generator, films: FilmedMot
     return {
         "as found in films": (found, valid),
         "camera known": films.lifted(seen, filming._replace(believed=filming.camera), fps),
-        "key points exact": films.lifted([exact_key_points(one, filming) for one in truth], filming, fps),
+        "keypoints exact": films.lifted([exact_keypoints(one, filming) for one in truth], filming, fps),
         "hips true": (found + apart, valid),
         "limbs true": (truth - apart, valid),
         "all true, while found": (truth, valid),

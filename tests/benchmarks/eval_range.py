@@ -2,7 +2,7 @@
 
 python -m tests.benchmarks.eval_range [SEED]
 
-Everyday motion with the key points that networks find, before cameras that are known to 4 degrees and 12 %; the
+Everyday motion with the keypoints that networks find, before cameras that are known to 4 degrees and 12 %; the
 distance of the hips from the radar, lifted, placed and smoothed, against the true one: its mean error but for a
 constant, and the root mean square and mean errors of its rate of change, which is where Doppler comes from.
 """
@@ -16,7 +16,7 @@ from torch import Tensor
 from tensorsim.body.skeleton import mid_hips
 from tensorsim.config import ACTIVITIES
 from tensorsim.training.everyday import at_rate, everyday_motion
-from tensorsim.training.key_point_errors import FilmedMotion
+from tensorsim.training.keypoint_errors import FilmedMotion
 
 GROUPS, PEOPLE, SECONDS = 12, 4, 4.0
 RATES_HZ = (15.0, 18.0, 20.0, 25.0)

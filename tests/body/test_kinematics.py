@@ -158,7 +158,7 @@ def test_sampler_repeats_by_seed_and_covers_what_people_do() -> None:
 @pytest.mark.parametrize(
     "joints", [torch.zeros(13, 3), torch.zeros(14, 2), torch.zeros(14), torch.zeros(14, 3, dtype=torch.int64)]
 )
-def test_coco_key_points_refuse_other_shapes(joints: Tensor) -> None:
+def test_coco_keypoints_refuse_other_shapes(joints: Tensor) -> None:
     with pytest.raises(TensorsimError, match="joints: got"):
         skeleton.body_to_coco(joints)
 

@@ -42,7 +42,7 @@ class TestCocoToBody(StageTester):
 
 
 def named(**scores: float) -> tuple[Tensor, Tensor]:
-    """Key points at (index, 10 * index), all seen unless said otherwise."""
+    """Keypoints at (index, 10 * index), all seen unless said otherwise."""
     index = torch.arange(17.0)
     score = torch.tensor([scores.get(name, 0.9) for name in COCO_KEYPOINTS])
     return torch.stack([index, 10 * index], dim=-1), score
@@ -102,8 +102,8 @@ def test_joints_of_marks_are_the_joints() -> None:
     torch.testing.assert_close(back, joints[..., :2])
 
 
-def test_a_key_point_that_is_not_seen_moves_no_joint() -> None:
-    """Files of key points have zeros for what was not found."""
+def test_a_keypoint_that_is_not_seen_moves_no_joint() -> None:
+    """Files of keypoints have zeros for what was not found."""
     points = body_to_coco(standing())[:, [0, 2]]
     scores = torch.ones(17, dtype=torch.float64)
     wanted = points.clone()

@@ -24,7 +24,7 @@ def simulated(film: Path, out: Path, engine: str) -> tuple[dict[str, np.ndarray]
     return dict(np.load(out / "pose.npz")), dict(np.load(out / "maps.npz"))
 
 
-def test_key_points_and_maps_of_the_engines_agree(
+def test_keypoints_and_maps_of_the_engines_agree(
     film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "home"))
@@ -33,7 +33,7 @@ def test_key_points_and_maps_of_the_engines_agree(
     seen = (expected["keypoint_scores"] > 0.3) & expected["valid"][..., None]
 
     def compared(engine: str) -> tuple[np.ndarray, dict[str, np.ndarray], float]:
-        """Pixels that each key point is away, maps, and decibels by which the Doppler-time map's energy differs."""
+        """Pixels that each keypoint is away, maps, and decibels by which the Doppler-time map's energy differs."""
         found, maps = simulated(film, tmp_path / engine, engine)
         away = np.linalg.norm(found["keypoints_px"] - expected["keypoints_px"], axis=-1)[seen]
         energy = [(values["doppler_time"] ** 2).sum() for values in (maps, truth)]
@@ -45,7 +45,7 @@ def test_key_points_and_maps_of_the_engines_agree(
     for name in ("range_time", "range_time_mti", "doppler_time"):
         shown = truth[name] > 1e-2 * truth[name].max()  # 40 dB
         off = np.abs(20 * np.log10(maps[name][shown] / truth[name][shown]))
-        # Key points that differ by 0.0002 pixels show most in single cells between two parts of the body: 2 to 3 of
+        # Keypoints that differ by 0.0002 pixels show most in single cells between two parts of the body: 2 to 3 of
         # 2 400 are off by 0.1 dB, on some processors more than on others.
         assert np.quantile(off, 0.99) < 0.05
         assert np.quantile(off, 0.998) < 0.1

@@ -1,4 +1,4 @@
-"""BlazePose landmarks in the layouts of MediaPipe's interfaces become COCO key points in pixels."""
+"""BlazePose landmarks in the layouts of MediaPipe's interfaces become COCO keypoints in pixels."""
 
 import json
 import random

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tensorsim.evaluation.film_variants import KEY_POINT_ERROR, Observed, mirrored, over_variants, variants
+from tensorsim.evaluation.film_variants import KEYPOINT_ERROR, Observed, mirrored, over_variants, variants
 from tensorsim.types import Tracks
 
 FPS, FRAMES, SIZE = 20.0, 40, (120, 200)
@@ -51,15 +51,15 @@ def test_six_variants_of_one_activity(seen: Observed) -> None:
         assert torch.equal(part, whole[:, :, cut:])
     for part, whole in zip((*earlier.tracks, *earlier[1:3]), (*seen.tracks, *seen[1:3]), strict=True):
         assert torch.equal(part, whole[:, :, :-cut])
-    errors = [found[f"key points off, seed {seed}"].keypoints - seen.keypoints for seed in (0, 1)]
+    errors = [found[f"keypoints off, seed {seed}"].keypoints - seen.keypoints for seed in (0, 1)]
     there = seen.tracks.valid
     for error in errors:
         spread = error[there].std() / math.hypot(40, 100)
-        assert float(spread) == pytest.approx(KEY_POINT_ERROR, rel=0.05)
+        assert float(spread) == pytest.approx(KEYPOINT_ERROR, rel=0.05)
         assert not error[~there].any()
     assert not torch.equal(*errors)
     torch.testing.assert_close(
-        variants(seen, FPS)["key points off, seed 1"].keypoints - seen.keypoints, errors[1]
+        variants(seen, FPS)["keypoints off, seed 1"].keypoints - seen.keypoints, errors[1]
     )
 
 

@@ -139,7 +139,7 @@ def test_a_true_stage_leaves_its_error_out(stage: str, pipelines: Pipelines) -> 
     usual, better = error(Setting("b")), error(Setting("b", true_stage=stage))
     if stage == "lifting":
         local = [e - mid_hips(e)[:, None] for e in (usual, better)]
-        # The usual lifter, from exact key points and with bones of their lengths, is 2 mm off.
+        # The usual lifter, from exact keypoints and with bones of their lengths, is 2 mm off.
         assert float(local[1].square().mean()) < 0.4 * float(local[0].square().mean())
     elif stage == "position":
         assert float(mid_hips(better).abs().max()) < 0.1 * float(mid_hips(usual).abs().max())
@@ -526,7 +526,7 @@ def test_a_guess_that_a_radar_cannot_follow_is_left_out(
 def test_an_activity_by_itself_has_a_floor(
     activity: str, lifter: Literal["temporal", "nearest"], tmp_path: Path
 ) -> None:
-    """From true joints and from true key points, each activity by itself: a mean hides one that is lost."""
+    """From true joints and from true keypoints, each activity by itself: a mean hides one that is lost."""
     loop = truth.TruthLoop(
         tmp_path, clips=1, activities=(activity,), scenes=(SCENE,), stages=False, seed=3000, lifter=lifter
     )

@@ -183,7 +183,7 @@ def test_who_was_hidden_is_placed_anew() -> None:
 
 
 def test_nobody_is_lifted_in_a_frame_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lifting takes longer than a frame lasts; the state is the same as after lifting key points of score 0."""
+    """Lifting takes longer than a frame lasts; the state is the same as after lifting keypoints of score 0."""
     stage = simulator().poses[0]
     states = [stage.begin(2)]
     for t in range(12):

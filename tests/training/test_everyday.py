@@ -15,12 +15,12 @@ from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.motion.people import People, draw_people
 from tensorsim.training import everyday
 from tensorsim.training.everyday import at_rate, bystander, everyday_motion
-from tensorsim.training.key_point_errors import (
+from tensorsim.training.keypoint_errors import (
     FilmedMotion,
     Filming,
     draw_camera,
-    find_key_points,
-    project_key_points,
+    find_keypoints,
+    project_keypoints,
 )
 
 
@@ -148,14 +148,14 @@ def standing() -> Tensor:
     return at_rate(motion(6, 1)[0][0], 80, 20.0)
 
 
-def test_key_points_are_near_the_true_ones(standing):
+def test_keypoints_are_near_the_true_ones(standing):
     camera = CameraConfig(position_m=(0.0, 0.0, 1.5))
     filming = Filming(camera, camera, 360, 640)
     errors = []
     for seed in range(12):
         draw = Draw(1, torch.Generator().manual_seed(seed))
-        seen = find_key_points(standing, 1.75, 20.0, filming, draw)
-        other = find_key_points(
+        seen = find_keypoints(standing, 1.75, 20.0, filming, draw)
+        other = find_keypoints(
             standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed + 100))
         )
         errors.append((seen.keypoints - other.keypoints).norm(dim=-1).median())
@@ -172,7 +172,7 @@ def test_limbs_jump_for_a_moment_and_their_scores_hardly_fall(standing):
     filming = Filming(camera, camera, 360, 640)
     moves, scores = [], []
     for seed in range(40):
-        seen = find_key_points(standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
+        seen = find_keypoints(standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
         size = (seen.keypoints[:, 5] - seen.keypoints[:, 15]).norm(dim=-1).median()
         moves.append(seen.keypoints.diff(dim=0).norm(dim=-1) / size)
         scores.append(seen.scores[1:])
@@ -187,7 +187,7 @@ def test_limbs_jump_for_a_moment_and_their_scores_hardly_fall(standing):
 
 
 def longest_lead(keypoints: Tensor) -> int:
-    """For how many frames in a row the same ankle of key points (T, 17, 2) is ahead in the picture."""
+    """For how many frames in a row the same ankle of keypoints (T, 17, 2) is ahead in the picture."""
     ahead = keypoints[:, 15, 0] > keypoints[:, 16, 0]
     changes = torch.nonzero(ahead.diff())[:, 0]
     return int(torch.cat([torch.tensor([-1]), changes, torch.tensor([len(ahead) - 1])]).diff().amax())
@@ -203,13 +203,13 @@ def test_the_leg_that_is_ahead_is_called_left_or_right_throughout_in_some_walks_
     joints = joints + torch.tensor([0.0, 5.0, 0.0])
     leads = [
         longest_lead(
-            find_key_points(
+            find_keypoints(
                 joints, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed))
             ).keypoints
         )
         for seed in range(60)
     ]
-    assert longest_lead(project_key_points(joints, filming)[0]) < 15
+    assert longest_lead(project_keypoints(joints, filming)[0]) < 15
     assert 0.1 < sum(lead > 18 for lead in leads) / 60 < 0.5  # 0.03 by other errors
 
 
@@ -241,7 +241,7 @@ def test_cameras_have_people_in_view_and_are_known_to_some_degrees(standing):
     wrong = []
     for seed in range(40):
         filming = draw_camera(hips, Draw(1, torch.Generator().manual_seed(seed)))
-        seen = find_key_points(standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
+        seen = find_keypoints(standing, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
         assert float((seen.scores[:, 11:13] > 0).double().mean()) > 0.6
         wrong.append(filming.camera.pitch_rad - filming.believed.pitch_rad)
     assert 2.0 < math.degrees(float(torch.tensor(wrong).std())) < 6.5

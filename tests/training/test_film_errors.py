@@ -14,7 +14,7 @@ KICK, WALK = ActivityClip("S3 Kicking", "0", 2), ActivityClip("S8 Walking", "0",
 
 
 def seen(clip: ActivityClip, error_px: float = 0.0, joint: int = 9, lost: int = 0) -> Observed:
-    """The true key points, one of them misplaced; lost in the first frames; and a track without a person."""
+    """The true keypoints, one of them misplaced; lost in the first frames; and a track without a person."""
     pixels, inside, _ = project(clip.joints(FPS))
     keypoints = pixels.clone()
     keypoints[:, joint, 0] += error_px
@@ -32,7 +32,7 @@ def watched(clip: ActivityClip, *arguments: float) -> Watched:
 
 
 def test_a_unit_is_the_standing_height_in_the_picture() -> None:
-    """At any distance: a walker's key points, from eyes to ankles, span a little less than one."""
+    """At any distance: a walker's keypoints, from eyes to ankles, span a little less than one."""
     look = Look.of(WALK.joints(FPS), WALK.height_m)
     assert float(look.unit_px.max() / look.unit_px.min()) > 1.05
     span = look.shape[..., 1].amax(1) - look.shape[..., 1].amin(1)

@@ -49,7 +49,7 @@ def test_nobody_found_is_nobody_there() -> None:
 
 
 def test_joints_are_those_of_the_truth_loop() -> None:
-    """Key points with errors are lifted as those of a film are."""
+    """Keypoints with errors are lifted as those of a film are."""
     mine = errors()
     seen = mine(CLIP.joints(FPS), CLIP.height_m, torch.Generator().manual_seed(1))
     joints, valid = FilmLoss(mine)(CLIP.joints(FPS), CLIP.height_m, torch.Generator().manual_seed(1))
@@ -59,7 +59,7 @@ def test_joints_are_those_of_the_truth_loop() -> None:
 
 
 def test_films_are_lifted_and_labelled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A person at the place of the true key points, and nobody in an empty scene."""
+    """A person at the place of the true keypoints, and nobody in an empty scene."""
     for row, folder in (("S1 Empty", "S1_Empty"), ("S8 Walking", "S8_Walking")):
         clip = ActivityClip(row, "1", 12 if row == "S1 Empty" else 19)
         seen = true_keypoints(clip)

@@ -79,7 +79,7 @@ def test_other_bones_have_the_lengths_asked_for(pool: MotionPool) -> None:
         torch.testing.assert_close(ratio, torch.full_like(ratio, factor))
 
 
-def test_exact_key_points_are_the_projection(pool: MotionPool) -> None:
+def test_exact_keypoints_are_the_projection(pool: MotionPool) -> None:
     """Against NumPy: a camera that looks down by 20 degrees."""
     draw = Draw(3, torch.Generator().manual_seed(1))
     joints, height, fps = windows_of(pool, 20, draw, 30.0)
@@ -145,7 +145,7 @@ def test_learns(pool: MotionPool) -> None:
 
 
 def test_videopose3d_sees_and_learns_the_same_body(pool: MotionPool) -> None:
-    """Exact key points are the projection of the target; forty steps halve the error."""
+    """Exact keypoints are the projection of the target; forty steps halve the error."""
     draw = Draw(8, torch.Generator().manual_seed(1))
     joints, height, fps = windows_of(pool, 24, draw, 30.0)
     view = before_camera(joints, known_camera(20.0, 2.0, 60.0), (640, 480), draw)

@@ -136,7 +136,7 @@ with ThreadPoolExecutor(8) as pool:
 
 
 @torch.no_grad()
-def test_in_bfloat16_key_points_stay_where_they_are() -> None:
+def test_in_bfloat16_keypoints_stay_where_they_are() -> None:
     network = ts.vision.HRNet.from_pretrained()
     crops = rendered_crops(network.input_size, people=3, seed=100)
     plain, found = network(crops), OnnxPose(network, "openvino-bfloat16")(crops)
@@ -152,7 +152,7 @@ def test_in_bfloat16_key_points_stay_where_they_are() -> None:
 
 
 @torch.no_grad()
-def test_in_8_bits_key_points_stay_where_they_are(tmp_path: Path) -> None:
+def test_in_8_bits_keypoints_stay_where_they_are(tmp_path: Path) -> None:
     network = ts.vision.HRNet.from_pretrained()
     # Other people than those whose ranges were taken.
     crops = rendered_crops(network.input_size, people=2, seed=100)

@@ -80,7 +80,7 @@ def folder_of_keypoints(source: SourceConfig) -> list[Clip]:
     Raises:
         TensorsimError: as :func:`folder_of_films`.
     """
-    return _of_classes(source, (".json",), "COCO key points (.json) in a folder for each class")
+    return _of_classes(source, (".json",), "COCO keypoints (.json) in a folder for each class")
 
 
 def folder_of_motion(source: SourceConfig) -> list[Clip]:

@@ -10,7 +10,7 @@ from tensorsim.config import CameraConfig
 from tensorsim.errors import (
     check_count,
     check_image_size,
-    check_key_points,
+    check_keypoints,
     check_per_person,
     check_positive,
     check_score,
@@ -132,13 +132,13 @@ class CameraCalibrator(nn.Module):
     prior (pitch 0 +- 20 degrees, roll 0 +- 3, height 1.5 m within a factor of 1.6, field of view 60 +- 15 degrees
     along the longer side of the picture); one person who walks through the scene is enough to determine everything.
     The estimated camera height scales with the height of the people. However long somebody stays in one place, that
-    is one observation: errors of key points there do not average out. A person who never moves while others do may be
+    is one observation: errors of keypoints there do not average out. A person who never moves while others do may be
     an object that looks like a person, and is ignored.
 
     Args:
         person_height_m: standing heights in the order of the people; the last one applies to all further people.
         height_sd_m: standard deviation of these heights: 0.08 m for people of unknown height, less for known ones.
-        keypoint_threshold: score from which a key point counts. The usual 0.3 is too low for this: key points with
+        keypoint_threshold: score from which a keypoint counts. The usual 0.3 is too low for this: keypoints with
             low scores are biased (feet below the picture are found at its edge), and all frames share one camera.
         most_frames: at most this many of the frames in which somebody is upright are used: evenly spread ones, or in
             long films evenly spread windows of six seconds.
@@ -206,8 +206,8 @@ class CameraCalibrator(nn.Module):
         image_width: int,
         fps: float,
     ) -> CameraEstimate:
-        """Key points, scores, valid, image size, frame rate -> the cameras of the clips."""
-        check_key_points(keypoints, scores, valid, 4, "(..., P, T, 17, 2) key points in pixels")
+        """Keypoints, scores, valid, image size, frame rate -> the cameras of the clips."""
+        check_keypoints(keypoints, scores, valid, 4, "(..., P, T, 17, 2) keypoints in pixels")
         check_image_size(image_height, image_width)
         check_positive(fps, "fps")
         shape = keypoints.shape[:-4]
@@ -242,7 +242,7 @@ class CameraCalibrator(nn.Module):
     def _fit(
         self, keypoints: Tensor, scores: Tensor, valid: Tensor, height: int, width: int, fps: float
     ) -> Tensor:
-        """Means, deviations and number of frames (9,) of the camera of one clip of key points (P, T, 17, 2)."""
+        """Means, deviations and number of frames (9,) of the camera of one clip of keypoints (P, T, 17, 2)."""
         people = valid.shape[0]
         upright = steadily(is_upright(keypoints, scores, self.keypoint_threshold), valid, fps)
         ends = ends_of_body(keypoints)

@@ -1,4 +1,4 @@
-"""Key points of a film whose camera turns and zooms, as a still camera would have seen them.
+"""Keypoints of a film whose camera turns and zooms, as a still camera would have seen them.
 
 A camera that turns about its optical centre, and zooms, maps the pixels of one picture to those of another by a
 homography ``K' R K^-1`` (Hartley and Zisserman, Multiple View Geometry, 8.4), whatever the depth of what it sees. A
@@ -20,7 +20,7 @@ MOST_TURN_RAD = math.radians(45)
 #: Nor is one if a corner's depth along the mean direction is a smaller share than this of its depth in its own picture:
 #: it would land far outside.
 LEAST_DEPTH = 0.2
-#: Share of the picture's width and height at its left, right and lower edges where key points count as cut off.
+#: Share of the picture's width and height at its left, right and lower edges where keypoints count as cut off.
 _BESIDE, _BELOW = 0.01, 0.03
 
 
@@ -30,7 +30,7 @@ class StillPicture(NamedTuple):
     Attributes:
         tracks: of one clip (B = 1), boxes in pixels of this picture.
         keypoints: (1, P, T, 17, 2) pixels.
-        scores: (1, P, T, 17); 0 where the film's own picture cuts a key point off.
+        scores: (1, P, T, 17); 0 where the film's own picture cuts a keypoint off.
         size: its height and width; its middle is where the middle of the film's picture is on average.
         margin: (2,) pixels added to a picture of the film at the left and at the top (as many right and below).
         from_film: (T, 3, 3) homographies from homogeneous pixels of each frame to a still picture of the film's size.
@@ -145,7 +145,7 @@ def still_picture(
     """People of a film in the picture of a still camera that looks where the film's does on average.
 
     What a picture of the film cuts off stays cut off: boxes that reach its edge reach that of the still picture, and
-    key points at its edge are not seen.
+    keypoints at its edge are not seen.
 
     Args:
         tracks: of one clip (B = 1).

@@ -1,4 +1,4 @@
-"""Key points of people who stand or walk: which frames show them whole and upright, and whether they walk."""
+"""Keypoints of people who stand or walk: which frames show them whole and upright, and whether they walk."""
 
 import math
 
@@ -26,7 +26,7 @@ WALK_RATIO, WALK_RATIO_SPREAD = 0.9, 0.08
 
 
 def ends_of_body(keypoints: Tensor) -> Tensor:
-    """Middle of the ankle joints and of the shoulders from COCO key points: (..., 17, 2) -> (..., 2, 2)."""
+    """Middle of the ankle joints and of the shoulders from COCO keypoints: (..., 17, 2) -> (..., 2, 2)."""
     joints, _ = coco_to_body(keypoints, torch.ones_like(keypoints[..., 0]))
     return torch.stack([(joints[..., 10, :] + joints[..., 13, :]) / 2, joints[..., 1, :]], dim=-2)
 
@@ -39,7 +39,7 @@ def is_upright(keypoints: Tensor, scores: Tensor, threshold: float) -> Tensor:
     the height of the body; it looks longer from above).
 
     Args:
-        keypoints: (..., 17, 2) COCO key points, v down.
+        keypoints: (..., 17, 2) COCO keypoints, v down.
         scores: (..., 17).
         threshold: score from which a point is seen.
 
@@ -115,7 +115,7 @@ def walking_share(keypoints: Tensor, upright: Tensor, fps: float) -> Tensor:
 
     A person who stays in place, as in a fight, does not walk: within the second the neck moves by less than 0.2 of the
     body's size in the image, and that size changes by less than 5 %. If somebody walks straight away from the camera,
-    or towards it, the ankles hardly move relative to each other, so little more than key-point errors already counts.
+    or towards it, the ankles hardly move relative to each other, so little more than keypoint errors already counts.
 
     Args:
         keypoints: (..., T, 17, 2).

@@ -1,1 +1,1 @@
-"""Key points in pixels -> joints in metres."""
+"""Keypoints in pixels -> joints in metres."""

@@ -12,7 +12,7 @@ Levenberg-Marquardt from the lifter's distances finds a local minimum. There are
 towards the camera or away from it; :func:`tensorsim.vision.lifting.bone_branches.choose_branches` proposes others as
 long as that lowers the cost.
 
-Made for key points that are exact except for noise that is independent from frame to frame, such as labels or markers.
+Made for keypoints that are exact except for noise that is independent from frame to frame, such as labels or markers.
 Errors of networks last for seconds, and distort depths more than this corrects.
 """
 

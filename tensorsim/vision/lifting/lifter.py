@@ -212,7 +212,7 @@ class NearestPoseLifter(nn.Module):
 
     def _share(self, poses: Tensor, scale: Tensor, distance: Tensor, placeable: Tensor) -> Tensor:
         """Weight of each candidate, (S, T, K) summing to one; only frames (S, T) that are ``placeable`` count."""
-        # Where even the nearest pose fits badly, as with wrong key points, the others are hardly worse.
+        # Where even the nearest pose fits badly, as with wrong keypoints, the others are hardly worse.
         misfit = distance.amin(dim=-1, keepdim=True)
         emission = -0.5 * distance / (self.tolerance**2 + self.reserve * misfit)
         if self.temporal == 0.0 or self.neighbours == 1:

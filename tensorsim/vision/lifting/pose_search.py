@@ -1,4 +1,4 @@
-"""Exact search of a large pool of poses for those whose projections fit key points best.
+"""Exact search of a large pool of poses for those whose projections fit keypoints best.
 
 The pool is sorted once into blocks of similar poses. A frame is compared only with blocks that the triangle inequality
 does not rule out, by matrix products in bfloat16 (float32 for unequal weights) whose rounding error is bounded. What
@@ -37,7 +37,7 @@ def seen_along_depth(poses: Tensor) -> Tensor:
 
 
 def weighted_cosine(keypoints: Tensor, weights: Tensor, poses: Tensor) -> Tensor:
-    """Agreement of poses with key points: the cosine between both, weighted and each about its weighted mean.
+    """Agreement of poses with keypoints: the cosine between both, weighted and each about its weighted mean.
 
     The best scale a > 0 and shift b leave ``sum_j w_j |k_j - a p_j - b|^2 = (1 - cos^2) sum_j w_j |k_j - k|^2``;
     a pose that fits only upside down has a cosine below zero.
@@ -63,7 +63,7 @@ def cosine_table(moment: Tensor, weights: Tensor, seen: Tensor) -> tuple[Tensor,
     """:func:`weighted_cosine` of every frame with every pose by matrix products, and the poses' weighted norms.
 
     Args:
-        moment: (N, 28) weighted key points about their weighted mean, at unit weighted norm.
+        moment: (N, 28) weighted keypoints about their weighted mean, at unit weighted norm.
         weights: (N, 14) summing to one.
         seen: (L, 28) from :func:`seen_along_depth`.
 
@@ -175,9 +175,9 @@ def best_per_frame(frame: Tensor, pose: Tensor, cosine: Tensor, count: int) -> t
 
 
 class PoseSearch(nn.Module):
-    """The poses of a pool, at every heading, whose projections along depth fit key points best.
+    """The poses of a pool, at every heading, whose projections along depth fit keypoints best.
 
-    A pose p fits key points k with scale a > 0 and shift b by ``min sum_j w_j |k_j - a p_j - b|^2``: the largest
+    A pose p fits keypoints k with scale a > 0 and shift b by ``min sum_j w_j |k_j - a p_j - b|^2``: the largest
     :func:`weighted_cosine` is the nearest pose. With equal weights that is the Euclidean distance between centred
     projections of unit norm, which the paper compares.
 
@@ -202,7 +202,7 @@ class PoseSearch(nn.Module):
             tilt; None sorts anew.
 
     Shapes:
-        key points (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, ``pose * yaws + heading``, best
+        keypoints (N, 14, 2) and weights (N, 14) >= 0 -> (N, neighbours) int64, ``pose * yaws + heading``, best
         first; the lower index first where two fit equally well. A frame without weights gets the first poses.
         Not differentiable.
     """
@@ -275,7 +275,7 @@ class PoseSearch(nn.Module):
         return seen_from(turned, self.pitch_rad)
 
     def forward(self, keypoints: Tensor, weights: Tensor) -> Tensor:
-        """Key points (N, 14, 2) and weights (N, 14) -> indices (N, neighbours)."""
+        """Keypoints (N, 14, 2) and weights (N, 14) -> indices (N, neighbours)."""
         w = normalise_weights(weights)
         k = keypoints - (w[..., None] * keypoints).sum(dim=-2, keepdim=True)
         size = (w[..., None] * k.square()).sum(dim=(-2, -1)).sqrt()[:, None]

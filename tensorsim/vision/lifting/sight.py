@@ -1,4 +1,4 @@
-"""Key points as a level camera would see them: the camera's tilt, turn and focal length taken out.
+"""Keypoints as a level camera would see them: the camera's tilt, turn and focal length taken out.
 
 Lines of sight are turned into a frame whose z axis is vertical and whose y axis points horizontally towards the
 person. A point at (x, y, z) is then seen at ``a = x / y`` and ``e = z / y``: upright bodies stay upright whatever the
@@ -25,7 +25,7 @@ class Sight(NamedTuple):
         features: (S, T, FEATURES) for the network.
         joints: (S, T, 14, 2) of the joints, in units of ``size`` from the direction of the person; 0 if not seen.
         elevation: (S, T) ``e`` of the direction of the person.
-        size: (S, T) angular size: root mean square of the visible key points' ``a`` and ``e`` about their mean.
+        size: (S, T) angular size: root mean square of the visible keypoints' ``a`` and ``e`` about their mean.
         azimuth: (S, T, 2) cosine and sine of the angle from world +y to the person, towards +x.
     """
 
@@ -41,7 +41,7 @@ def mirror_image(sight: Sight, other_keypoint: Tensor, other_joint: Tensor) -> S
 
     Args:
         sight: of the people.
-        other_keypoint: (17,) int64, for each key point the one that takes its place in a mirror image.
+        other_keypoint: (17,) int64, for each keypoint the one that takes its place in a mirror image.
         other_joint: (14,) int64, the same for joints.
     """
     turn = torch.tensor([-1.0, 1.0], dtype=sight.joints.dtype, device=sight.joints.device)
@@ -116,7 +116,7 @@ def level_sight(
     """What the network needs to know about S tracks.
 
     Args:
-        keypoints: (S, T, 17, 2) COCO key points in pixels.
+        keypoints: (S, T, 17, 2) COCO keypoints in pixels.
         scores: (S, T, 17); below ``threshold`` they count as not seen.
         joints: (S, T, 14, 2) joints in pixels, see :func:`tensorsim.body.skeleton.coco_to_body`.
         joint_scores: (S, T, 14).

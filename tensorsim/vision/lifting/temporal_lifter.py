@@ -1,8 +1,8 @@
-"""Lifting by a network that sees a window of time: key points to joints, position and their uncertainty.
+"""Lifting by a network that sees a window of time: keypoints to joints, position and their uncertainty.
 
-The key points are seen as by a level camera (:mod:`tensorsim.vision.lifting.sight`), and a network of dilated
-convolutions along time (:mod:`tensorsim.vision.lifting.temporal_net`) finds depths, distance and corrections of the key
-points.
+The keypoints are seen as by a level camera (:mod:`tensorsim.vision.lifting.sight`), and a network of dilated
+convolutions along time (:mod:`tensorsim.vision.lifting.temporal_net`) finds depths, distance and corrections of the
+keypoints.
 """
 
 import math
@@ -74,7 +74,7 @@ def along_axes(across: Tensor, along: Tensor, azimuth: Tensor) -> Tensor:
 
 
 class TemporalLifter(nn.Module):
-    """Key points of tracked people over time -> joints about the hips, position of the hips, standard deviations.
+    """Keypoints of tracked people over time -> joints about the hips, position of the hips, standard deviations.
 
     The network sees the people and their mirror images, and both results are averaged: a mirrored film gives the
     mirrored motion.
@@ -83,7 +83,7 @@ class TemporalLifter(nn.Module):
         network: with its weights; None is an untrained one. :meth:`from_pretrained` loads the shipped one.
         camera: where the camera stands, its tilt and focal length; None is the default one, at the radar.
         person_height_m: standing heights in the order of the people; the last one applies to all further people.
-        keypoint_threshold: score from which a key point counts as seen.
+        keypoint_threshold: score from which a keypoint counts as seen.
         frames_per_block: frames that go through the network at once, for tracks with somebody in or near them, which
             bounds time and memory; results where somebody is tracked do not depend on it.
         camera_known: False for an estimated camera. The network sees where the floor is and derives the distance of
@@ -91,7 +91,7 @@ class TemporalLifter(nn.Module):
             are placed where their bones have the expected lengths.
 
     Shapes:
-        COCO key points (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
+        COCO keypoints (..., P, T, 17, 2) in pixels, scores (..., P, T, 17), boxes (..., P, T, 4) ``xyxy`` pixels,
         valid (..., P, T) bool, height and width of the picture, frames per second -> :class:`TemporalPose`. Frames
         in which nobody is tracked are filled from those around them, or far from any of those with the camera's
         position. Differentiable.
@@ -121,9 +121,9 @@ class TemporalLifter(nn.Module):
         self.network = TemporalNet() if network is None else network
         self.keypoint_threshold, self.frames_per_block = keypoint_threshold, frames_per_block
         self.camera_known, self.log_bones = camera_known, math.log(_ALL_BONES)
-        #: Body heights within which a key point counts as right; from twice as much on it is wrong.
+        #: Body heights within which a keypoint counts as right; from twice as much on it is wrong.
         self.near = 0.06
-        #: Seconds in which a joint moves from its key point to where the network places it.
+        #: Seconds in which a joint moves from its keypoint to where the network places it.
         self.gives_way_s = 0.2
         #: Frames before and after a frame that affect its result.
         # Three averages in a row: the direction, the size about it, and later the length of the bones.
@@ -154,7 +154,7 @@ class TemporalLifter(nn.Module):
         image_width: int,
         fps: float,
     ) -> TemporalPose:
-        """Key points, scores, boxes, valid, image size and fps -> TemporalPose."""
+        """Keypoints, scores, boxes, valid, image size and fps -> TemporalPose."""
         _check(keypoints, scores, boxes, valid)
         check_image_size(image_height, image_width)
         check_positive(fps, "fps")
@@ -211,9 +211,9 @@ class TemporalLifter(nn.Module):
     ) -> Lifted:
         """The pose as :class:`~tensorsim.vision.lifting.metric_pose.MetricPose` takes it.
 
-        A joint that is seen stays at its key point as long as the network places it nearby, so that fast motion is not
+        A joint that is seen stays at its keypoint as long as the network places it nearby, so that fast motion is not
         smoothed; one that is not seen, or seems to be wrong, is where the network places it. A joint moves between the
-        two over :attr:`gives_way_s`, and its key points in frames next to a wrong one are replaced as well: a foot that
+        two over :attr:`gives_way_s`, and its keypoints in frames next to a wrong one are replaced as well: a foot that
         is mistaken for the other one in some frames would jump there and back.
 
         Args:
@@ -360,7 +360,7 @@ def _in_rows(found: Tensor, rows: Tensor, tracks: int) -> Tensor:
 
 def _check(keypoints: Tensor, scores: Tensor, boxes: Tensor, valid: Tensor) -> None:
     """Refuse inputs that do not fit together."""
-    check_points(keypoints, 4, 17, 2, "keypoints", "(..., P, T, 17, 2) COCO key points in pixels")
+    check_points(keypoints, 4, 17, 2, "keypoints", "(..., P, T, 17, 2) COCO keypoints in pixels")
     frames = list(keypoints.shape[:-2])
     check_shape(scores, list(keypoints.shape[:-1]), "scores")
     check_shape(boxes, frames + [4], "boxes")  # noqa: RUF005 (TorchScript)

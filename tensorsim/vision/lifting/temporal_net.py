@@ -50,7 +50,7 @@ class _Block(nn.Module):
 class TemporalNet(nn.Module):
     """Maps tracks as a level camera sees them to joints in body heights; see :class:`Located`.
 
-    Every joint lies on its line of sight, which the network may move a little (much where the key point is hidden or
+    Every joint lies on its line of sight, which the network may move a little (much where the keypoint is hidden or
     wrong), at the depth that the network gives. Each frame is estimated from ``reach`` frames before and after it.
 
     Args:

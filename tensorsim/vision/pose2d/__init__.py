@@ -1,1 +1,1 @@
-"""Images and boxes -> COCO-17 key points."""
+"""Images and boxes -> COCO-17 keypoints."""

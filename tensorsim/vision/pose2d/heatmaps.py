@@ -274,6 +274,6 @@ class HeatmapDecoder(nn.Module):
         return self.stride * points, scores
 
     def extra_repr(self) -> str:
-        """What print shows, and what distinguishes cached key points from those of other settings."""
+        """What print shows, and what distinguishes cached keypoints from those of other settings."""
         spread = f", sharpness={self.sharpness:g}, tolerance={self.tolerance:g}" * (self.method == "expected")
         return f"{self.method}{spread}"

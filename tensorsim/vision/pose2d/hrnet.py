@@ -198,7 +198,7 @@ class _Transition(nn.ModuleList):
 
 
 class PresenceHead(nn.Module):
-    """How far to trust each heat map, from the whole crop: little if its key point is not in the picture.
+    """How far to trust each heat map, from the whole crop: little if its keypoint is not in the picture.
 
     Where the picture ends within a person, a heat map still has a highest peak, at another part of the body or of
     somebody else. Two layers see the mean of the features in 4 x 4 parts of the crop, black edges included, and the
@@ -212,7 +212,7 @@ class PresenceHead(nn.Module):
 
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
-        # Factors above 1 are cut, so that key points that are surely there keep their scores.
+        # Factors above 1 are cut, so that keypoints that are surely there keep their scores.
         self.most = 1.3
         self.hidden = nn.Linear(16 * channels + len(COCO_KEYPOINTS), hidden)
         self.factor = nn.Linear(hidden, len(COCO_KEYPOINTS))

@@ -30,13 +30,13 @@ class RtmPose(TopDownPose):
     """RTMPose as mmdeploy exports it, run by ONNX Runtime, with the interface of :class:`TopDownPose`.
 
     Args:
-        path: the ``.onnx`` file, with outputs ``simcc_x`` and ``simcc_y`` of 17 key points.
+        path: the ``.onnx`` file, with outputs ``simcc_x`` and ``simcc_y`` of 17 keypoints.
         flip_test: average with the mirror image: more accurate, at twice the cost.
         padding: boxes are enlarged by this factor; 1.25 as in training.
         crops_per_batch: largest number of crops in one batch of the network.
 
     Shapes: images (B, 3, H, W) RGB, uint8 or float in [0, 1], boxes (B, P, 4) ``xyxy`` pixels, valid (B, P) bool ->
-    key points (B, P, 17, 2), ``uv`` pixels of the image, and scores (B, P, 17), from 0; both zero where not valid.
+    keypoints (B, P, 17, 2), ``uv`` pixels of the image, and scores (B, P, 17), from 0; both zero where not valid.
 
     Raises:
         TensorsimError: a file that is missing, unreadable or of another layout, arguments out of range; see

@@ -15,9 +15,9 @@ def even_count(duration_s: Tensor, fps: float) -> Tensor:
 def to_even_time(
     tracks: Tracks, keypoints: Tensor, scores: Tensor, times_s: Tensor, fps: float
 ) -> tuple[Tracks, Tensor, Tensor]:
-    """Interpolate boxes and key points linearly in time, from the times of the frames to ``k / fps``.
+    """Interpolate boxes and keypoints linearly in time, from the times of the frames to ``k / fps``.
 
-    Between two frames a person is valid if valid in both, and a key point has the lower of its two scores. At the time
+    Between two frames a person is valid if valid in both, and a keypoint has the lower of its two scores. At the time
     of a frame its values are kept. During a pause, in which the film shows one frame for a long time, people move
     evenly to where they are in the next frame.
 
@@ -29,9 +29,9 @@ def to_even_time(
         fps: frames per second of the result.
 
     Returns:
-        Tracks, key points and scores at the ``T' = floor(duration * fps) + 1`` even times of the longest clip, the
+        Tracks, keypoints and scores at the ``T' = floor(duration * fps) + 1`` even times of the longest clip, the
         first of which is that of the first frame. After the last frame of a clip nobody is valid. Differentiable with
-        respect to boxes, key points and scores.
+        respect to boxes, keypoints and scores.
 
     Raises:
         TensorsimError: times of another shape, not finite or not increasing, fewer than 2 frames, fps not positive.

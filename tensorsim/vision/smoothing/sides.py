@@ -7,7 +7,7 @@ limbs jump: the vector from the right to the left ankle turns round from one fra
 import torch
 from torch import Tensor, nn
 
-from tensorsim.errors import check_key_points, check_positive, check_score
+from tensorsim.errors import check_keypoints, check_positive, check_score
 
 
 def viterbi_two_states(stay: Tensor, change: Tensor, second: float) -> Tensor:
@@ -43,7 +43,7 @@ def viterbi_two_states(stay: Tensor, change: Tensor, second: float) -> Tensor:
 
 
 class SteadySides(nn.Module):
-    """Exchanges left and right key points where that makes limbs move steadily.
+    """Exchanges left and right keypoints where that makes limbs move steadily.
 
     Arms (with the shoulders) and legs (with the hips) are two chains of two states, as found or exchanged. From one
     frame to the next each pair of points, left and right, costs the squared change of the vector between them, in
@@ -57,8 +57,8 @@ class SteadySides(nn.Module):
         threshold: score from which a point counts.
 
     Shapes:
-        COCO key points (..., T, 17, 2) pixels, scores (..., T, 17), valid (..., T) bool, frames per second -> key
-        points and scores. Differentiable, except for the choice of those to exchange.
+        COCO keypoints (..., T, 17, 2) pixels, scores (..., T, 17), valid (..., T) bool, frames per second ->
+        keypoints and scores. Differentiable, except for the choice of those to exchange.
 
     Raises:
         TensorsimError: costs that are not positive, wrong shapes, NaN.
@@ -72,8 +72,8 @@ class SteadySides(nn.Module):
         self.change, self.exchanged, self.threshold = change, exchanged, threshold
 
     def forward(self, keypoints: Tensor, scores: Tensor, valid: Tensor, fps: float) -> tuple[Tensor, Tensor]:
-        """Key points, scores, valid, frame rate -> key points and scores of steady sides."""
-        check_key_points(keypoints, scores, valid, 3, "(..., T, 17, 2) key points in pixels")
+        """Keypoints, scores, valid, frame rate -> keypoints and scores of steady sides."""
+        check_keypoints(keypoints, scores, valid, 3, "(..., T, 17, 2) keypoints in pixels")
         check_positive(fps, "fps")
         if valid.numel() == 0:
             return keypoints, scores
@@ -93,7 +93,7 @@ class SteadySides(nn.Module):
         return keypoints, torch.where(swap, scores.index_select(-1, opposite), scores)
 
     def _exchanged(self, points: Tensor, weights: Tensor, first: int, fps: float) -> Tensor:
-        """Frames (N, T) in which the three pairs from key point ``first`` on are exchanged."""
+        """Frames (N, T) in which the three pairs from keypoint ``first`` on are exchanged."""
         pairs, both = points[:, :, first : first + 6], weights[:, :, first : first + 6]
         between = pairs[:, :, 0::2] - pairs[:, :, 1::2]
         trust = torch.minimum(both[:, :, 0::2], both[:, :, 1::2])

@@ -47,7 +47,7 @@ from tests.stage import StageTester
 
 
 def standing(feet_v: float, size_px: float) -> Tensor:
-    """COCO key points (17, 2) of a body that stands in the middle of the picture, seen from the front."""
+    """COCO keypoints (17, 2) of a body that stands in the middle of the picture, seen from the front."""
     points = torch.tensor(STANDING, dtype=torch.float64)
     u = (WIDTH - 1) / 2 + size_px * points[:, 0]
     return torch.stack([u, feet_v + size_px * (points[:, 1] - 0.96)], dim=-1)
@@ -142,7 +142,7 @@ def test_nobody_tells_nothing() -> None:
 
 
 @pytest.mark.parametrize(("seed", "far_share", "lift"), [(1, 0.7, 0.15), (2, 0.5, 0.12)])
-def test_key_points_of_low_scores_do_not_tell_the_camera(seed: int, far_share: float, lift: float) -> None:
+def test_keypoints_of_low_scores_do_not_tell_the_camera(seed: int, far_share: float, lift: float) -> None:
     """Feet that are found too high where they are near, with half the usual score, make people small there."""
     camera = known_camera(24.0, 3.0, 60.0)
     walk = walk_before(camera, seed=seed)
@@ -336,9 +336,9 @@ def test_a_tilt_that_is_hardly_known_is_drawn_towards_level() -> None:
 
 def test_pictures_taken_upright_are_as_wide_along_their_longer_side() -> None:
     nobody = torch.zeros(1, 30, dtype=torch.bool)
-    key_points, scores = torch.zeros(1, 30, 17, 2), torch.zeros(1, 30, 17)
+    keypoints, scores = torch.zeros(1, 30, 17, 2), torch.zeros(1, 30, 17)
     for height, width, fov in ((360, 640, 60.0), (640, 360, 35.98), (500, 500, 60.0)):
-        found = CameraCalibrator()(key_points, scores, nobody, height, width, FPS)
+        found = CameraCalibrator()(keypoints, scores, nobody, height, width, FPS)
         assert math.degrees(float(found.horizontal_fov_rad)) == pytest.approx(fov, abs=0.01)
         unsure = found._replace(pitch_sd_rad=torch.tensor(1e6), horizontal_fov_rad=torch.tensor(1.5))
         kept = with_reserve(unsure, height, width)

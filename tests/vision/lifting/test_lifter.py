@@ -262,7 +262,7 @@ def test_nearest_valid_frame() -> None:
 
 
 def film(joints: Tensor, yaw: float, noise_px: float) -> tuple[Tensor, Tensor]:
-    """Key points of a body of 1.75 m that stays 4 m in front of a pinhole camera, and its relative depths."""
+    """Keypoints of a body of 1.75 m that stays 4 m in front of a pinhole camera, and its relative depths."""
     body = 1.75 * (joints - mid_hips(joints)[:, None]) / body_height(joints).mean()
     c, s = math.cos(yaw), math.sin(yaw)
     x = c * body[..., 0] - s * body[..., 1]

@@ -177,7 +177,7 @@ def film(
     camera: CameraConfig = CameraConfig(),  # noqa: B008
     tall: float = TALL,
 ) -> tuple[Tensor, Lifted]:
-    """Key points (T, 14, 2) of world joints and the lifting that an all-knowing lifter would return."""
+    """Keypoints (T, 14, 2) of world joints and the lifting that an all-knowing lifter would return."""
     image = torch.tensor(project(world.numpy(), camera))
     pose = camera_to_world(camera)
     ahead = (world - pose[:, 3]) @ pose[:, 2]

@@ -40,7 +40,7 @@ def network(seed: int = 0, channels: int = 16) -> TemporalNet:
 
 
 def filmed(frames: int = 24, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """A generated walk before CAMERA: joints, key points, scores, boxes, valid, each for one person."""
+    """A generated walk before CAMERA: joints, keypoints, scores, boxes, valid, each for one person."""
     joints = ActivityGenerator().generate("walking", 1, seed, frames / 30).joints[0]
     focal = WIDTH / 2 / math.tan(CAMERA.horizontal_fov_rad / 2)
     center = ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -94,8 +94,8 @@ class TestBeforeAnEstimatedCamera(TestTemporalLifter):
         return TemporalLifter(network(), CAMERA, (1.7, 1.6), frames_per_block=5, camera_known=False)
 
 
-def test_joints_lie_on_the_lines_of_sight_of_their_key_points() -> None:
-    """An untrained network moves no key point: projected back, its joints are at the pixels that it was given."""
+def test_joints_lie_on_the_lines_of_sight_of_their_keypoints() -> None:
+    """An untrained network moves no keypoint: projected back, its joints are at the pixels that it was given."""
     torch.manual_seed(0)
     net = TemporalNet(16)
     with torch.no_grad():  # depths and sizes at random, no shifts
@@ -138,10 +138,10 @@ def test_metric_pose_places_what_the_lifter_found() -> None:
     torch.testing.assert_close(joints, found.joints + found.root[..., None, :], atol=1e-5, rtol=0)
 
 
-def test_key_points_that_are_nearly_right_stay_and_others_move() -> None:
+def test_keypoints_that_are_nearly_right_stay_and_others_move() -> None:
     _, keypoints, scores, boxes, valid = filmed()
     torch.manual_seed(0)
-    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()  # moves no key point
+    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()  # moves no keypoint
     body, _ = coco_to_body(keypoints, scores)
     jittery, wrong = body.clone(), body.clone()
     with torch.no_grad():
@@ -155,10 +155,10 @@ def test_key_points_that_are_nearly_right_stay_and_others_move() -> None:
     torch.testing.assert_close(far, body, atol=1e-6, rtol=0)
 
 
-def test_a_joint_does_not_jump_to_a_wrong_key_point_and_back() -> None:
+def test_a_joint_does_not_jump_to_a_wrong_keypoint_and_back() -> None:
     _, keypoints, scores, boxes, valid = filmed(40)
     torch.manual_seed(0)
-    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()  # moves no key point
+    lifter = TemporalLifter(TemporalNet(16), CAMERA, (1.7,)).double().eval()  # moves no keypoint
     body, _ = coco_to_body(keypoints, scores)
     spoilt = body.clone()
     with torch.no_grad():
@@ -473,7 +473,7 @@ def test_where_nobody_is_seen_for_long_the_camera_looks() -> None:
 
 
 @pytest.mark.parametrize(("shift", "moved"), [(0.5, 0.0), (1.5, 0.5), (2.1, 1.0), (5.0, 1.0)])
-def test_key_points_far_from_the_found_body_give_way_to_it(shift: float, moved: float) -> None:
+def test_keypoints_far_from_the_found_body_give_way_to_it(shift: float, moved: float) -> None:
     """Up to ``near`` standing heights they stay, from twice that on the body's joints take their places."""
     torch.manual_seed(0)
     _, keypoints, scores, boxes, valid = filmed()

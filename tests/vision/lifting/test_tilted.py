@@ -73,7 +73,7 @@ def test_other_parts_know_no_camera() -> None:
 
 
 def test_a_rolled_camera_lifts_as_a_level_one_does() -> None:
-    """Key points turned about the middle of the picture, as by a camera that is turned the other way."""
+    """Keypoints turned about the middle of the picture, as by a camera that is turned the other way."""
     generator = torch.Generator().manual_seed(0)
     library = torch.randn(40, 14, 3, generator=generator)
     level = NearestPoseLifter(library, yaws=4, neighbours=4)

@@ -20,7 +20,7 @@ from tensorsim.vision.pose2d.hrnet import IMAGENET_MEAN, IMAGENET_STD
 from tensorsim.vision.pose2d.rtmpose import OnnxSimcc, SimccDecoder
 from tests.stage import StageTester
 
-#: Colour that a key point looks for; left and right look for the same one.
+#: Colour that a keypoint looks for; left and right look for the same one.
 COLOUR = [min(k, MIRRORED[k]) % 3 for k in range(17)]
 SIZE = (64, 48)
 
@@ -32,7 +32,7 @@ def write_network(
     names: tuple[str, str] = ("simcc_x", "simcc_y"),
     stretch: float = 2.0,
 ) -> Path:
-    """The largest value of each column and row of the colour of each key point, ``stretch`` bins a pixel."""
+    """The largest value of each column and row of the colour of each keypoint, ``stretch`` bins a pixel."""
     height, width = SIZE
     nodes, outputs = [], []
     for name, axis, length in ((names[0], 2, width), (names[1], 3, height)):

@@ -22,7 +22,7 @@ OPPOSITE = [0, 1, 2, 3, 4, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
 
 
 def seen(activity: str, heading_deg: float, seed: int = 0, fps: float = FPS) -> Tensor:
-    """Key points (T, 17, 2) of a generated person 4.5 m from a level camera."""
+    """Keypoints (T, 17, 2) of a generated person 4.5 m from a level camera."""
     joints = ActivityGenerator().generate(activity, seed=seed, duration_s=4.0, rate_hz=fps).joints[0].double()
     joints = joints - mid_hips(joints)[:1] * joints.new_tensor([1.0, 1.0, 0.0])
     joints = joints @ rotation(2, torch.tensor(math.radians(heading_deg), dtype=torch.float64)).mT

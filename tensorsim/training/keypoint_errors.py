@@ -1,4 +1,4 @@
-"""Simulated key points as networks find them in films from any camera, and the motion that the pipeline makes of them.
+"""Simulated keypoints as networks find them in films from any camera, and the motion that the pipeline makes of them.
 
 Networks do not err at random: a hidden arm stays in the wrong place for as long as it is hidden, left and right are
 mixed up for a while, the leg that is ahead is called left at every step, a wrist or ankle jumps to something else for a
@@ -21,13 +21,13 @@ from tensorsim.training.lifter_views import USUAL_SCORES
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
-#: Errors of each COCO key point relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
+#: Errors of each COCO keypoint relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
 RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2
 #: Jumps per second of each: a limb is taken for something else, or for that of the other side, for some frames; then
 #: their mean duration in seconds and their distance.
 JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
 JUMP_S, JUMP = 0.12, 0.2
-#: Key points that are mixed up with those of the other side: arms, legs, all.
+#: Keypoints that are mixed up with those of the other side: arms, legs, all.
 MIXED_UP = ((5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16), tuple(range(5, 17)))
 #: Pictures: height, width.
 SIZES = ((360, 640), (480, 640), (640, 360))
@@ -98,17 +98,17 @@ def _jumps(frames: int, fps: float, often: Tensor, each: Draw) -> tuple[Tensor, 
     return jumps, since.clamp(min=0)
 
 
-def project_key_points(joints: Tensor, filming: Filming) -> tuple[Tensor, Tensor]:
-    """Key points of joints (T, 14, 3) m in the pictures, (T, 17, 2) pixels, and their depths (T, 17) m."""
+def project_keypoints(joints: Tensor, filming: Filming) -> tuple[Tensor, Tensor]:
+    """Keypoints of joints (T, 14, 3) m in the pictures, (T, 17, 2) pixels, and their depths (T, 17) m."""
     focal = focal_length(filming.camera, filming.width)
     center = principal_point(filming.camera, filming.height, filming.width)
     return project(body_to_coco(joints), focal, center, camera_to_world(filming.camera))
 
 
-def find_key_points(joints: Tensor, height_m: float, fps: float, filming: Filming, draw: Draw) -> Seen:
+def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming, draw: Draw) -> Seen:
     """What networks find of a person with joints (T, 14, 3) m and this height; ``draw`` is for one."""
     frames = len(joints)
-    true, depth = project_key_points(joints, filming)
+    true, depth = project_keypoints(joints, filming)
     focal = focal_length(filming.camera, filming.width)
     unit = (focal * height_m / depth[:, 11:13].mean(1).clamp(min=0.5))[:, None, None]
 
@@ -194,7 +194,7 @@ def _followed(found: Tensor, scores: Tensor, tilted: Tensor, fps: float, draw: D
 
 
 class FilmedMotion:
-    """Motion as the pipeline finds it in films: key points with errors, lifted, placed and smoothed."""
+    """Motion as the pipeline finds it in films: keypoints with errors, lifted, placed and smoothed."""
 
     def __init__(self) -> None:
         nothing = nn.Identity()
@@ -208,12 +208,12 @@ class FilmedMotion:
         draw = Draw(1, generator)
         hips = torch.stack([(joints[:, 8] + joints[:, 11]) / 2 for joints, _ in people])
         filming = draw_camera(hips.mean(0), draw)
-        seen = [find_key_points(joints, height, fps, filming, draw) for joints, height in people]
+        seen = [find_keypoints(joints, height, fps, filming, draw) for joints, height in people]
         return self.lifted(seen, filming, fps)
 
     @torch.no_grad()
     def lifted(self, seen: list[Seen], filming: Filming, fps: float) -> tuple[Tensor, Tensor]:
-        """What the pipeline makes of key points from a camera: joints (P, T, 14, 3) and presence (P, T)."""
+        """What the pipeline makes of keypoints from a camera: joints (P, T, 14, 3) and presence (P, T)."""
         keypoints, scores, valid = (torch.stack(parts) for parts in zip(*seen, strict=True))
         boxes = keypoint_boxes(keypoints, scores)
         if not bool(valid.any()):

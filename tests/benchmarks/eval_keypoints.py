@@ -1,6 +1,6 @@
-"""Where networks mark joints beside the joints of rendered people: ``python -m tests.benchmarks.eval_key_points``.
+"""Where networks mark joints beside the joints of rendered people: ``python -m tests.benchmarks.eval_keypoints``.
 
-People are rendered upright, from all sides; each network of ``--pose`` marks their key points. Printed are medians
+People are rendered upright, from all sides; each network of ``--pose`` marks their keypoints. Printed are medians
 over people, per joint, of how far the mark is from the joint, in percent of the height of the picture of the body
 (right and down positive), and the shares of the segments, found and taken
 (:class:`tensorsim.body.skeleton.Marks`).
@@ -43,7 +43,7 @@ class Marked(NamedTuple):
 
 
 def joints_of(keypoints: Tensor) -> npt.NDArray[np.float64]:
-    """Body joints (14, 2) of COCO key points (17, 2) that are exact."""
+    """Body joints (14, 2) of COCO keypoints (17, 2) that are exact."""
     return coco_to_body(keypoints.double(), torch.ones(17).double())[0].numpy()
 
 
@@ -108,7 +108,7 @@ def shares(rows: list[Marked]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m tests.benchmarks.eval_key_points", description=(__doc__ or "").split(":")[0]
+        prog="python -m tests.benchmarks.eval_keypoints", description=(__doc__ or "").split(":")[0]
     )
     parser.add_argument(
         "--pose", nargs="*", default=[None], help="paths or names of networks (default: ours)"
