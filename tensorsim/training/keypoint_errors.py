@@ -141,8 +141,8 @@ def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming
     # Where legs seen from the side pass each other, the one ahead in the picture is called left, or right, throughout.
     side_on = (true[:, 11, 0] - true[:, 12, 0]).abs() < 0.06 * unit[:, 0, 0]
     left_ahead = true[:, 15, 0] > true[:, 16, 0]
-    usual = (draw(0.0, 1.0) < 0.5)[0]
-    exchanged = side_on & (left_ahead != usual) & _spell(frames, 0.4, 0.3, 1.2, draw)[0]
+    left_leads = (draw(0.0, 1.0) < 0.5)[0]
+    exchanged = side_on & (left_ahead != left_leads) & _spell(frames, 0.4, 0.3, 1.2, draw)[0]
     legs = torch.arange(17) > 12
     found = torch.where((exchanged[:, None] & legs)[..., None], found[:, list(MIRRORED)], found)
     for group in MIXED_UP:
@@ -159,9 +159,9 @@ def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming
     found = torch.where(jumps[..., None], landed, found)
 
     inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
-    confidence = torch.tensor(USUAL_SCORES, dtype=torch.float64)
+    usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
     # Networks are almost as confident of wrong points.
-    scores = confidence - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
+    scores = usual - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
     scores = (scores - jumps * each(0.15, 0.25, frames).T).clamp(0.35, 0.98)
     scores = torch.where(merged[..., 0], scores - 0.2, scores)
     hidden = _spell(frames, 0.06, 0.1, 1.0, each).T

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from tensorsim.body.gait import boulic_gait
 from tensorsim.body.kinematics import rotation
+from tensorsim.body.skeleton import MIRRORED_JOINTS
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.lifting.walking_legs import WalkingLegs
@@ -16,7 +17,7 @@ from tests.stage import StageTester
 
 FPS = 30.0
 LEGS = [9, 10, 12, 13]
-MIRRORED_LEGS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 13, 11, 9, 10]
+MIRRORED_LEGS = [MIRRORED_JOINTS[joint] if joint in LEGS else joint for joint in range(14)]
 
 
 def generated(activity: str, heading_deg: float = 0.0, seed: int = 3) -> Tensor:
@@ -87,6 +88,20 @@ class TestWalkingLegs(StageTester):
             ((joints, seen, valid.float(), fps), "valid"),
             ((joints, seen, valid, 0.0), "fps"),
         ]
+
+
+class TestSeenLegs(TestWalkingLegs):
+    """Legs that are seen to swing too little, but for half a second, so that the phase matters."""
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        generator = torch.Generator().manual_seed(0)
+        walk = swinging(generated("walking"), 0.4)[40:80].to(dtype)
+        noise = torch.randn(*batch, *walk.shape, generator=generator, dtype=dtype)
+        joints = walk + 0.005 * noise
+        seen, valid = masks(joints, hidden=False)
+        seen[..., 12:27, 9:11] = seen[..., 12:27, 12:14] = False
+        assert float((self.make()(joints, seen, valid, FPS) - joints).abs().amax()) > 0.1
+        return joints, seen, valid, FPS
 
 
 @pytest.mark.parametrize("heading", [0.0, 70.0, 200.0])
