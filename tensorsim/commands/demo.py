@@ -81,6 +81,7 @@ class Demo(NetworkOptions, ClipOptions):
         from tensorsim.sources import drawn_by, film_source
         from tensorsim.streaming import maps_of_pose
         from tensorsim.summary import summary_of, write_summary
+        from tensorsim.vision.engines import chosen_engine
 
         device = usable_device(self.device)
         with collected_warnings() as messages, torch.inference_mode():
@@ -125,6 +126,7 @@ class Demo(NetworkOptions, ClipOptions):
                     **drawn_by(camera, (HEIGHT, WIDTH)),
                     "film_against_truth": likeness | joint_errors(pose, film),
                     "empty_map_against_truth": empty_likeness,
+                    "engine": chosen_engine(self.engine, device),
                     "options": self.described(),
                     "warnings": messages,
                 }

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tensorsim.commands.arguments import Option, Several
-from tensorsim.commands.networks import NetworkOptions, default_networks, load_networks
+from tensorsim.commands.networks import Engine, NetworkOptions, default_networks, load_networks
 from tensorsim.commands.options import RadarOptions, at_display_rate, load_recognizer
 from tensorsim.exceptions import TensorsimError, check_count, check_seed, collected_warnings, print_warnings
 from tensorsim.files import check_folder, complete_file, write_text
@@ -25,6 +25,9 @@ class EvaluateFilms(NetworkOptions):
 
     data: Path
     """Folder of films with a labels.json: a list of {"file", "start_s", "end_s", "accept": [activities]}."""
+    engine: Engine = "onnxruntime"
+    """What runs the networks on the CPU, as in `tensorsim simulate`. ONNX Runtime gives about the same figures on all
+    processors."""
     out: Path
     """Output folder."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from tensorsim.commands.arguments import Option
 from tensorsim.exceptions import TensorsimError
 
-Engine = Literal["onnxruntime", "openvino", "int8", "torch"]
+Engine = Literal["auto", "onnxruntime", "openvino", "int8", "torch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,10 +23,11 @@ class NetworkOptions:
     such network as .onnx. Default: $TENSORSIM_POSE if set, else the shipped one."""
     flip_test: Option[bool] = None
     """Also run the pose network on the mirror image of each person: more accurate, at twice the cost. Default: on."""
-    engine: Engine = "onnxruntime"
+    engine: Engine = "auto"
     """What runs the networks on the CPU. ONNX Runtime takes half the time of torch, after exporting the networks once
     to the user's cache. Faster but less exact: "openvino" (pip install openvino) runs the pose network in bfloat16 on
-    CPUs that support it, "int8" in 8-bit integers. A GPU always uses torch."""
+    CPUs that support it, "int8" in 8-bit integers. auto: OpenVINO if it is installed and the CPU supports bfloat16,
+    else ONNX Runtime. A GPU always uses torch."""
 
 
 def default_networks(detector: str | None, pose: str | None) -> tuple[Path, Path]:

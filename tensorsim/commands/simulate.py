@@ -122,6 +122,7 @@ class Simulate(NetworkOptions, ClipOptions):
         from tensorsim.pipeline import PoseToDoppler
         from tensorsim.sources import KINDS, kind_of
         from tensorsim.summary import summary_of, write_summary
+        from tensorsim.vision.engines import chosen_engine
 
         kind = kind_of(self.source)
         for field in fields(self):
@@ -152,6 +153,8 @@ class Simulate(NetworkOptions, ClipOptions):
                     alone = write_each_person(folder, done, self) if self.per_person else []
                 summary = label | summary_of(source, config, found, maps)
                 summary |= {"options": self.described(), "warnings": messages}
+                if kind == "video":
+                    summary["engine"] = chosen_engine(self.engine, device)
                 for row, person in zip(summary["people"], alone, strict=len(alone) > 0):
                     row |= person.label
                 self.write_report(

@@ -1,7 +1,11 @@
 """What runs the networks on a processor: ONNX Runtime, OpenVINO, or torch."""
 
+from importlib.util import find_spec
+
+import torch
 from torch import nn
 
+from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose, Runtime
@@ -15,7 +19,20 @@ _RUNTIMES: dict[str, tuple[Runtime, Runtime]] = {
     "openvino": ("openvino", "openvino-bfloat16"),
     "int8": ("onnxruntime", "int8"),
 }
-ENGINES = (*_RUNTIMES, "torch")
+ENGINES = ("auto", *_RUNTIMES, "torch")
+
+
+def chosen_engine(engine: str, device: torch.device) -> str:
+    """The engine that runs the networks on this device if ``engine`` is asked for; ``"auto"`` is the fastest one.
+
+    That is OpenVINO where it is installed and the processor has instructions for bfloat16, otherwise ONNX Runtime.
+    """
+    if device.type != "cpu":
+        return "torch"
+    if engine != "auto":
+        return engine
+    fast = find_spec("openvino") is not None and multiplies_bfloat16(device)
+    return "openvino" if fast else "onnxruntime"
 
 
 def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module, nn.Module]:
@@ -23,7 +40,8 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
 
     Args:
         engine: ``"onnxruntime"`` runs both in float32; ``"int8"`` the pose network in 8-bit integers; ``"openvino"``
-            the pose network in bfloat16 on processors with instructions for it; ``"torch"`` changes nothing.
+            the pose network in bfloat16 on processors with instructions for it; ``"torch"`` changes nothing;
+            ``"auto"`` is the one of :func:`chosen_engine`.
         detector, pose: the stages; networks inside of ``pose`` are replaced.
 
     Raises:
@@ -31,6 +49,7 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
     """
     if engine not in ENGINES:
         raise TensorsimError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
+    engine = chosen_engine(engine, torch.device("cpu"))
     if engine == "torch":
         return detector, pose
     of_detector, of_pose = _RUNTIMES[engine]

@@ -1,14 +1,17 @@
 """Engines run the networks of this package and no others."""
 
+import importlib.util
 from typing import get_args
 
 import pytest
+import torch
 from torch import nn
 
 import tensorsim as ts
 from tensorsim.commands.networks import Engine
 from tensorsim.errors import TensorsimError
-from tensorsim.vision.engines import ENGINES, run_by
+from tensorsim.vision import engines
+from tensorsim.vision.engines import ENGINES, chosen_engine, run_by
 from tensorsim.vision.onnx_engine import OnnxPose
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
@@ -42,11 +45,31 @@ def test_commands_offer_the_engines_that_there_are() -> None:
     assert get_args(Engine) == ENGINES
 
 
+@pytest.mark.parametrize("installed", [True, False])
+@pytest.mark.parametrize("bfloat16", [True, False])
+def test_the_fastest_engine_is_taken_by_itself(
+    monkeypatch: pytest.MonkeyPatch, network: ts.vision.HRNet, installed: bool, bfloat16: bool
+) -> None:
+    spec = importlib.util.find_spec("torch") if installed else None
+    monkeypatch.setattr(engines, "find_spec", lambda name: spec)
+    monkeypatch.setattr(engines, "multiplies_bfloat16", lambda device: bfloat16)
+    expected = "openvino" if installed and bfloat16 else "onnxruntime"
+    cpu = torch.device("cpu")
+    assert chosen_engine("auto", cpu) == expected
+    assert chosen_engine("int8", cpu) == "int8"
+    assert chosen_engine("auto", torch.device("cuda")) == "torch"
+    monkeypatch.undo()
+    pose = TopDownPose(network, flip_test=False)
+    run_by("auto", nn.Identity(), pose)
+    assert isinstance(pose.network, OnnxPose)
+    assert pose.network.engine.runtime.startswith(chosen_engine("auto", cpu))
+
+
 def test_torch_leaves_them_alone_and_other_names_are_refused(network: ts.vision.HRNet) -> None:
     pose = TopDownPose(network, flip_test=False)
     assert run_by("torch", nn.Identity(), pose)[1] is pose
     assert pose.network is network
     with pytest.raises(
-        TensorsimError, match="engine: got 'fast', expected one of onnxruntime, openvino, int8, torch"
+        TensorsimError, match="engine: got 'fast', expected one of auto, onnxruntime, openvino, int8, torch"
     ):
         run_by("fast", nn.Identity(), pose)
