@@ -25,9 +25,6 @@ class EvaluateFilms(NetworkOptions):
 
     data: Path
     """Folder of films with a labels.json: a list of {"file", "start_s", "end_s", "accept": [activities]}."""
-    engine: Engine = "onnxruntime"
-    """What runs the networks on the CPU, as in `tensorsim simulate`. ONNX Runtime gives about the same figures on all
-    processors."""
     out: Path
     """Output folder."""
     scenes: tuple[Literal["free-space", "through-wall"], ...] = ("free-space", "through-wall")
@@ -52,6 +49,9 @@ class EvaluateFilms(NetworkOptions):
     horizontally."""
     seed: int = 0
     """Random seed for the receiver noise."""
+    engine: Engine = "onnxruntime"
+    """What runs the networks on the CPU, as in `tensorsim simulate`. ONNX Runtime gives about the same figures on all
+    processors."""
     device: str = "auto"
     """Device: cpu, cuda, cuda:1, ...; auto uses a GPU if there is one."""
     quiet: bool = False

@@ -1,5 +1,6 @@
 """The networks in ONNX Runtime and OpenVINO give the people and the maps that they give in torch."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def simulated(film: Path, out: Path, engine: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     options = ["--engine", engine, "--device", "cpu", "--classifier", "none", "--quiet"]
     cli.main(["simulate", str(film), "--out", str(out), *options])
+    assert json.loads((out / "summary.json").read_text())["engine"] == engine
     return dict(np.load(out / "pose.npz")), dict(np.load(out / "maps.npz"))
 
 

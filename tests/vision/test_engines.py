@@ -48,7 +48,7 @@ def test_commands_offer_the_engines_that_there_are() -> None:
 @pytest.mark.parametrize("installed", [True, False])
 @pytest.mark.parametrize("bfloat16", [True, False])
 def test_the_fastest_engine_is_taken_by_itself(
-    monkeypatch: pytest.MonkeyPatch, network: ts.vision.HRNet, installed: bool, bfloat16: bool
+    monkeypatch: pytest.MonkeyPatch, installed: bool, bfloat16: bool
 ) -> None:
     spec = importlib.util.find_spec("torch") if installed else None
     monkeypatch.setattr(engines, "find_spec", lambda name: spec)
@@ -58,11 +58,13 @@ def test_the_fastest_engine_is_taken_by_itself(
     assert chosen_engine("auto", cpu) == expected
     assert chosen_engine("int8", cpu) == "int8"
     assert chosen_engine("auto", torch.device("cuda")) == "torch"
-    monkeypatch.undo()
+
+
+def test_the_chosen_engine_runs_the_networks(network: ts.vision.HRNet) -> None:
     pose = TopDownPose(network, flip_test=False)
     run_by("auto", nn.Identity(), pose)
     assert isinstance(pose.network, OnnxPose)
-    assert pose.network.engine.runtime.startswith(chosen_engine("auto", cpu))
+    assert pose.network.engine.runtime.startswith(chosen_engine("auto", torch.device("cpu")))
 
 
 def test_torch_leaves_them_alone_and_other_names_are_refused(network: ts.vision.HRNet) -> None:
