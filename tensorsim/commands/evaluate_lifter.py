@@ -52,7 +52,7 @@ class EvaluateLifter:
         rows = {
             "generated, errors": (("activities", "exercises"), True),
             "falls, errors": (("falls",), True),
-            "blows, kicks, other falls, errors": (("everyday",), True),
+            "blows, kicks, other falls, errors": (("everyday", "blows and kicks"), True),
         }
         if self.motion:
             rows = {

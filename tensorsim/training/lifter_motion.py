@@ -21,7 +21,7 @@ from tensorsim.body.skeleton import body_height, mid_hips
 from tensorsim.data.motion_files import load_motion, motion_keys
 from tensorsim.errors import TensorsimError
 from tensorsim.files import write_bytes
-from tensorsim.motion import everyday, martial_arts
+from tensorsim.motion import everyday, exercises, martial_arts, scripts
 from tensorsim.motion.act import Act
 from tensorsim.motion.activities import perform
 from tensorsim.motion.exercises import EXERCISES
@@ -65,12 +65,17 @@ class MotionPool(NamedTuple):
 
 #: Kinds of motion and the share of each.
 KINDS = {
-    "activities": 0.31, "exercises": 0.15, "falls": 0.15, "joined poses": 0.16, "captures": 0.13, "everyday": 0.10,
+    "activities": 0.22, "exercises": 0.11, "falls": 0.12, "joined poses": 0.12, "captures": 0.15, "everyday": 0.06,
+    "blows and kicks": 0.22,
 }  # fmt: skip
-#: Blows, kicks and falls of everyday people, which happen at time 0 of their scripts.
+#: Kicks of a ball and falls of everyday people, which happen at time 0 of their scripts.
 _EVERYDAY = (
     everyday.kick_ball, everyday.fall_onto_seat, everyday.fall_on_knees, everyday.walk_and_fall_any_way,
-    martial_arts.punch_once, martial_arts.kick_round, martial_arts.swing_fist,
+)  # fmt: skip
+#: Blows and kicks, which are over in a few frames and therefore rare unless there are many; the first is at time 0.
+_BLOWS = (
+    martial_arts.kick_round, scripts.kick, martial_arts.punch_once, martial_arts.swing_fist, martial_arts.kick_round,
+    scripts.kick, exercises.box, scripts.punch,
 )  # fmt: skip
 
 
@@ -209,6 +214,8 @@ def _batches(
             yield _captured(sequences, size, generator)
         elif kind == "everyday":
             yield _performed(_EVERYDAY[i % len(_EVERYDAY)], size, -3.0, generator)
+        elif kind == "blows and kicks":
+            yield _performed(_BLOWS[i % len(_BLOWS)], size, -2.0, generator)
         else:
             yield _joined(size, generator)
 

@@ -18,6 +18,7 @@ from tensorsim.training.lifter import (
     laplace,
     lifter_loss,
     picture_joints,
+    speed_weight,
     target,
 )
 from tensorsim.training.lifter_motion import FRAMES, KINDS, MotionPool, build_pool, captures, with_other_bones
@@ -133,6 +134,17 @@ def test_loss_is_least_for_the_truth_and_for_the_right_spread(pool: MotionPool) 
     levels = torch.linspace(-4.0, 1.0, 101)
     best = levels[laplace(error, levels).argmin()]
     assert float(best.exp()) == pytest.approx(0.2, rel=0.05)
+
+
+def test_errors_of_fast_joints_weigh_more() -> None:
+    """A wrist that moves at 2 body heights/s between frames 12 and 15 has the weight 3 there and two frames around."""
+    about = torch.zeros(1, 30, 14, 3)
+    about[0, :, 4, 1] = 2.0 / 25 * (torch.arange(30.0) - 12).clamp(0, 3)
+    weight = speed_weight(about, torch.tensor([25.0]))
+    expected = torch.ones(1, 30, 14)
+    expected[0, 10:18, 4] = 3.0
+    torch.testing.assert_close(weight, expected)
+    assert float(speed_weight(20 * about, torch.tensor([25.0])).max()) == 6.0
 
 
 def test_learns(pool: MotionPool) -> None:
