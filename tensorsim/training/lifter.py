@@ -50,9 +50,9 @@ def speed_weight(about: Tensor, fps: Tensor) -> Tensor:
         fps: (B,).
     """
     speed = torch.diff(about, dim=1).norm(dim=-1) * fps[:, None, None]
-    speed = torch.cat([speed[:, :1], torch.maximum(speed[:, 1:], speed[:, :-1]), speed[:, -1:]], dim=1)
-    near = F.max_pool1d(speed.transpose(1, 2), 2 * _NEAR_FRAMES + 1, 1, _NEAR_FRAMES).transpose(1, 2)
-    return (1.0 + near).clamp(max=_LARGEST_WEIGHT)
+    steps = _NEAR_FRAMES + 1  # between frames, to each side
+    fastest = F.max_pool1d(speed.transpose(1, 2), 2 * steps, 1, steps).transpose(1, 2)
+    return (1.0 + fastest).clamp(max=_LARGEST_WEIGHT)
 
 
 def lifter_loss(found: Located, true: Tensor, weight: Tensor, fps: Tensor) -> dict[str, Tensor]:

@@ -1,4 +1,5 @@
-"""Motion to train a lifter on: activities, exercises, falls, randomly joined poses, captures, everyday motion.
+"""Motion to train a lifter on: activities, exercises, falls, randomly joined poses, captures, everyday motion,
+blows and kicks.
 
 Everything is stored as joints at 60 frames per second, about 4 s each, on the floor, and is turned, placed and filmed
 anew every time it is used.
@@ -24,11 +25,9 @@ from tensorsim.files import write_bytes
 from tensorsim.motion import everyday, exercises, martial_arts, scripts
 from tensorsim.motion.act import Act
 from tensorsim.motion.activities import perform
-from tensorsim.motion.exercises import EXERCISES
 from tensorsim.motion.people import People, PeopleConfig, draw_people
 from tensorsim.motion.pose_sampler import FAMILIES, sample_angles
 from tensorsim.motion.resample import PoseResampler
-from tensorsim.motion.scripts import SCRIPTS
 from tensorsim.motion.timing import minimum_jerk
 
 #: Frames per second and number of frames of a motion.
@@ -77,6 +76,13 @@ _BLOWS = (
     martial_arts.kick_round, scripts.kick, martial_arts.punch_once, martial_arts.swing_fist, martial_arts.kick_round,
     scripts.kick, exercises.box, scripts.punch,
 )  # fmt: skip
+#: Kinds that follow scripts: their scripts, used in turn, and ``farthest_s`` of :func:`_performed`.
+_SCRIPTED: dict[str, tuple[tuple[Callable[[Tensor, People], Act], ...], float]] = {
+    "activities": (scripts.SCRIPTS, 2.0),
+    "exercises": (tuple(exercises.EXERCISES.values()), 0.5),
+    "everyday": (_EVERYDAY, -3.0),
+    "blows and kicks": (_BLOWS, -2.0),
+}
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
@@ -198,13 +204,11 @@ def _batches(
     kind: str, count: int, sequences: list[tuple[Tensor, float]], generator: torch.Generator
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Motions of one kind with heights, a chunk at a time."""
-    scripts = list(EXERCISES.values())
     for i, first in enumerate(range(0, count, _CHUNK)):
         size = min(_CHUNK, count - first)
-        if kind == "activities":
-            yield _performed(SCRIPTS[i % 12], size, 2.0, generator)
-        elif kind == "exercises":
-            yield _performed(scripts[i % len(scripts)], size, 0.5, generator)
+        if kind in _SCRIPTED:
+            in_turn, farthest_s = _SCRIPTED[kind]
+            yield _performed(in_turn[i % len(in_turn)], size, farthest_s, generator)
         elif kind == "falls":
             joints, heights = _performed(fall_any_way, size, 0.0, generator)
             # Reversed in time, they get up.
@@ -212,10 +216,6 @@ def _batches(
             yield torch.where(back[:, None, None, None], joints.flip(1), joints), heights
         elif kind == "captures":
             yield _captured(sequences, size, generator)
-        elif kind == "everyday":
-            yield _performed(_EVERYDAY[i % len(_EVERYDAY)], size, -3.0, generator)
-        elif kind == "blows and kicks":
-            yield _performed(_BLOWS[i % len(_BLOWS)], size, -2.0, generator)
         else:
             yield _joined(size, generator)
 
