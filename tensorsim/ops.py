@@ -35,3 +35,13 @@ def safe_sqrt(x: Tensor) -> Tensor:
         return x.sqrt()
     positive = x > 0
     return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
+
+
+def magnitude(x: Tensor) -> Tensor:
+    """``|x|`` of complex numbers, with gradient 0 at 0.
+
+    Without gradients by ``hypot``, which takes a third of the time of ``abs``; its gradient at 0 would be NaN.
+    """
+    if x.requires_grad:
+        return x.abs()
+    return torch.hypot(torch.real(x), torch.imag(x))

@@ -1,6 +1,7 @@
 """The process of the command: how it starts and how it ends."""
 
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -45,6 +46,27 @@ def test_threads_are_settled_before_torch_is_imported_and_for_the_command_only()
     for argv, expected in ((["/usr/bin/tensorsim", "check"], "100"), (["my_program.py", "check"], "None")):
         done = run_python(AT_IMPORT.format(action=show, argv=argv))
         assert done.stdout.strip() == expected, done.stderr
+
+
+#: Prints how many pages the kernel provided for ten blocks of 10 000 pages, one after another.
+BLOCKS = """
+import os, resource
+from tensorsim import process
+os.environ.update({settings})
+process.keep_freed_memory()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    block = b"x" * 40_960_000
+    del block
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only the GNU C library has this setting")
+def test_freed_memory_is_reused_unless_the_user_has_decided() -> None:
+    assert int(run_python(BLOCKS.format(settings={})).stdout) < 15_000
+    kept = run_python(BLOCKS.format(settings={"MALLOC_MMAP_THRESHOLD_": "131072"}))
+    assert int(kept.stdout) > 90_000
 
 
 def test_a_deleted_working_directory_is_said(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from tensorsim.config import ProcessingConfig, RadarConfig, SceneConfig, WallConfig
 from tensorsim.config.processing import Mti
 from tensorsim.errors import TensorsimError, check_scene, is_exporting
-from tensorsim.ops import flatten_batch, safe_sqrt, unflatten_batch
+from tensorsim.ops import flatten_batch, magnitude, safe_sqrt, unflatten_batch
 from tensorsim.protocols import check_instance
 from tensorsim.radar.options import configured, echo_of, refuse_conflicts
 from tensorsim.radar.processing.ambiguity import SpeedCheck, check_unambiguous
@@ -375,10 +375,10 @@ class RadarSimulator(nn.Module):
 
     def _shown(self, profiles: Tensor) -> Tensor:
         """Magnitude (B, R, m) of profiles (B, m, V R), root mean square over the antennas."""
-        magnitude = profiles.transpose(1, 2).abs()
+        shown = magnitude(profiles.transpose(1, 2))
         if self.channels == 1:
-            return magnitude
-        return safe_sqrt(magnitude.unflatten(1, [self.channels, -1]).square().mean(1))
+            return shown
+        return safe_sqrt(shown.unflatten(1, [self.channels, -1]).square().mean(1))
 
     def _piece(self, fresh: Tensor, positions: Tensor, rcs: Tensor, pending: Pending) -> Piece:
         """Maps of the next pulses, given what is pending from the earlier ones.

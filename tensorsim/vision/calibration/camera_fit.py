@@ -140,19 +140,14 @@ def residuals(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
 def jacobian(parameters: Tensor, bodies: Bodies, fps: float) -> Tensor:
     """Jacobian (..., P, T, 5, 4 + 3 P) of :func:`residuals` for the parameters, by central differences."""
     people, step = bodies.upright.shape[0], 1e-5
-    columns: list[Tensor] = []
-    each = torch.eye(people, dtype=parameters.dtype, device=parameters.device)[:, None, None, :]
-    for i in range(4 + 3):
-        # One camera parameter, or one of all people at once: a body depends only on those of its own person.
-        moved = torch.zeros(4 + 3 * people, dtype=parameters.dtype, device=parameters.device)
-        if i < 4:
-            moved[i] = step
-        else:
-            moved[4 + (i - 4) * people : 4 + (i - 3) * people] = step
-        slope = residuals(parameters + moved, bodies, fps) - residuals(parameters - moved, bodies, fps)
-        slope = slope.unsqueeze(-1) / (2 * step)
-        columns.append(slope if i < 4 else slope * each)
-    return torch.cat(columns, dim=-1)
+    # One camera parameter, or one of all people at once: a body depends only on those of its own person.
+    moved = torch.eye(4 + 3, dtype=parameters.dtype, device=parameters.device) * step
+    moved = torch.cat([moved[:, :4], moved[:, 4:].repeat_interleave(people, dim=1)], dim=1)
+    at = parameters.unsqueeze(-2)
+    slopes = residuals(at + moved, bodies, fps) - residuals(at - moved, bodies, fps)
+    slopes = slopes.movedim(-4, -1) / (2 * step)  # (..., P, T, 5, 7)
+    each = torch.eye(people, dtype=parameters.dtype, device=parameters.device)[:, None, None, None, :]
+    return torch.cat([slopes[..., :4], (slopes[..., 4:, None] * each).flatten(-2)], dim=-1)
 
 
 def robust(residual: Tensor, outlier: float) -> tuple[Tensor, Tensor]:
