@@ -400,7 +400,11 @@ class VideoToPose(nn.Module):
         if self.temporal is not None:
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
             lifted = self.temporal.in_picture(found, body, body_scores, height, width, fps)
-            body, noise = lifted.keypoints, self.noise_share * found.deviation
+            noise = self.noise_share * found.deviation
+            if self.bone_fit is None:
+                body = lifted.keypoints
+            else:  # made for exact keypoints, which stay where they are even where the lifter doubts them
+                body = torch.where(reliable.unsqueeze(-1), body, lifted.keypoints)
         else:
             assert self.lifter is not None
             lifted = self.lifter(body, body_scores)

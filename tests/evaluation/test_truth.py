@@ -128,6 +128,17 @@ def test_true_lifting_places_joints_exactly() -> None:
     assert float(error[..., 1].abs().max()) < 5e-3
 
 
+@pytest.mark.parametrize("near", [0.06, 1e-4])
+def test_exact_keypoints_stay_where_the_lifter_doubts_them(
+    near: float, pipelines: Pipelines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipelines.lifters[False], "near", near)
+    kick = ActivityClip("S3 Kicking", "0", 2)
+    errors = truth.pose_errors(*pipelines.joints(Setting("b"), kick, None), kick)
+    assert errors["root"] < 0.02
+    assert errors["joints"] < 0.01
+
+
 @pytest.mark.parametrize("stage", STAGES[2:])
 def test_a_true_stage_leaves_its_error_out(stage: str, pipelines: Pipelines) -> None:
     clip = walk()
