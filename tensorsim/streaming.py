@@ -70,7 +70,7 @@ def within_reach(found: Found, radar: RadarConfig) -> Found:
     if ahead_m == 0:
         return found
     warnings.warn(
-        f"people are beyond the {radar.reach_m:.2f} m of this radar's range axis: the radar is placed {ahead_m:.1f} m "
+        f"people are beyond the {radar.reach_m:.2f} m of this radar's range axis: the radar is placed {ahead_m:.2f} m "
         "in front of the camera (with --camera-fov or --initial-distance it stays at the camera)",
         TensorsimWarning,
         stacklevel=2,

@@ -83,7 +83,7 @@ def found(joints: Tensor, camera: CameraEstimate | None) -> Found:
 
 def test_the_radar_is_moved_where_the_camera_was_estimated_and_it_is_said():
     before = found(body(9.0), estimate())
-    with pytest.warns(TensorsimWarning, match=r"placed \d\.\d m in front of the camera"):
+    with pytest.warns(TensorsimWarning, match=r"placed \d\.\d\d m in front of the camera"):
         after = within_reach(before, RADAR)
     moved = before.pose.joints - after.pose.joints
     # Frames without anybody as well: a jump there would bend the curve beside it.

@@ -142,6 +142,7 @@ class TemporalLifter(nn.Module):
         other = TemporalLifter(
             self.network, camera, heights, self.keypoint_threshold, self.frames_per_block, known
         )
+        other.near, other.gives_way_s = self.near, self.gives_way_s
         return other.to(self.heights.device).train(self.training)
 
     def forward(

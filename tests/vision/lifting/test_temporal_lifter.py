@@ -272,6 +272,15 @@ def test_tracks_cost_time_only_around_the_frames_in_which_they_are() -> None:
         assert bool(torch.isfinite(one).all())
 
 
+def test_for_another_camera_the_settings_are_the_same() -> None:
+    lifter = TemporalLifter(network(), CAMERA, (1.7,), keypoint_threshold=0.4, frames_per_block=99)
+    lifter.near, lifter.gives_way_s = 0.1, 0.3
+    other = lifter.seen_by(CameraConfig(focal_px=900.0))
+    assert (other.near, other.gives_way_s, other.keypoint_threshold) == (0.1, 0.3, 0.4)
+    assert (other.frames_per_block, other.heights.tolist(), other.camera_known) == (99, [1.7], True)
+    assert other.pinhole.focal_length(100) == 900.0
+
+
 def test_before_an_estimated_camera_bones_have_their_lengths() -> None:
     """A person who keeps still: the same picture, from where all bones together are 2.39 standing heights long."""
     _, keypoints, scores, boxes, valid = filmed(60)
