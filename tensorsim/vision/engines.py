@@ -1,14 +1,12 @@
 """What runs the networks on a processor: ONNX Runtime, OpenVINO, or torch."""
 
-from importlib.util import find_spec
-
 import torch
 from torch import nn
 
 from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.detection.rtmdet import RTMDet
-from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose, Runtime
+from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose, Runtime, import_failure
 from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
@@ -25,13 +23,13 @@ ENGINES = ("auto", *_RUNTIMES, "torch")
 def chosen_engine(engine: str, device: torch.device) -> str:
     """The engine that runs the networks on this device if ``engine`` is asked for; ``"auto"`` is the fastest one.
 
-    That is OpenVINO where it is installed and the processor has instructions for bfloat16, otherwise ONNX Runtime.
+    That is OpenVINO where it can be imported and the processor has instructions for bfloat16, otherwise ONNX Runtime.
     """
     if device.type != "cpu":
         return "torch"
     if engine != "auto":
         return engine
-    fast = find_spec("openvino") is not None and multiplies_bfloat16(device)
+    fast = multiplies_bfloat16(device) and import_failure("openvino") is None
     return "openvino" if fast else "onnxruntime"
 
 

@@ -10,8 +10,8 @@ import io
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock, local
 from typing import Any, Literal, NoReturn
@@ -39,6 +39,15 @@ Images = npt.NDArray[np.float32]
 Run = Callable[[Images], list[Images]]
 
 
+def import_failure(package: str) -> str | None:
+    """Why a package cannot be imported, in one line; None if it can."""
+    try:
+        import_module(package)
+    except Exception as error:  # a broken installation may raise anything
+        return " ".join(str(error).split()) or type(error).__name__
+    return None
+
+
 class OnnxEngine(nn.Module):
     """Runs a network (N, 3, H, W) -> one or several tensors (N, ...) in another runtime on the CPU.
 
@@ -59,10 +68,9 @@ class OnnxEngine(nn.Module):
     def __init__(self, network: nn.Module, size: tuple[int, int], runtime: Runtime = "onnxruntime") -> None:
         super().__init__()
         package = "openvino" if runtime.startswith("openvino") else "onnxruntime"
-        if find_spec(package) is None:
-            raise TensorsimError(
-                f"--engine {package}: not installed; install it with `pip install {package}`"
-            )
+        reason = import_failure(package)
+        if reason is not None:
+            raise TensorsimError(f"--engine {package}: {reason}; install it with `pip install {package}`")
         # The exporter leaves a network in the mode that it says it is in, parts included.
         self.network, self.size, self.runtime = network.eval(), size, runtime
         self.threads = torch.get_num_threads()

@@ -1,6 +1,5 @@
 """Engines run the networks of this package and no others."""
 
-import importlib.util
 from typing import get_args
 
 import pytest
@@ -50,8 +49,7 @@ def test_commands_offer_the_engines_that_there_are() -> None:
 def test_the_fastest_engine_is_taken_by_itself(
     monkeypatch: pytest.MonkeyPatch, installed: bool, bfloat16: bool
 ) -> None:
-    spec = importlib.util.find_spec("torch") if installed else None
-    monkeypatch.setattr(engines, "find_spec", lambda name: spec)
+    monkeypatch.setattr(engines, "import_failure", lambda _: None if installed else "no such package")
     monkeypatch.setattr(engines, "multiplies_bfloat16", lambda device: bfloat16)
     expected = "openvino" if installed and bfloat16 else "onnxruntime"
     cpu = torch.device("cpu")

@@ -14,8 +14,7 @@ import tensorsim as ts
 from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.render.crops import rendered_crops
-from tensorsim.vision import onnx_engine
-from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose, Runtime
+from tensorsim.vision.onnx_engine import OnnxDetector, OnnxEngine, OnnxPose, Runtime, import_failure
 from tensorsim.vision.pose2d.heatmaps import HeatmapDecoder
 
 
@@ -101,9 +100,19 @@ def test_other_weights_are_another_file_and_damage_is_repaired(tmp_path: Path) -
 def test_without_the_library_it_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, runtime: Runtime, package: str
 ) -> None:
-    monkeypatch.setattr(onnx_engine, "find_spec", lambda _: None)
-    with pytest.raises(TensorsimError, match=f"--engine {package}: not installed"):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(
+        TensorsimError, match=f"--engine {package}: .*; install it with `pip install {package}`"
+    ):
         OnnxPose(nn.Identity(), runtime)
+
+
+def test_a_library_that_does_not_load_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = "raise RuntimeError('libfast.so: \\n cannot be opened')"
+    (tmp_path / "broken_engine.py").write_text(broken)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert import_failure("broken_engine") == "libfast.so: cannot be opened"
+    assert import_failure("math") is None
 
 
 @torch.no_grad()
