@@ -179,7 +179,7 @@ def complete_or_nothing(out: Path, source: Path | None = None) -> Iterator[Path]
     even after a crash. The scratch folder is inside ``out``, and therefore on the same file system.
 
     Args:
-        out: a folder, created if needed; one created here is removed again if it stays empty.
+        out: a folder, created if needed, with its parents; those created here are removed again if they stay empty.
         source: the file or folder that the results are made from.
 
     Raises:
@@ -252,18 +252,18 @@ def _listed(out: Path) -> list[str]:
 def locked(out: Path) -> Iterator[None]:
     """Lock a folder for this process; the lock is released when the process ends, even by a crash.
 
-    The folder is created if needed, and removed again if it is still empty.
+    The folder and its parents are created if needed, and those created are removed again if they are still empty.
     """
-    made = not out.exists()
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
+        with writing(out):
+            out.mkdir(parents=True, exist_ok=True)
         with _only_one(out):
             yield
     finally:
-        if made:
-            with suppress(OSError):  # it is not empty
-                out.rmdir()
+        with suppress(OSError):  # it is not empty
+            for folder in made:
+                folder.rmdir()
 
 
 @contextmanager

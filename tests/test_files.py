@@ -185,6 +185,24 @@ def test_only_the_folder_itself_has_to_take_files(tmp_path: Path, monkeypatch: p
         assert set(files_in(elsewhere)) == {name, "summary.json"}
 
 
+def fail_beside(folder: Path, name: str | None) -> None:
+    """A run that fails, in one case after something else has been put next to its folder."""
+    with complete_or_nothing(folder):
+        if name is not None:
+            (folder.parent / name).touch()
+        raise ValueError("broken")
+
+
+def test_a_failed_run_leaves_no_folders(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ValueError, match="broken"):
+        fail_beside(tmp_path / "there" / "new" / "out", None)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "there"]
+    with pytest.raises(ValueError, match="broken"):
+        fail_beside(tmp_path / "new" / "out", "other")
+    assert sorted(tmp_path.rglob("*")) == sorted(tmp_path / name for name in ("there", "new", "new/other"))
+
+
 def test_a_second_run_into_a_folder_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with complete_or_nothing(out) as folder:
