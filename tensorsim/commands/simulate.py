@@ -20,6 +20,7 @@ from tensorsim.commands.options import (
 )
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 from tensorsim.limits import check_range
+from tensorsim.process import is_command, keep_freed_memory
 
 if TYPE_CHECKING:
     import torch
@@ -113,6 +114,8 @@ class Simulate(NetworkOptions, ClipOptions):
     def run(self) -> None:
         """Run the command."""
         self.check(self.out)
+        if is_command():  # for the rest of the process
+            keep_freed_memory()
 
         import torch
 

@@ -17,7 +17,6 @@ from typing import Any
 import torch
 
 import tensorsim as ts
-from tensorsim import process
 from tensorsim.commands.demo import film_person
 from tensorsim.data.video_writer import write_video
 from tensorsim.live.camera import Camera
@@ -56,7 +55,6 @@ class Repeated:
 
 
 def main() -> None:
-    process.keep_freed_memory()  # as the command does
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--film", type=Path)
     parser.add_argument("--minutes", type=float, default=60.0)

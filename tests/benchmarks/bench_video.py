@@ -15,6 +15,7 @@ keypoints with the mirror test in the boxes that were tracked. Its wall time is 
 from tensorsim import process
 
 process.prepare()  # as the command does, before torch is loaded: threads that spin take time from the others
+process.keep_freed_memory()
 
 # isort: on
 import argparse
