@@ -114,7 +114,7 @@ class Simulate(NetworkOptions, ClipOptions):
     def run(self) -> None:
         """Run the command."""
         self.check(self.out)
-        if is_command():  # for the rest of the process
+        if is_command():  # it affects the whole process, which may otherwise be somebody else's
             keep_freed_memory()
 
         import torch

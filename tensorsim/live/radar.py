@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.errors import TensorsimError
-from tensorsim.ops import of_person
+from tensorsim.ops import magnitude, of_person
 from tensorsim.pipeline import PoseToDoppler
 from tensorsim.radar.processing.columns import block_rms
 from tensorsim.radar.simulator import Pending
@@ -182,15 +182,15 @@ class LiveRadar:
         end_s = self.pulse / self.prf_hz
         piece = self.simulator.advance(*scene, first, self.pending)
         self.pending = piece.pending
-        still = self._display(0, piece.profiles[0].T.abs())
-        moving = self._display(1, piece.moving[0].T.abs())
+        still = self._display(0, magnitude(piece.profiles[0].T))
+        moving = self._display(1, magnitude(piece.moving[0].T))
         return NewColumns(piece.doppler_time[0], still, moving, end_s)
 
-    def _display(self, index: int, magnitude: Tensor) -> Tensor:
+    def _display(self, index: int, columns: Tensor) -> Tensor:
         """Columns (R, m) at the display rate; those that do not fill a block are kept for the next call."""
         if self.rest[index].numel():
-            magnitude = torch.cat([self.rest[index], magnitude], dim=-1)
+            columns = torch.cat([self.rest[index], columns], dim=-1)
         block = self.simulator.range_time_block
-        whole = magnitude.shape[-1] // block * block
-        self.rest[index] = magnitude[:, whole:].clone()
-        return block_rms(magnitude[:, :whole], block)
+        whole = columns.shape[-1] // block * block
+        self.rest[index] = columns[:, whole:].clone()
+        return block_rms(columns[:, :whole], block)
