@@ -95,7 +95,8 @@ def _convert(where: str, value: Any, hint: Any) -> Any:
     if hint in (bool, str):
         if isinstance(value, hint):
             return value
-        raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}")
+        quoted = f', in quotes: "{value}"' if hint is str and isinstance(value, (int, float)) else ""
+        raise TensorsimError(f"{where}: got {value!r}, expected {_kind(hint)}{quoted}")
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
         return value  # a float would round integers beyond 2**53
     number = _number(value)

@@ -69,6 +69,7 @@ def test_a_yaml_file_holds_everything(tmp_path: Path) -> None:
         ("scene: {paths: direct}", r"scene: paths: got 'direct', expected a list of names"),
         ("processing: {range_gate_m: near}", r"range_gate_m: got 'near', expected a number"),
         ("classifier: [a]", r"classifier: got \['a'\], expected text"),
+        ("pose: {people: 2}", r"people: got 2, expected text, in quotes: \"2\""),
         ("seed: -1", r"seed: got -1, expected an integer from 0"),
         ("scene: {radar: {carrier_hz: .nan}}", r"scene: radar: carrier_hz: got .*nan"),
     ],
