@@ -17,16 +17,12 @@ from tensorsim.evaluation.measured.motions import Draw, smooth_noise
 from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
-from tensorsim.training.lifter_views import USUAL_SCORES
+from tensorsim.training.lifter_views import JUMP, JUMP_ACROSS, JUMP_S, JUMPS_HZ, PARTS, USUAL_SCORES, squeezed
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
 #: Errors of each COCO keypoint relative to the mean: head, shoulders, elbows, wrists, hips, knees, ankles.
 RELATIVE = (0.6,) * 5 + (0.8,) * 2 + (1.2,) * 2 + (1.6,) * 2 + (1.0,) * 2 + (1.0,) * 2 + (1.2,) * 2
-#: Jumps per second of each: a limb is taken for something else, or for that of the other side, for some frames; then
-#: their mean duration in seconds and their distance.
-JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
-JUMP_S, JUMP = 0.12, 0.2
 #: Keypoints that are mixed up with those of the other side: arms, legs, all.
 MIXED_UP = ((5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16), tuple(range(5, 17)))
 #: Pictures: height, width.
@@ -154,18 +150,24 @@ def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming
     often = torch.exp(draw.normal(1)) * (1 + 2 * tilted.mean())
     jumps, since = _jumps(frames, fps, often, each)
     led = JUMP * each.normal(frames, 2).transpose(0, 1).gather(0, since[..., None].expand(-1, -1, 2))
-    across = (each(0.0, 1.0, frames).T < 0.44).gather(0, since)
+    across = (each(0.0, 1.0, frames).T < JUMP_ACROSS).gather(0, since)
     landed = torch.where(across[..., None], found[:, list(MIRRORED)], found + unit * led)
     found = torch.where(jumps[..., None], landed, found)
 
-    inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
     usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
     # Networks are almost as confident of wrong points.
     scores = usual - 1.2 * error.norm(dim=-1) + 0.06 * each.normal(frames).T
     scores = (scores - jumps * each(0.15, 0.25, frames).T).clamp(0.35, 0.98)
     scores = torch.where(merged[..., 0], scores - 0.2, scores)
     hidden = _spell(frames, 0.06, 0.1, 1.0, each).T
-    scores = torch.where(hidden, 0.2, scores) * (inside & (depth > NEAR_M))
+    scores = torch.where(hidden, 0.2, scores)
+    # Of some people who lie down, the detector finds only a part.
+    part = torch.zeros(17, dtype=torch.bool)
+    part[list(PARTS[int(draw(0.0, 1.0) < 0.3)])] = True
+    cut = (tilted > 0.6) & _spell(frames, 0.3, 0.3, 1.5, draw)[0]
+    found, scores = squeezed(found, scores, part | ~cut[:, None], 0.06 * unit * away.unflatten(-1, (17, 2)))
+    inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
+    scores = scores * (inside & (depth > NEAR_M))
     return Seen(found, scores, _followed(found, scores, tilted, fps, draw))
 
 

@@ -29,6 +29,13 @@ USUAL_SCORES = (0.92,) * 5 + (0.80,) * 12
 _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
 #: Keypoints that are mistaken for one another: (right, left) of arms, of legs, and all.
 _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
+#: Jumps per second of each keypoint: a limb is taken for something else, or for that of the other side, for some
+#: frames; their mean duration in seconds, their distance in body heights, and the share of those to the other side.
+JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
+JUMP_S, JUMP, JUMP_ACROSS = 0.12, 0.2, 0.44
+#: Keypoints that people who lie down are reduced to where the detector finds them in part: hips and legs, or those
+#: above the knees.
+PARTS = (tuple(range(11, 17)), tuple(range(13)))
 
 
 class Windows(NamedTuple):
@@ -193,6 +200,42 @@ def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int],
     return View(local, turned, focal, size, torch.full_like(far, camera.position_m[2]))
 
 
+def squeezed(points: Tensor, scores: Tensor, part: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Keypoints of people of whom the detector finds a part: the others are placed somewhere on that part.
+
+    Args:
+        points: (..., 17, 2).
+        scores: (..., 17).
+        part: (..., 17) bool, keypoints in the part found.
+        noise: (..., 17, 2) errors of the others before they are moved there, in the unit of the points.
+
+    Returns:
+        Keypoints, and scores, which are less than half for the others.
+    """
+    low = torch.where(part[..., None], points, torch.inf).amin(dim=-2, keepdim=True)
+    high = torch.where(part[..., None], points, -torch.inf).amax(dim=-2, keepdim=True)
+    moved = (points + noise).maximum(low).minimum(high)
+    return torch.where(part[..., None], points, moved), torch.where(part, scores, 0.45 * scores)
+
+
+def _jumps(frames: int, fps: Tensor, often: Tensor, draw: Draw) -> tuple[Tensor, Tensor]:
+    """Which keypoints jump (B, T, 17) bool, and how many jumps began before each frame (B, T, 17).
+
+    Args:
+        frames: number of frames T.
+        fps: (B,) frames per second.
+        often: (B, T) factor of the rate.
+        draw: random numbers.
+    """
+    time = torch.arange(frames)[:, None]
+    chance = often[..., None] * torch.tensor(JUMPS_HZ) / fps[:, None, None]
+    began = draw.number(0.0, 1.0, frames, 17) < chance
+    since = torch.where(began, time, -1).cummax(dim=1)[0]
+    lasts = 1 - JUMP_S * fps[:, None, None] * draw.number(1e-6, 1.0, frames, 17).log()  # exponential
+    jumps = (since >= 0) & (time - since < lasts.gather(1, since.clamp(min=0)))
+    return jumps, since.clamp(min=0)
+
+
 def _missed(
     points: Tensor, unit: Tensor, depth: Tensor, tilted: Tensor, scores: Tensor, fps: Tensor, draw: Draw
 ) -> tuple[Tensor, Tensor]:
@@ -239,6 +282,17 @@ def _missed(
         spell = draw.spells(frames, 0.07, 0.02, 0.35)
         found = torch.where((spell[..., None] & swapped)[..., None], found[:, :, list(MIRRORED)], found)
 
+    often = torch.exp(draw.normal(1)) * (1 + draw.number(0.0, 6.0, 1) * tilted)
+    jumps, since = _jumps(frames, fps, often, draw)
+    led = (
+        JUMP
+        * unit[..., None, None]
+        * draw.normal(frames, 17, 2).gather(1, since[..., None].expand(-1, -1, -1, 2))
+    )
+    across = draw.chance(JUMP_ACROSS, frames, 17).gather(1, since)
+    landed = torch.where(across[..., None], found[:, :, list(MIRRORED)], found + led)
+    found = torch.where(jumps[..., None], landed, found)
+
     miss = (found - points).norm(dim=-1) / unit[..., None]
     usual = torch.tensor(USUAL_SCORES) * (1 + 0.05 * draw.normal(1, 17))
     level = torch.where(draw.chance(0.8)[:, None, None], usual, torch.ones(17)) * draw.number(
@@ -247,7 +301,15 @@ def _missed(
     scores = scores * level - 2.0 * miss * draw.number(0.2, 1.0, 1, 17) - 0.15 * covered
     scores = scores + 0.05 * draw.correlated(frames, 0.3 * fps, 17)
     lost = draw.spells(frames, 0.10, 0.05, 1.2, 17).transpose(1, 2)
-    return found, torch.where(lost, draw.number(0.0, 0.45, frames, 17), scores)
+    scores = torch.where(lost, draw.number(0.0, 0.45, frames, 17), scores)
+    # Of some people who lie down, the detector finds only a part.
+    part = torch.zeros(2, 17, dtype=torch.bool)
+    for kept, keypoints in zip(part, PARTS, strict=True):
+        kept[list(keypoints)] = True
+    seen = part[draw.chance(0.3).long()][:, None]
+    cut = (tilted > 0.6) & draw.spells(frames, 0.35, 0.3, 2.0)
+    noise = 0.06 * unit[..., None, None] * draw.correlated(frames, 0.4 * fps, 17, 2)
+    return squeezed(found, scores, seen | ~cut[..., None], noise)
 
 
 def _followed(

@@ -1,5 +1,6 @@
 """Training of the temporal lifter: motion, views, errors, loss, a run from the command line."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from tensorsim.body.skeleton import body_height, body_to_coco, mid_hips
 from tensorsim.cli import main
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.camera import known_camera
-from tensorsim.training import lifter_motion
+from tensorsim.training import lifter_motion, lifter_views
 from tensorsim.training.lifter import (
     LifterRecipe,
     VideoPoseRecipe,
@@ -23,7 +24,16 @@ from tensorsim.training.lifter import (
 )
 from tensorsim.training.lifter_motion import FRAMES, KINDS, MotionPool, build_pool, captures, with_other_bones
 from tensorsim.training.lifter_scores import judge, lifted, nearest, temporal, views
-from tensorsim.training.lifter_views import Draw, before_camera, film, seen_in, windows_of
+from tensorsim.training.lifter_views import (
+    JUMP_S,
+    JUMPS_HZ,
+    Draw,
+    before_camera,
+    film,
+    seen_in,
+    squeezed,
+    windows_of,
+)
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
 from tensorsim.vision.lifting.videopose3d import VideoPose3D
@@ -108,6 +118,37 @@ def test_windows_with_the_same_seed_are_the_same_and_errors_are_bounded(pool: Mo
     assert 0.5 < float(shown.float().mean()) < 1.0
     assert bool(one.keypoints.isfinite().all())
     assert float((one.boxes[..., 2] - one.boxes[..., 0]).amin()) >= 0.0
+
+
+def test_limbs_jump_as_often_and_for_as_long_as_stated() -> None:
+    draw = Draw(40, torch.Generator().manual_seed(0))
+    fps, frames = 30.0, 2000
+    often = torch.ones(40, frames)
+    often[20:] = 3.0  # people who lie down
+    jumps, since = lifter_views._jumps(frames, torch.full((40,), fps), often, draw)
+    # An exponential duration in whole frames, and a frame at either end.
+    duration_s = (2 + 1 / math.expm1(1 / (JUMP_S * fps))) / fps
+    for people, factor in ((slice(20), 1.0), (slice(20, None), 3.0)):
+        limbs = [7, 8, 9, 10, 13, 14, 15, 16]
+        share = jumps[people, 60:].double().mean((0, 1))[limbs]
+        expected = factor * torch.tensor(JUMPS_HZ)[limbs].double() * duration_s
+        assert float((share / expected - 1).abs().max()) < 0.25
+        assert abs(float(share.sum() / expected.sum()) - 1) < 0.1  # jumps that overlap count once
+    assert bool((since <= torch.arange(frames)[:, None]).all())
+
+
+def test_keypoints_of_a_person_found_in_part_are_placed_on_that_part() -> None:
+    generator = torch.Generator().manual_seed(0)
+    points, noise = (100 * torch.randn(5, 17, 2, generator=generator) for _ in range(2))
+    part = torch.zeros(17, dtype=torch.bool)
+    part[11:] = True
+    found, scores = squeezed(points, torch.full((5, 17), 0.8), part.expand(5, 17), noise)
+    assert torch.equal(found[:, 11:], points[:, 11:])
+    assert bool((found.amin(1) >= points[:, 11:].amin(1)).all())
+    assert bool((found.amax(1) <= points[:, 11:].amax(1)).all())
+    torch.testing.assert_close(scores, torch.where(part, 0.8, 0.36).expand(5, 17))
+    whole, _ = squeezed(points, scores, torch.ones(5, 17, dtype=torch.bool), noise)
+    assert torch.equal(whole, points)
 
 
 def test_target_is_turned_to_the_person(pool: MotionPool) -> None:
