@@ -17,7 +17,15 @@ from tensorsim.evaluation.measured.motions import Draw, smooth_noise
 from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
-from tensorsim.training.lifter_views import JUMP, JUMP_ACROSS, JUMP_S, JUMPS_HZ, PARTS, USUAL_SCORES, squeezed
+from tensorsim.training.lifter_views import (
+    JUMP,
+    JUMP_ACROSS,
+    JUMP_S,
+    JUMPS_HZ,
+    PARTS,
+    USUAL_SCORES,
+    found_in_part,
+)
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
@@ -165,7 +173,9 @@ def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming
     part = torch.zeros(17, dtype=torch.bool)
     part[list(PARTS[int(draw(0.0, 1.0) < 0.3)])] = True
     cut = (tilted > 0.6) & _spell(frames, 0.3, 0.3, 1.5, draw)[0]
-    found, scores = squeezed(found, scores, part | ~cut[:, None], 0.06 * unit * away.unflatten(-1, (17, 2)))
+    found, scores = found_in_part(
+        found, scores, part | ~cut[:, None], 0.06 * unit * away.unflatten(-1, (17, 2))
+    )
     inside = (found >= -0.5).all(-1) & (found[..., 0] < filming.width) & (found[..., 1] < filming.height)
     scores = scores * (inside & (depth > NEAR_M))
     return Seen(found, scores, _followed(found, scores, tilted, fps, draw))

@@ -200,7 +200,7 @@ def before_camera(joints: Tensor, camera: CameraConfig, extent: tuple[int, int],
     return View(local, turned, focal, size, torch.full_like(far, camera.position_m[2]))
 
 
-def squeezed(points: Tensor, scores: Tensor, part: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def found_in_part(points: Tensor, scores: Tensor, part: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Keypoints of people of whom the detector finds a part: the others are placed somewhere on that part.
 
     Args:
@@ -219,7 +219,7 @@ def squeezed(points: Tensor, scores: Tensor, part: Tensor, noise: Tensor) -> tup
 
 
 def _jumps(frames: int, fps: Tensor, often: Tensor, draw: Draw) -> tuple[Tensor, Tensor]:
-    """Which keypoints jump (B, T, 17) bool, and how many jumps began before each frame (B, T, 17).
+    """Which keypoints jump (B, T, 17) bool, and the frame of the latest jump of each (B, T, 17), 0 before the first.
 
     Args:
         frames: number of frames T.
@@ -284,13 +284,13 @@ def _missed(
 
     often = torch.exp(draw.normal(1)) * (1 + draw.number(0.0, 6.0, 1) * tilted)
     jumps, since = _jumps(frames, fps, often, draw)
-    led = (
+    offset = (
         JUMP
         * unit[..., None, None]
         * draw.normal(frames, 17, 2).gather(1, since[..., None].expand(-1, -1, -1, 2))
     )
     across = draw.chance(JUMP_ACROSS, frames, 17).gather(1, since)
-    landed = torch.where(across[..., None], found[:, :, list(MIRRORED)], found + led)
+    landed = torch.where(across[..., None], found[:, :, list(MIRRORED)], found + offset)
     found = torch.where(jumps[..., None], landed, found)
 
     miss = (found - points).norm(dim=-1) / unit[..., None]
@@ -309,7 +309,7 @@ def _missed(
     seen = part[draw.chance(0.3).long()][:, None]
     cut = (tilted > 0.6) & draw.spells(frames, 0.35, 0.3, 2.0)
     noise = 0.06 * unit[..., None, None] * draw.correlated(frames, 0.4 * fps, 17, 2)
-    return squeezed(found, scores, seen | ~cut[..., None], noise)
+    return found_in_part(found, scores, seen | ~cut[..., None], noise)
 
 
 def _followed(

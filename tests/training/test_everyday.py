@@ -186,6 +186,32 @@ def test_limbs_jump_for_a_moment_and_their_scores_hardly_fall(standing):
     assert float(sure[far].double().mean()) > 0.7
 
 
+def share_reduced_to_legs(joints: Tensor) -> float:
+    """How often people with these joints are found as hips and legs alone in a quarter of the frames or more."""
+    camera = CameraConfig(position_m=(0.0, 0.0, 1.5))
+    filming = Filming(camera, camera, 360, 640)
+    times = 0
+    for seed in range(60):
+        seen = find_keypoints(joints, 1.75, 20.0, filming, Draw(1, torch.Generator().manual_seed(seed)))
+        legs, others = seen.keypoints[:, 11:], seen.keypoints[:, :11]
+        within = (others >= legs.amin(1, keepdim=True)) & (others <= legs.amax(1, keepdim=True))
+        times += float(within.all(-1).all(-1).double().mean()) > 0.25
+    return times / 60
+
+
+def test_some_who_lie_are_reduced_to_their_legs(standing):
+    """As in films where the detector finds only these; nobody who stands is."""
+    hips = standing[:, (8, 11)].mean(1, keepdim=True)
+    # On the back, across the line of sight, 0.15 m above the floor.
+    lying = (
+        (standing - hips)[..., [2, 1, 0]]
+        + hips * torch.tensor([1.0, 1.0, 0.0])
+        + torch.tensor([0.0, 0.0, 0.15])
+    )
+    assert 0.08 < share_reduced_to_legs(lying) < 0.35
+    assert share_reduced_to_legs(standing) == 0
+
+
 def longest_lead(keypoints: Tensor) -> int:
     """For how many frames in a row the same ankle of keypoints (T, 17, 2) is ahead in the picture."""
     ahead = keypoints[:, 15, 0] > keypoints[:, 16, 0]

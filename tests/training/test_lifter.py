@@ -30,8 +30,8 @@ from tensorsim.training.lifter_views import (
     Draw,
     before_camera,
     film,
+    found_in_part,
     seen_in,
-    squeezed,
     windows_of,
 )
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
@@ -142,12 +142,12 @@ def test_keypoints_of_a_person_found_in_part_are_placed_on_that_part() -> None:
     points, noise = (100 * torch.randn(5, 17, 2, generator=generator) for _ in range(2))
     part = torch.zeros(17, dtype=torch.bool)
     part[11:] = True
-    found, scores = squeezed(points, torch.full((5, 17), 0.8), part.expand(5, 17), noise)
+    found, scores = found_in_part(points, torch.full((5, 17), 0.8), part.expand(5, 17), noise)
     assert torch.equal(found[:, 11:], points[:, 11:])
     assert bool((found.amin(1) >= points[:, 11:].amin(1)).all())
     assert bool((found.amax(1) <= points[:, 11:].amax(1)).all())
     torch.testing.assert_close(scores, torch.where(part, 0.8, 0.36).expand(5, 17))
-    whole, _ = squeezed(points, scores, torch.ones(5, 17, dtype=torch.bool), noise)
+    whole, _ = found_in_part(points, scores, torch.ones(5, 17, dtype=torch.bool), noise)
     assert torch.equal(whole, points)
 
 
