@@ -16,6 +16,7 @@ import tensorsim as ts
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, TensorsimWarning
+from tensorsim.geometry.framing import keypoint_boxes, seen_keypoints
 from tensorsim.motion import JointScatterers
 from tensorsim.pipeline import PoseToDoppler, VideoToActivity, VideoToDoppler, VideoToPose
 from tensorsim.pipeline.pose import joined
@@ -657,3 +658,33 @@ def test_who_is_too_far_away_alone_leaves_an_empty_scene() -> None:
     pose = ts.Pose(torch.zeros(1, 1, 20, 4), blank, blank[..., 0], joints, there)
     with pytest.warns(TensorsimWarning, match="the receiver filters out"):
         maps_of_pose(stage, pose, FPS, torch.device("cpu"), quiet=True)
+
+
+def test_joints_that_are_not_seen_are_smoothed_more_than_those_that_are() -> None:
+    walk = ts.motion.ActivityGenerator().generate("walking", seed=2, duration_s=3.0, rate_hz=30.0).joints[0]
+    walk = walk + torch.tensor([0.0, 3.0, 0.0])  # all of the body is in the picture
+    camera = ts.CameraConfig(position_m=(0.0, 0.0, 1.2))
+    keypoints, scores = seen_keypoints(
+        walk[None], torch.ones(1, len(walk), dtype=torch.bool), camera, 480, 640
+    )
+    arm, when = [8, 10], slice(30, 75)  # right elbow and wrist, in COCO
+    scores[:, when, arm] = 0.1
+    jumps = 30 * torch.randn(45, 1, 2, generator=torch.Generator().manual_seed(0))
+    keypoints[:, when, arm] += jumps
+    boxes = keypoint_boxes(keypoints, scores)
+    present = torch.ones(1, 1, len(walk), dtype=torch.bool)
+    tracks = ts.Tracks(boxes[None], present, present)
+    stage = VideoToPose(nn.Identity(), nn.Identity(), camera=camera, walking_legs=False).eval()
+
+    def unsteady(factor: float) -> Tensor:
+        """Accelerations (14,) of the joints, m/s^2."""
+        stage.hidden_noise = factor
+        with torch.no_grad():
+            joints = stage.lift(tracks, keypoints[None], scores[None], 480, 640, 30.0).joints[0, 0, 32:73]
+        return joints.diff(n=2, dim=0).norm(dim=-1).mean(0) * 30**2
+
+    as_others, more = unsteady(1.0), unsteady(3.0)
+    hidden = torch.tensor([3, 4])  # of the body
+    assert float((more[hidden] / as_others[hidden]).max()) < 0.95
+    legs = torch.tensor([9, 10, 12, 13])
+    torch.testing.assert_close(more[legs], as_others[legs])

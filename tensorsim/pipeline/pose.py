@@ -134,6 +134,8 @@ class VideoToPose(nn.Module):
         self.hidden_speed_m_s = 3.0
         #: The temporal lifter's errors persist over time; only this share varies between frames, as noise does.
         self.noise_share = 0.03
+        #: Joints that are not seen are noisier by this factor: they are guessed anew in every frame.
+        self.hidden_noise = 3.0
         #: No joint moves faster than this, in m/s: in a hard kick the foot reaches 10 to 12.
         self.top_speed_m_s = 12.0
         #: Lowest mean score of a person's seen keypoints; in boxes around furniture it is about 0.4.
@@ -401,6 +403,7 @@ class VideoToPose(nn.Module):
             found = self.temporal(keypoints, scores, tracks.boxes, usable, height, width, fps)
             lifted = self.temporal.in_picture(found, body, body_scores, height, width, fps)
             noise = self.noise_share * found.deviation
+            noise = torch.where(reliable.unsqueeze(-1), noise, self.hidden_noise * noise)
             if self.bone_fit is None:
                 body = lifted.keypoints
             else:  # made for exact keypoints, which stay where they are even where the lifter doubts them
