@@ -17,15 +17,7 @@ from tensorsim.evaluation.measured.motions import Draw, smooth_noise
 from tensorsim.geometry.camera import NEAR_M, camera_to_world, focal_length, principal_point, project
 from tensorsim.geometry.framing import keypoint_boxes
 from tensorsim.pipeline import VideoToPose
-from tensorsim.training.lifter_views import (
-    JUMP,
-    JUMP_ACROSS,
-    JUMP_S,
-    JUMPS_HZ,
-    PARTS,
-    USUAL_SCORES,
-    found_in_part,
-)
+from tensorsim.training.lifter_views import JUMPS_HZ, PARTS, USUAL_SCORES, found_in_part, jumps_from, landed
 from tensorsim.types import Tracks
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 
@@ -91,17 +83,6 @@ def _spell(frames: int, rate: float, shortest: float, longest: float, draw: Draw
     return (draw(0.0, 1.0) < rate) & (time >= start) & (time < start + length)
 
 
-def _jumps(frames: int, fps: float, often: Tensor, each: Draw) -> tuple[Tensor, Tensor]:
-    """Which of N points jump (T, N) bool, and the frame of each latest jump (T, N); ``often`` scales the rate."""
-    time = torch.arange(frames)[:, None]
-    chance = often * torch.tensor(JUMPS_HZ, dtype=torch.float64) / fps
-    began = chance > each(0.0, 1.0, frames).T
-    since = torch.where(began, time, -1).cummax(dim=0)[0]
-    lasts = 1 - JUMP_S * fps * each(1e-6, 1.0, frames).T.log()  # exponential
-    jumps = (since >= 0) & (time - since < lasts.gather(0, since.clamp(min=0)))
-    return jumps, since.clamp(min=0)
-
-
 def project_keypoints(joints: Tensor, filming: Filming) -> tuple[Tensor, Tensor]:
     """Keypoints of joints (T, 14, 3) m in the pictures, (T, 17, 2) pixels, and their depths (T, 17) m."""
     focal = focal_length(filming.camera, filming.width)
@@ -156,11 +137,11 @@ def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming
         found = torch.where((spell[:, None] & mixed)[..., None], found[:, list(MIRRORED)], found)
 
     often = torch.exp(draw.normal(1)) * (1 + 2 * tilted.mean())
-    jumps, since = _jumps(frames, fps, often, each)
-    led = JUMP * each.normal(frames, 2).transpose(0, 1).gather(0, since[..., None].expand(-1, -1, 2))
-    across = (each(0.0, 1.0, frames).T < JUMP_ACROSS).gather(0, since)
-    landed = torch.where(across[..., None], found[:, list(MIRRORED)], found + unit * led)
-    found = torch.where(jumps[..., None], landed, found)
+    began, lasting = each(0.0, 1.0, frames).T, each(1e-6, 1.0, frames).T
+    rate_hz = often * torch.tensor(JUMPS_HZ, dtype=torch.float64)
+    jumps, since = jumps_from(rate_hz, fps, began, lasting)
+    step, across = each.normal(frames, 2).transpose(0, 1), each(0.0, 1.0, frames).T
+    found = torch.where(jumps[..., None], landed(found, unit, since, step, across), found)
 
     usual = torch.tensor(USUAL_SCORES, dtype=torch.float64)
     # Networks are almost as confident of wrong points.
@@ -170,8 +151,7 @@ def find_keypoints(joints: Tensor, height_m: float, fps: float, filming: Filming
     hidden = _spell(frames, 0.06, 0.1, 1.0, each).T
     scores = torch.where(hidden, 0.2, scores)
     # Of some people who lie down, the detector finds only a part.
-    part = torch.zeros(17, dtype=torch.bool)
-    part[list(PARTS[int(draw(0.0, 1.0) < 0.3)])] = True
+    part = PARTS[int(draw(0.0, 1.0) < 0.3)]
     cut = (tilted > 0.6) & _spell(frames, 0.3, 0.3, 1.5, draw)[0]
     found, scores = found_in_part(
         found, scores, part | ~cut[:, None], 0.06 * unit * away.unflatten(-1, (17, 2))

@@ -33,9 +33,9 @@ _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
 #: frames; their mean duration in seconds, their distance in body heights, and the share of those to the other side.
 JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
 JUMP_S, JUMP, JUMP_ACROSS = 0.12, 0.2, 0.44
-#: Keypoints that people who lie down are reduced to where the detector finds them in part: hips and legs, or those
-#: above the knees.
-PARTS = (tuple(range(11, 17)), tuple(range(13)))
+#: (2, 17) keypoints that people who lie down are reduced to where the detector finds them in part: hips and legs, or
+#: those above the knees.
+PARTS = torch.stack([torch.arange(17) >= 11, torch.arange(17) < 13])
 
 
 class Windows(NamedTuple):
@@ -218,22 +218,34 @@ def found_in_part(points: Tensor, scores: Tensor, part: Tensor, noise: Tensor) -
     return torch.where(part[..., None], points, moved), torch.where(part, scores, 0.45 * scores)
 
 
-def _jumps(frames: int, fps: Tensor, often: Tensor, draw: Draw) -> tuple[Tensor, Tensor]:
-    """Which keypoints jump (B, T, 17) bool, and the frame of the latest jump of each (B, T, 17), 0 before the first.
+def jumps_from(rate_hz: Tensor, fps: Tensor | float, began: Tensor, lasting: Tensor) -> tuple[Tensor, Tensor]:
+    """Which keypoints jump (..., T, 17) bool, and the frame of the latest jump of each, 0 before the first.
 
     Args:
-        frames: number of frames T.
-        fps: (B,) frames per second.
-        often: (B, T) factor of the rate.
-        draw: random numbers.
+        rate_hz: (..., T or 1, 17) jumps per second.
+        fps: frames per second, (..., 1, 1) or a number.
+        began, lasting: (..., T, 17) uniform random numbers, the latter above 0.
     """
-    time = torch.arange(frames)[:, None]
-    chance = often[..., None] * torch.tensor(JUMPS_HZ) / fps[:, None, None]
-    began = draw.number(0.0, 1.0, frames, 17) < chance
-    since = torch.where(began, time, -1).cummax(dim=1)[0]
-    lasts = 1 - JUMP_S * fps[:, None, None] * draw.number(1e-6, 1.0, frames, 17).log()  # exponential
-    jumps = (since >= 0) & (time - since < lasts.gather(1, since.clamp(min=0)))
+    time = torch.arange(began.shape[-2])[:, None]
+    since = torch.where(began < rate_hz / fps, time, -1).cummax(dim=-2)[0]
+    lasts = 1 - JUMP_S * fps * lasting.log()  # exponential
+    jumps = (since >= 0) & (time - since < lasts.gather(-2, since.clamp(min=0)))
     return jumps, since.clamp(min=0)
+
+
+def landed(found: Tensor, unit: Tensor, since: Tensor, step: Tensor, across: Tensor) -> Tensor:
+    """Where keypoints (..., T, 17, 2) are if they jump: on the other side, or somewhere nearby.
+
+    Args:
+        found: keypoints before they jump.
+        unit: (..., T, 1, 1) body heights in the unit of the keypoints.
+        since: (..., T, 17) frame of the latest jump, see :func:`jumps_from`.
+        step: (..., T, 17, 2) normal random numbers.
+        across: (..., T, 17) uniform random numbers.
+    """
+    led = JUMP * step.gather(-3, since[..., None].expand_as(step))
+    over = (across < JUMP_ACROSS).gather(-2, since)
+    return torch.where(over[..., None], found[..., list(MIRRORED), :], found + unit * led)
 
 
 def _missed(
@@ -283,15 +295,12 @@ def _missed(
         found = torch.where((spell[..., None] & swapped)[..., None], found[:, :, list(MIRRORED)], found)
 
     often = torch.exp(draw.normal(1)) * (1 + draw.number(0.0, 6.0, 1) * tilted)
-    jumps, since = _jumps(frames, fps, often, draw)
-    offset = (
-        JUMP
-        * unit[..., None, None]
-        * draw.normal(frames, 17, 2).gather(1, since[..., None].expand(-1, -1, -1, 2))
-    )
-    across = draw.chance(JUMP_ACROSS, frames, 17).gather(1, since)
-    landed = torch.where(across[..., None], found[:, :, list(MIRRORED)], found + offset)
-    found = torch.where(jumps[..., None], landed, found)
+    began, lasting = draw.number(0.0, 1.0, frames, 17), draw.number(1e-6, 1.0, frames, 17)
+    rate_hz = often[..., None] * torch.tensor(JUMPS_HZ)
+    jumps, since = jumps_from(rate_hz, fps[:, None, None], began, lasting)
+    step, across = draw.normal(frames, 17, 2), draw.number(0.0, 1.0, frames, 17)
+    there = landed(found, unit[..., None, None], since, step, across)
+    found = torch.where(jumps[..., None], there, found)
 
     miss = (found - points).norm(dim=-1) / unit[..., None]
     usual = torch.tensor(USUAL_SCORES) * (1 + 0.05 * draw.normal(1, 17))
@@ -303,13 +312,10 @@ def _missed(
     lost = draw.spells(frames, 0.10, 0.05, 1.2, 17).transpose(1, 2)
     scores = torch.where(lost, draw.number(0.0, 0.45, frames, 17), scores)
     # Of some people who lie down, the detector finds only a part.
-    part = torch.zeros(2, 17, dtype=torch.bool)
-    for kept, keypoints in zip(part, PARTS, strict=True):
-        kept[list(keypoints)] = True
-    seen = part[draw.chance(0.3).long()][:, None]
+    part = PARTS[draw.chance(0.3).long()][:, None]
     cut = (tilted > 0.6) & draw.spells(frames, 0.35, 0.3, 2.0)
     noise = 0.06 * unit[..., None, None] * draw.correlated(frames, 0.4 * fps, 17, 2)
-    return found_in_part(found, scores, seen | ~cut[..., None], noise)
+    return found_in_part(found, scores, part | ~cut[..., None], noise)
 
 
 def _followed(

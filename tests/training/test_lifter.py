@@ -12,7 +12,7 @@ from tensorsim.body.skeleton import body_height, body_to_coco, mid_hips
 from tensorsim.cli import main
 from tensorsim.errors import TensorsimError
 from tensorsim.evaluation.camera import known_camera
-from tensorsim.training import lifter_motion, lifter_views
+from tensorsim.training import lifter_motion
 from tensorsim.training.lifter import (
     LifterRecipe,
     VideoPoseRecipe,
@@ -31,6 +31,7 @@ from tensorsim.training.lifter_views import (
     before_camera,
     film,
     found_in_part,
+    jumps_from,
     seen_in,
     windows_of,
 )
@@ -123,9 +124,10 @@ def test_windows_with_the_same_seed_are_the_same_and_errors_are_bounded(pool: Mo
 def test_limbs_jump_as_often_and_for_as_long_as_stated() -> None:
     draw = Draw(40, torch.Generator().manual_seed(0))
     fps, frames = 30.0, 2000
-    often = torch.ones(40, frames)
+    often = torch.ones(40, 1, 1)
     often[20:] = 3.0  # people who lie down
-    jumps, since = lifter_views._jumps(frames, torch.full((40,), fps), often, draw)
+    began, lasting = draw.number(0.0, 1.0, frames, 17), draw.number(1e-6, 1.0, frames, 17)
+    jumps, since = jumps_from(often * torch.tensor(JUMPS_HZ), fps, began, lasting)
     # An exponential duration in whole frames, and a frame at either end.
     duration_s = (2 + 1 / math.expm1(1 / (JUMP_S * fps))) / fps
     for people, factor in ((slice(20), 1.0), (slice(20, None), 3.0)):
