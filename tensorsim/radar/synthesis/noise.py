@@ -30,6 +30,12 @@ def decibels(signal_power: Tensor, noise_power: Tensor) -> Tensor:
     return torch.where(noise_power > 0, ratio, torch.full_like(ratio, float("inf")))
 
 
+def _deviation(power: Tensor) -> Tensor:
+    """Square root of the power, whose gradient is 0 at 0: it would be infinite, and NaN for all that led to it."""
+    there = power > 0
+    return torch.where(there, power, 1.0).sqrt() * there
+
+
 class ProfileNoise(nn.Module):
     """Receiver noise in range profiles, drawn in the range bins: without IF and Fourier transform.
 
@@ -71,7 +77,7 @@ class ProfileNoise(nn.Module):
             pair = parts[:, reach - lag : reach - lag + bins] + parts[:, reach + lag : reach + lag + bins]
             noise = torch.add(noise, pair, alpha=self.taps[lag] / self.taps[0])
         drawn = energy(white).to(power.dtype) * power * (self.samples / shape[1])
-        deviation = self.taps[0] * power.to(noise.dtype).sqrt()[:, None, None, None]
+        deviation = self.taps[0] * _deviation(power.to(noise.dtype))[:, None, None, None]
         return torch.view_as_complex(noise * deviation), drawn
 
 
@@ -140,7 +146,7 @@ class ReceiverNoise(nn.Module):
     def draw(self, like: Tensor, noise_power: Tensor) -> Tensor:
         """Noise in the shape of ``like`` (..., M, N) with this variance (...)."""
         parts = torch.view_as_real(torch.randn_like(like))
-        deviation = noise_power.to(parts.dtype).sqrt()[..., None, None, None]
+        deviation = _deviation(noise_power.to(parts.dtype))[..., None, None, None]
         return torch.view_as_complex(parts * deviation)
 
     @torch.jit.export

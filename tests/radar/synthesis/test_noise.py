@@ -149,6 +149,20 @@ def test_gradient_scales_the_noise_with_the_signal():
     assert torch.autograd.gradcheck(function, (x,))
 
 
+def test_a_clip_without_echo_leaves_the_gradients_of_the_others_finite():
+    gain = torch.ones((), dtype=torch.float64, requires_grad=True)
+    clips = torch.stack([signal(4, 5, dtype=torch.complex128), torch.zeros(4, 5, dtype=torch.complex128)])
+    ReceiverNoise(10.0)(gain * clips).abs().square().sum().backward()
+    assert math.isfinite(float(gain.grad))
+    power = torch.tensor([2.0, 0.0], dtype=torch.float64, requires_grad=True)
+    noise, _ = ProfileNoise(torch.ones(16, dtype=torch.float64))(
+        torch.zeros(2, 4, 6, dtype=torch.complex128), power
+    )
+    noise.abs().square().sum().backward()
+    assert float(power.grad[0]) > 0
+    assert float(power.grad[1]) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
