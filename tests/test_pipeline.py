@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 import tensorsim as ts
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
+from tensorsim.body.skeleton import trunk_uprightness
 from tensorsim.config import JOINTS
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.geometry.framing import keypoint_boxes, seen_keypoints
@@ -688,3 +689,30 @@ def test_joints_that_are_not_seen_are_smoothed_more_than_those_that_are() -> Non
     assert float((more[hidden] / as_others[hidden]).max()) < 0.95
     legs = torch.tensor([9, 10, 12, 13])
     torch.testing.assert_close(more[legs], as_others[legs])
+
+
+def test_people_who_lie_are_smoothed_more_than_those_who_stand() -> None:
+    fall = ts.motion.ActivityGenerator().generate("walking to falling", seed=1, duration_s=4.0, rate_hz=30.0)
+    joints = fall.joints[0] + torch.tensor([0.0, 2.0, 0.0])
+    upright = trunk_uprightness(joints)
+    assert float(upright[:30].min()) > 0.9
+    assert float(upright[-30:].abs().max()) < 0.5
+    camera = ts.CameraConfig(position_m=(0.0, 0.0, 1.2))
+    keypoints, scores = seen_keypoints(
+        joints[None], torch.ones(1, len(joints), dtype=torch.bool), camera, 480, 640
+    )
+    keypoints += 3 * torch.randn(keypoints.shape, generator=torch.Generator().manual_seed(0))
+    present = torch.ones(1, 1, len(joints), dtype=torch.bool)
+    tracks = ts.Tracks(keypoint_boxes(keypoints, scores)[None], present, present)
+    stage = VideoToPose(nn.Identity(), nn.Identity(), camera=camera, walking_legs=False).eval()
+
+    def unsteady(factor: float) -> Tensor:
+        """Mean acceleration (T - 2,) of the joints, m/s^2."""
+        stage.lying_noise = factor
+        with torch.no_grad():
+            found = stage.lift(tracks, keypoints[None], scores[None], 480, 640, 30.0).joints[0, 0]
+        return found.diff(n=2, dim=0).norm(dim=-1).mean(-1) * 30**2
+
+    as_others, more = unsteady(1.0), unsteady(5.0)
+    assert float(more[-30:].mean() / as_others[-30:].mean()) < 0.9
+    torch.testing.assert_close(more[:20], as_others[:20], rtol=0.02, atol=0.02)

@@ -43,6 +43,12 @@ def mid_hips(joints: Tensor) -> Tensor:
     )  # literals: TorchScript cannot read module constants
 
 
+def trunk_uprightness(joints: Tensor) -> Tensor:
+    """Cosine of the angle between the trunk and the vertical: (..., 14, 3) -> (...), 1 upright, 0 horizontal."""
+    trunk = joints[..., 1, :] - mid_hips(joints)
+    return trunk[..., 2] / trunk.square().sum(dim=-1).clamp(min=1e-6).sqrt()
+
+
 def lowest_ankle(joints: Tensor) -> Tensor:
     """Height of the lower ankle: (..., 14, 3) -> (...)."""
     return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])

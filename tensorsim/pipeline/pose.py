@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body, mid_hips
+from tensorsim.body.skeleton import coco_to_body, mid_hips, trunk_uprightness
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import (
     TensorsimError,
@@ -136,6 +136,8 @@ class VideoToPose(nn.Module):
         self.noise_share = 0.03
         #: Joints that are not seen are noisier by this factor: they are guessed anew in every frame.
         self.hidden_noise = 3.0
+        #: Joints of people who lie, the trunk horizontal, are noisier by this factor: networks find them less well.
+        self.lying_noise = 5.0
         #: No joint moves faster than this, in m/s: in a hard kick the foot reaches 10 to 12.
         self.top_speed_m_s = 12.0
         #: Lowest mean score of a person's seen keypoints; in boxes around furniture it is about 0.4.
@@ -421,6 +423,9 @@ class VideoToPose(nn.Module):
             joints, seen = self.metric_pose(body, body_scores, lifted, usable, height, width, fps)
         if self.temporal is None:
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
+        elif self.bone_fit is None:
+            lying = 1 - trunk_uprightness(joints.detach()).clamp(min=0.0)
+            noise = noise * (1 + (self.lying_noise - 1) * lying)[..., None, None]
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         if self.bone_fit is not None:
             joints = self.bone_fit(joints, seen & usable.unsqueeze(-1), fps)

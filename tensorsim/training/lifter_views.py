@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import rotation
-from tensorsim.body.skeleton import MIRRORED, body_to_coco, coco_to_body, mid_hips, mirror
+from tensorsim.body.skeleton import MIRRORED, body_to_coco, coco_to_body, mid_hips, mirror, trunk_uprightness
 from tensorsim.config import CameraConfig
 from tensorsim.geometry.camera import camera_to_world, focal_length
 from tensorsim.training.lifter_motion import RATE_HZ, MotionPool
@@ -31,7 +31,7 @@ _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
 _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
 #: Jumps per second of each keypoint: a limb is taken for something else, or for that of the other side, for some
 #: frames; their mean duration in seconds, their distance in body heights, and the share of those to the other side.
-JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
+JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.05,) * 2 + (0.07,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
 JUMP_S, JUMP, JUMP_ACROSS = 0.12, 0.2, 0.44
 #: (2, 17) keypoints that people who lie down are reduced to where the detector finds them in part: hips and legs, or
 #: those above the knees.
@@ -393,8 +393,7 @@ def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = 
     points = camera[..., :2] / away[..., None] * view.focal[:, None, None, None] + center[:, None, None]
     inside = ((points > -2) & (points < extent[:, None, None] + 2)).all(dim=-1) & (camera[..., 2] > 0.2)
     unit = (view.focal * height)[:, None] / away[..., 11:13].mean(dim=-1)
-    trunk = view.joints[:, :, 1] - mid_hips(view.joints)
-    tilted = 1 - (trunk[..., 2] / trunk.norm(dim=-1).clamp(min=1e-6)).clamp(min=0.0)
+    tilted = 1 - trunk_uprightness(view.joints).clamp(min=0.0)
     if errors:
         scores = torch.ones_like(away)
         # From behind, eyes and nose are hidden; many networks still place them, with high scores.

@@ -1,12 +1,13 @@
 """COCO-17 to the 14 joints, by name."""
 
+import math
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import body_to_coco, coco_to_body
+from tensorsim.body.skeleton import body_to_coco, coco_to_body, trunk_uprightness
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
 from tensorsim.errors import TensorsimError
 from tests.stage import StageTester
@@ -151,3 +152,11 @@ def test_nothing_of_the_head_seen_leaves_the_nose() -> None:
 def test_a_threshold_that_is_not_positive_is_refused(threshold: float) -> None:
     with pytest.raises(TensorsimError, match="threshold: got"):
         coco_to_body(*named(), threshold=threshold)
+
+
+def test_trunk_uprightness_is_the_cosine_of_the_lean() -> None:
+    angle = torch.tensor([0.0, 0.5, math.pi / 2, math.pi], dtype=torch.float64)
+    joints = torch.zeros(4, 14, 3, dtype=torch.float64)
+    joints[:, 1] = 0.5 * torch.stack([angle.sin(), torch.zeros(4, dtype=torch.float64), angle.cos()], -1)
+    joints[:, (8, 11)] = 1e-9 * torch.randn(4, 2, 3, generator=torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(trunk_uprightness(joints), angle.cos(), rtol=0, atol=1e-7)

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.gait import boulic_gait, cycle_s
-from tensorsim.body.skeleton import mid_hips
+from tensorsim.body.skeleton import mid_hips, trunk_uprightness
 from tensorsim.errors import TensorsimError, check_finite, check_mask, check_points, check_positive
 from tensorsim.vision.smoothing.along_time import gaussian_mean, local_linear
 
@@ -113,8 +113,7 @@ class WalkingLegs(nn.Module):
         right = joints[..., 8, :2] - joints[..., 11, :2] + joints[..., 2, :2] - joints[..., 5, :2]
         facing = F.normalize(torch.stack([-right[..., 1], right[..., 0]], dim=-1), dim=-1, eps=1e-6)
         forwards = (velocity * facing).sum(dim=-1) / speed
-        trunk = joints[..., 1, :] - hips
-        upright = trunk[..., 2] / trunk.square().sum(dim=-1).clamp(min=1e-6).sqrt()
+        upright = trunk_uprightness(joints)
         walks = ((speed - self.slow_m_s) / (self.walking_m_s - self.slow_m_s)).clamp(0.0, 1.0)
         # A person who bends down or lies does not walk. Where forwards turns into backwards, stepping legs would jump.
         walks = (
