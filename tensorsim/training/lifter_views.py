@@ -31,8 +31,10 @@ _MARGINS = ((0.04, 0.06, 0.04, 0.078), (0.05, 0.06, 0.05, 0.045))
 _SWAPS = ((5, 7, 9), (11, 13, 15), (1, 3, 5, 7, 9, 11, 13, 15))
 #: Jumps per second of each keypoint: a limb is taken for something else, or for that of the other side, for some
 #: frames; their mean duration in seconds, their distance in body heights, and the share of those to the other side.
-JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.05,) * 2 + (0.07,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
+JUMPS_HZ = (0.015,) * 5 + (0.02,) * 2 + (0.10,) * 2 + (0.16,) * 2 + (0.02,) * 2 + (0.11,) * 2 + (0.16,) * 2
 JUMP_S, JUMP, JUMP_ACROSS = 0.12, 0.2, 0.44
+#: Share of these jumps of elbows and wrists that the lifter learns from: with all of them, it smooths quick hands.
+_ARMS = torch.tensor((1.0,) * 7 + (0.5,) * 2 + (0.44,) * 2 + (1.0,) * 6)
 #: (2, 17) keypoints that people who lie down are reduced to where the detector finds them in part: hips and legs, or
 #: those above the knees.
 PARTS = torch.stack([torch.arange(17) >= 11, torch.arange(17) < 13])
@@ -296,7 +298,7 @@ def _missed(
 
     often = torch.exp(draw.normal(1)) * (1 + draw.number(0.0, 6.0, 1) * tilted)
     began, lasting = draw.number(0.0, 1.0, frames, 17), draw.number(1e-6, 1.0, frames, 17)
-    rate_hz = often[..., None] * torch.tensor(JUMPS_HZ)
+    rate_hz = often[..., None] * (_ARMS * torch.tensor(JUMPS_HZ))
     jumps, since = jumps_from(rate_hz, fps[:, None, None], began, lasting)
     step, across = draw.normal(frames, 17, 2), draw.number(0.0, 1.0, frames, 17)
     there = landed(found, unit[..., None, None], since, step, across)
