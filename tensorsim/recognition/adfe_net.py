@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from tensorsim.config import RadarConfig
 from tensorsim.errors import TensorsimError
+from tensorsim.ops import safe_sqrt
 from tensorsim.radar.processing.doppler import DopplerFrames
 from tensorsim.radar.processing.mti import MovingTargetIndicator
 from tensorsim.recognition.blocks import ChannelGate, ImageClassifier
@@ -89,8 +90,7 @@ class DopplerEnhancement(DopplerFrames):
         total = torch.zeros_like(self.spectrum(frames[:, 0])[..., 0])
         for r in range(frames.shape[1]):
             power = self.spectrum(frames[:, r]).square().sum(-1)
-            # The square root of 0 has no gradient.
-            total = total + torch.where(power > 0, torch.where(power > 0, power, 1.0).sqrt(), 0.0)
+            total = total + safe_sqrt(power)
         shape = list(profiles.shape[:-2])
         shape.extend([self.bins, frames.shape[2]])
         return total.transpose(-1, -2).reshape(shape)

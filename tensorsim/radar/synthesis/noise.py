@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from tensorsim.config.checks import is_finite
 from tensorsim.errors import TensorsimError, check_choice, check_complex_map, check_positive
 from tensorsim.limits import check_range
+from tensorsim.ops import safe_sqrt
 
 BOLTZMANN_J_PER_K = 1.380649e-23
 REFERENCE_TEMPERATURE_K = 290.0
@@ -28,12 +29,6 @@ def decibels(signal_power: Tensor, noise_power: Tensor) -> Tensor:
     """``10 log10(signal / noise)``; +inf without noise, -inf without signal."""
     ratio = 10.0 * torch.log10(signal_power / noise_power)
     return torch.where(noise_power > 0, ratio, torch.full_like(ratio, float("inf")))
-
-
-def _deviation(power: Tensor) -> Tensor:
-    """Square root of the power, whose gradient is 0 at 0: it would be infinite, and NaN for all that led to it."""
-    there = power > 0
-    return torch.where(there, power, 1.0).sqrt() * there
 
 
 class ProfileNoise(nn.Module):
@@ -77,7 +72,7 @@ class ProfileNoise(nn.Module):
             pair = parts[:, reach - lag : reach - lag + bins] + parts[:, reach + lag : reach + lag + bins]
             noise = torch.add(noise, pair, alpha=self.taps[lag] / self.taps[0])
         drawn = energy(white).to(power.dtype) * power * (self.samples / shape[1])
-        deviation = self.taps[0] * _deviation(power.to(noise.dtype))[:, None, None, None]
+        deviation = self.taps[0] * safe_sqrt(power.to(noise.dtype))[:, None, None, None]
         return torch.view_as_complex(noise * deviation), drawn
 
 
@@ -146,7 +141,8 @@ class ReceiverNoise(nn.Module):
     def draw(self, like: Tensor, noise_power: Tensor) -> Tensor:
         """Noise in the shape of ``like`` (..., M, N) with this variance (...)."""
         parts = torch.view_as_real(torch.randn_like(like))
-        deviation = _deviation(noise_power.to(parts.dtype))[..., None, None, None]
+        # Without echo there is no noise: the gradients of the other clips stay finite.
+        deviation = safe_sqrt(noise_power.to(parts.dtype))[..., None, None, None]
         return torch.view_as_complex(parts * deviation)
 
     @torch.jit.export
