@@ -211,18 +211,21 @@ class VideoReader:
     def _chunks(self, size: int) -> Generator[Tensor, None, None]:
         import cv2
 
-        shape = size, self.height, self.width, 3
-        buffer, filled = np.empty(shape, np.uint8), 0
+        def empty() -> Tensor:
+            # NumPy would ask for huge pages, which can take the kernel several times as long to find.
+            return torch.empty(size, self.height, self.width, 3, dtype=torch.uint8)
+
+        buffer, filled = empty(), 0
         times_s: list[float] = []
         for _, own_s, frame in self._decoded():
             times_s.append(own_s)
-            cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled])
+            cv2.cvtColor(frame, cv2.COLOR_BGR2RGB, dst=buffer[filled].numpy())
             filled += 1
             if filled == size:
-                yield torch.from_numpy(buffer).permute(0, 3, 1, 2)
-                buffer, filled = np.empty(shape, np.uint8), 0
+                yield buffer.permute(0, 3, 1, 2)
+                buffer, filled = empty(), 0
         if filled:
-            yield torch.from_numpy(buffer[:filled]).permute(0, 3, 1, 2)
+            yield buffer[:filled].permute(0, 3, 1, 2)
         self._keep_times(torch.tensor(times_s, dtype=torch.float64))
 
     def _decoded(self) -> Generator[tuple[float, float, np.ndarray], None, None]:
