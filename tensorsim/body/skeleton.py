@@ -49,6 +49,11 @@ def trunk_uprightness(joints: Tensor) -> Tensor:
     return trunk[..., 2] / trunk.square().sum(dim=-1).clamp(min=1e-6).sqrt()
 
 
+def trunk_lean(joints: Tensor) -> Tensor:
+    """How far the trunk leans: (..., 14, 3) -> (...), 0 upright, 1 horizontal or upside down."""
+    return 1 - trunk_uprightness(joints).clamp(min=0.0)
+
+
 def lowest_ankle(joints: Tensor) -> Tensor:
     """Height of the lower ankle: (..., 14, 3) -> (...)."""
     return torch.minimum(joints[..., 10, 2], joints[..., 13, 2])

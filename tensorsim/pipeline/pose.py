@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import coco_to_body, mid_hips, trunk_uprightness
+from tensorsim.body.skeleton import coco_to_body, mid_hips, trunk_lean
 from tensorsim.config import CameraConfig, PoseConfig, SimulationConfig
 from tensorsim.errors import (
     TensorsimError,
@@ -424,7 +424,7 @@ class VideoToPose(nn.Module):
         if self.temporal is None:
             noise = noise_with_depth(noise, lifted.deviation, joints, torch.tensor(self.camera_m).to(joints))
         elif self.bone_fit is None:
-            lying = 1 - trunk_uprightness(joints.detach()).clamp(min=0.0)
+            lying = trunk_lean(joints.detach())
             noise = noise * (1 + (self.lying_noise - 1) * lying)[..., None, None]
         usable = usable & seen.any(dim=-1)  # without frames whose size is implausible
         if self.bone_fit is not None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tensorsim.body.kinematics import rotation
-from tensorsim.body.skeleton import MIRRORED, body_to_coco, coco_to_body, mid_hips, mirror, trunk_uprightness
+from tensorsim.body.skeleton import MIRRORED, body_to_coco, coco_to_body, mid_hips, mirror, trunk_lean
 from tensorsim.config import CameraConfig
 from tensorsim.geometry.camera import camera_to_world, focal_length
 from tensorsim.training.lifter_motion import RATE_HZ, MotionPool
@@ -395,7 +395,7 @@ def seen_in(view: View, height: Tensor, fps: Tensor, draw: Draw, errors: bool = 
     points = camera[..., :2] / away[..., None] * view.focal[:, None, None, None] + center[:, None, None]
     inside = ((points > -2) & (points < extent[:, None, None] + 2)).all(dim=-1) & (camera[..., 2] > 0.2)
     unit = (view.focal * height)[:, None] / away[..., 11:13].mean(dim=-1)
-    tilted = 1 - trunk_uprightness(view.joints).clamp(min=0.0)
+    tilted = trunk_lean(view.joints)
     if errors:
         scores = torch.ones_like(away)
         # From behind, eyes and nose are hidden; many networks still place them, with high scores.

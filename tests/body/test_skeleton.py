@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tensorsim.body.skeleton import body_to_coco, coco_to_body, trunk_uprightness
+from tensorsim.body.skeleton import body_to_coco, coco_to_body, trunk_lean, trunk_uprightness
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
 from tensorsim.errors import TensorsimError
 from tests.stage import StageTester
@@ -160,3 +160,4 @@ def test_trunk_uprightness_is_the_cosine_of_the_lean() -> None:
     joints[:, 1] = 0.5 * torch.stack([angle.sin(), torch.zeros(4, dtype=torch.float64), angle.cos()], -1)
     joints[:, (8, 11)] = 1e-9 * torch.randn(4, 2, 3, generator=torch.Generator().manual_seed(0)).double()
     torch.testing.assert_close(trunk_uprightness(joints), angle.cos(), rtol=0, atol=1e-7)
+    torch.testing.assert_close(trunk_lean(joints), (1 - angle.cos()).clamp(max=1), rtol=0, atol=1e-7)
