@@ -1,4 +1,4 @@
-"""Everyday variants of the twelve activities: falls in any direction, walks that come to a stop, kicks of a ball.
+"""Everyday variants of the twelve activities: falls in any direction, walks that come to a stop, kicks of balls.
 
 Scripts as in :mod:`.scripts`. Each begins at time 0; before that the person stands or walks up.
 """
@@ -219,9 +219,10 @@ def walk_with_still_arms(time: Tensor, who: People) -> Act:
 def kick_ball(time: Tensor, who: People) -> Act:
     """Walks or runs up to a ball, kicks it at time 0 with a straight swing of the leg, and stops or runs on a little.
 
-    In captured ball kicks people run up for one to two seconds; at the kick the hips move at 2 to 3.5 m/s and the
-    foot at 10 m/s, and people come to rest within a second. At a lower ``tempo`` the leg swings less far in the same
-    time.
+    In captured ball kicks people run up for half a second to two seconds, most of them ever faster, with the kicking
+    side turned back by 30 to 60 degrees until the leg swings through; at the kick the hips move at 2 to 3.5 m/s and
+    the foot at 10 m/s, and people come to rest within a second. At a lower ``tempo`` the leg swings less far in the
+    same time.
     """
     v = Vary(who)
     far = who.tempo[:, None].clamp(max=1.0)
@@ -240,9 +241,11 @@ def kick_ball(time: Tensor, who: People) -> Act:
     folded = segment(time, lifted - 0.08, back - 0.04) - segment(time, back + 0.04, through)
     poised = bell(time, lifted, landed)
     swing = v(6.0) * (shot - drawn)
+    angled = 45.0 * share_of(who, 31.0)
     base = make_pose(
         time,
         who,
+        turn=angled * (segment(time, back - 0.1, landed) - 1),
         pitch=v(12.0) * poised - v(15.0) * far * shot,
         twist=v(10.0) * (drawn - shot),
         hip=(REST_HIP - v(15.0) * far * drawn + v(45.0) * far * shot, REST_HIP + 5 * poised),
@@ -251,10 +254,11 @@ def kick_ball(time: Tensor, who: People) -> Act:
         abduction=(8 + v(10.0) * poised, 8 + v(15.0) * poised),
         elbow=(12 + 20 * poised, 12 + 20 * poised),
     )
-    start = -1.2 - 1.5 * share_of(who, 7.0)
-    stop, still = -0.2 + 0 * back, 0.4 + 0.4 * share_of(who, 13.0)
-    pace = segment(time, start, start + 0.5) - segment(time, stop, still)
-    gone_s = travel(time, start, start + 0.5) - travel(time, stop, still)
+    start = -0.8 - 1.9 * share_of(who, 7.0)
+    top = torch.lerp(start + 0.5, -0.2 + 0 * start, share_of(who, 19.0))  # some run faster and faster
+    stop, still = -0.2 + 0 * back, 0.4 + 0.6 * share_of(who, 13.0)
+    pace = segment(time, start, top) - segment(time, stop, still)
+    gone_s = travel(time, start, top) - travel(time, stop, still)
     act = with_gait(time, runner, base, pace, quick[:, None] * gone_s)
     aloft = segment(time, lifted, lifted + 0.1) - segment(time, landed - 0.1, landed)
     free = torch.stack([1 - aloft, torch.ones_like(aloft)], dim=-1)
@@ -268,3 +272,45 @@ def kick_ball(time: Tensor, who: People) -> Act:
         # The standing leg carries the body, not the kicking one.
         support=torch.tensor([0.0, 1.0], dtype=time.dtype).expand_as(act.support),
     )
+
+
+def juggle_ball(time: Tensor, who: People) -> Act:
+    """Keeps a ball up with small kicks ahead, the first at time 0; some use both feet in turn and some only one."""
+    v = Vary(who)
+    lift, lower = v(0.22), v(0.28)
+    every = lift + lower + 0.05 + 0.5 * share_of(who, 17.0)
+    both = torch.where(share_of(who, 31.0) < 0.6, 1.0, 0.0).to(time.dtype)
+    period = every * (1 + both)
+    high, folded = v(28.0) + 40 * share_of(who, 13.0), v(45.0)
+
+    def foot(start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Angles of hip and knee, and how far the foot is off the floor, 0 to 1."""
+        since = torch.remainder(time - start, period)
+        zero = 0 * lift
+        up = segment(since, zero, lift) - segment(since, lift + 0.03, lift + 0.03 + lower)
+        # The knee bends first; the foot meets the ball with the shank swinging ahead.
+        fold = bell(since, zero, 1.3 * lift)
+        aloft = segment(since, zero, 0.4 * lift) - segment(since, lift + 0.5 * lower, lift + 0.03 + lower)
+        return REST_HIP + high * up, REST_KNEE + folded * fold + 0.3 * high * up, aloft
+
+    (hip, knee, right), (other_hip, other_knee, left) = foot(0 * every), foot(every)
+    left = both * left
+    arms = v(22.0)
+    pose = make_pose(
+        time,
+        who,
+        pitch=v(6.0) - 4 * (right + left),
+        nod=20.0,
+        hip=(hip, REST_HIP + both * (other_hip - REST_HIP)),
+        knee=(knee, REST_KNEE + both * (other_knee - REST_KNEE)),
+        flexion=(8 - v(6.0) * (right - left), 8 + v(6.0) * (right - left)),
+        abduction=(arms, arms),
+        elbow=(v(35.0), v(35.0)),
+    )
+    act = on_the_spot(time, pose)
+    aloft = torch.stack([right, left], dim=-1)
+    width = (who.proportions.half_hips * who.height_m)[:, None]
+    zero = torch.zeros_like(time)
+    # The other leg carries the body, and the hips shift over it.
+    sway = torch.stack([0.5 * width * (left - right), zero, zero], dim=-1)
+    return act._replace(hold=1 - aloft, support=0.5 + 0.5 * (aloft.flip(-1) - aloft), offset=sway)

@@ -74,8 +74,9 @@ VARIANTS: tuple[tuple[Variant, ...], ...] = (
         Variant(martial_arts.punch_once, 0.0, 1.0, 0.25, (0.6, 1.2), steps=0.5, lunges=0.6),
     ),
     (
-        Variant(scripts.kick, 0.4, None, 0.45, (0.6, 1.2), steps=0.5),
-        Variant(martial_arts.kick_round, 0.0, 1.2, 0.4, (0.6, 1.2), steps=0.5),
+        Variant(scripts.kick, 0.4, None, 0.4, (0.6, 1.2), steps=0.5),
+        Variant(martial_arts.kick_round, 0.0, 1.2, 0.32, (0.6, 1.2), steps=0.5),
+        Variant(everyday.juggle_ball, 0.0, None, 0.13, (0.6, 1.15), steps=0.5),
         # Few: a run-up to a ball looks like a walk.
         Variant(everyday.kick_ball, -0.8, 1.6, 0.15, (0.4, 1.15)),
     ),

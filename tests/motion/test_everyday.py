@@ -37,7 +37,7 @@ def moved(request):
     return request.param, people, perform(script(request.param), time.expand(16, -1), people)
 
 
-@pytest.mark.parametrize("moved", [*FALLS, *BLOWS, *WALKS, "kick_ball"], indirect=True)
+@pytest.mark.parametrize("moved", [*FALLS, *BLOWS, *WALKS, "kick_ball", "juggle_ball"], indirect=True)
 def test_bones_keep_their_length_and_nobody_is_too_fast(moved):
     _, _, joints = moved
     for a, b in BONES:
@@ -190,6 +190,46 @@ def test_a_ball_is_kicked_from_a_foot_that_stands_beside_it():
     foot = (ankles[..., 0, :].diff(dim=1).norm(dim=-1) * RATE).amax(1)
     assert 7.0 < float(foot.median()) < 10.5
     assert float(foot.max()) < 13.0
+
+
+def test_the_kicking_side_is_turned_back_until_the_leg_swings_through():
+    people = draw_people(40, PeopleConfig(), torch.Generator().manual_seed(3))
+    time = (torch.arange(round(3.5 * RATE), dtype=torch.float64) / RATE - 2.5).expand(40, -1)
+    joints = perform(everyday.kick_ball, time, people)
+    right = (joint(joints, "right_hip") - joint(joints, "left_hip"))[..., :2]
+    turn_deg = torch.rad2deg(torch.atan2(right[..., 1], right[..., 0]))  # 0 faces along the run-up
+    before, after = turn_deg[:, round(2.3 * RATE)], turn_deg[:, -1]
+    assert float(before.median()) < -10
+    assert float(before.min()) > -70
+    assert float(after.abs().max()) < 10
+    # Some are ever faster until they kick, some run at one speed.
+    hips = (joint(joints, "right_hip") + joint(joints, "left_hip"))[..., 1] / 2
+    gone = hips[:, round(2.3 * RATE)] - hips[:, 0]
+    late = hips[:, round(2.3 * RATE)] - hips[:, round(1.9 * RATE)]
+    assert float((late / gone).min()) < 0.4 < 0.7 < float((late / gone).max())
+
+
+def test_who_juggles_a_ball_kicks_low_with_one_foot_or_both_in_turn():
+    people = draw_people(24, PeopleConfig(), torch.Generator().manual_seed(4))
+    time = (torch.arange(round(6 * RATE), dtype=torch.float64) / RATE).expand(24, -1)
+    joints, act = perform(everyday.juggle_ball, time, people), everyday.juggle_ball(time, people)
+    ankles = torch.stack([joint(joints, "right_ankle"), joint(joints, "left_ankle")], dim=-2)
+    height = ankles[..., 2] / people.height_m[:, None, None]
+    assert float(height.min()) > ANKLE_HEIGHT - 0.0022
+    highest = height.amax(1)
+    assert bool(((highest[:, 0] > 0.08) & (highest[:, 0] < 0.45)).all())
+    uses_left = highest[:, 1] > 0.08
+    assert 6 < int(uses_left.sum()) < 20
+    # One foot is always on the floor, and does not slide.
+    assert float(height.amin(-1).max()) < ANKLE_HEIGHT + 0.02
+    held = (act.hold > 0.9999)[:, 1:] & (act.hold > 0.9999)[:, :-1]
+    assert float((ankles.diff(dim=1).norm(dim=-1) * RATE)[held].max()) < 0.2
+    foot = ankles[..., 0, :].diff(dim=1).norm(dim=-1) * RATE
+    assert 1.5 < float(foot.amax(1).median()) < 7.0
+    # The foot meets the ball ahead of the body.
+    ahead = (ankles[..., 0, 1] - joint(joints, "right_hip")[..., 1]) / people.height_m[:, None]
+    top = height[..., 0].argmax(1, keepdim=True)
+    assert float(ahead.gather(1, top).median()) > 0.1
 
 
 def test_the_trunk_of_who_kicks_round_leans_over_the_standing_foot():
