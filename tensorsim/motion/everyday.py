@@ -279,7 +279,7 @@ def juggle_ball(time: Tensor, who: People) -> Act:
     v = Vary(who)
     lift, lower = v(0.22), v(0.28)
     every = lift + lower + 0.05 + 0.5 * share_of(who, 17.0)
-    both = torch.where(share_of(who, 31.0) < 0.6, 1.0, 0.0).to(time.dtype)
+    both = (share_of(who, 31.0) < 0.6).to(time.dtype)
     period = every * (1 + both)
     high, folded = v(28.0) + 40 * share_of(who, 13.0), v(45.0)
 
