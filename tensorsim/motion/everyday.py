@@ -1,6 +1,6 @@
 """Everyday variants of the twelve activities: falls in any direction, walks that come to a stop, kicks of balls.
 
-Scripts as in :mod:`.scripts`. Each begins at time 0; before that the person stands or walks up.
+Scripts as in :mod:`.scripts`. Those with a beginning begin at time 0; before that the person stands or walks up.
 """
 
 import math
@@ -25,7 +25,7 @@ from tensorsim.motion.act import (
 )
 from tensorsim.motion.people import People
 from tensorsim.motion.scripts import fall_tempo, toppling
-from tensorsim.motion.timing import GRAVITY, bell, landing, minimum_jerk, segment, travel
+from tensorsim.motion.timing import GRAVITY, bell, landing, minimum_jerk, segment, there_and_back, travel
 
 
 def fall_any_way(time: Tensor, who: People) -> Act:
@@ -275,7 +275,7 @@ def kick_ball(time: Tensor, who: People) -> Act:
 
 
 def juggle_ball(time: Tensor, who: People) -> Act:
-    """Keeps a ball up with small kicks ahead, the first at time 0; some use both feet in turn and some only one."""
+    """Keeps a ball up all the time with small kicks ahead; some use both feet in turn, and some only one."""
     v = Vary(who)
     lift, lower = v(0.22), v(0.28)
     every = lift + lower + 0.05 + 0.5 * share_of(who, 17.0)
@@ -283,26 +283,26 @@ def juggle_ball(time: Tensor, who: People) -> Act:
     period = every * (1 + both)
     high, folded = v(28.0) + 40 * share_of(who, 13.0), v(45.0)
 
-    def foot(start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Angles of hip and knee, and how far the foot is off the floor, 0 to 1."""
+    def foot(start: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Angles of hip and knee, and how far the foot is off the floor, 0 to 1; at rest where ``share`` is 0."""
         since = torch.remainder(time - start, period)
         zero = 0 * lift
-        up = segment(since, zero, lift) - segment(since, lift + 0.03, lift + 0.03 + lower)
+        up = share * there_and_back(since, lift, 0.03, lower)
         # The knee bends first; the foot meets the ball with the shank swinging ahead.
-        fold = bell(since, zero, 1.3 * lift)
+        fold = share * bell(since, zero, 1.3 * lift)
         aloft = segment(since, zero, 0.4 * lift) - segment(since, lift + 0.5 * lower, lift + 0.03 + lower)
-        return REST_HIP + high * up, REST_KNEE + folded * fold + 0.3 * high * up, aloft
+        return REST_HIP + high * up, REST_KNEE + folded * fold + 0.3 * high * up, share * aloft
 
-    (hip, knee, right), (other_hip, other_knee, left) = foot(0 * every), foot(every)
-    left = both * left
+    right_hip, right_knee, right = foot(0 * every, torch.ones_like(both))
+    left_hip, left_knee, left = foot(every, both)
     arms = v(22.0)
     pose = make_pose(
         time,
         who,
         pitch=v(6.0) - 4 * (right + left),
         nod=20.0,
-        hip=(hip, REST_HIP + both * (other_hip - REST_HIP)),
-        knee=(knee, REST_KNEE + both * (other_knee - REST_KNEE)),
+        hip=(right_hip, left_hip),
+        knee=(right_knee, left_knee),
         flexion=(8 - v(6.0) * (right - left), 8 + v(6.0) * (right - left)),
         abduction=(arms, arms),
         elbow=(v(35.0), v(35.0)),

@@ -15,16 +15,10 @@ from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_t
 from tensorsim.motion.feet import soft_reach
 from tensorsim.motion.people import People
 from tensorsim.motion.scripts import fall_tempo, over_the_knees, toppling
-from tensorsim.motion.timing import GRAVITY, bell, minimum_jerk, segment
+from tensorsim.motion.timing import GRAVITY, bell, minimum_jerk, segment, there_and_back
 
 #: Metres around take-off and landing over which the heels leave the floor.
 _HEEL_M = 0.015
-
-
-def _there_and_back(time: Tensor, out: Tensor, hold: Tensor, back: Tensor) -> Tensor:
-    """From 0 to 1 in ``out`` seconds from time 0, held for ``hold``, and back to 0 in ``back``."""
-    zero = torch.zeros_like(out)
-    return segment(time, zero, out) - segment(time, out + hold, out + hold + back)
 
 
 def _cycle_share(time: Tensor, period: Tensor, who: People) -> Tensor:
@@ -35,7 +29,7 @@ def _cycle_share(time: Tensor, period: Tensor, who: People) -> Tensor:
 def pick_up(time: Tensor, who: People) -> Act:
     """Picks something up from the floor and stands again; some stoop and some squat."""
     v = Vary(who)
-    down = _there_and_back(time, v(1.1), v(0.3), v(1.2))
+    down = there_and_back(time, v(1.1), v(0.3), v(1.2))
     squat = (0.5 + (v(1.0) - 1) / 0.25).clamp(0.0, 1.0)
     knee = REST_KNEE + (v(50.0) + 75 * squat - REST_KNEE) * down
     # The hips move back as the trunk bends forward, so that the body stays over the feet.
@@ -58,7 +52,7 @@ def drink(time: Tensor, who: People) -> Act:
     """Lifts a cup to the mouth, tips head and cup back, and lowers the hand again."""
     v = Vary(who)
     out, hold, back = v(1.0), v(1.2), v(1.0)
-    up = _there_and_back(time, out, hold, back)
+    up = there_and_back(time, out, hold, back)
     tip = bell(time, 0.8 * out, out + hold + 0.2 * back)
     pose = make_pose(
         time,
@@ -98,7 +92,7 @@ def fall_down(time: Tensor, who: People) -> Act:
 def bend(time: Tensor, who: People) -> Act:
     """Bends down with nearly straight legs, hands at the shins, and comes up again."""
     v = Vary(who)
-    down = _there_and_back(time, v(1.0), v(0.4), v(1.0))
+    down = there_and_back(time, v(1.0), v(0.4), v(1.0))
     arms = 2 + v(10.0) * down
     # The hips move back, so that the body stays over the feet.
     hip = REST_HIP + 10 * down
@@ -219,7 +213,7 @@ def box(time: Tensor, who: People) -> Act:
     def fist(start: Tensor | float) -> Tensor:
         since = torch.remainder(beat - start, 2 * every)
         out, back = 0.34 * every, 0.46 * every
-        return segment(since, 0 * out, out) - segment(since, out, out + back)
+        return there_and_back(since, out, 0.0, back)
 
     right, left = fist(0.0), fist(every)
     twist = v(28.0) * (right - left)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tensorsim.motion.act import REST_HIP, REST_KNEE, Act, Vary, make_pose, on_the_spot, share_of
 from tensorsim.motion.people import People
-from tensorsim.motion.timing import bell, segment
+from tensorsim.motion.timing import bell, segment, there_and_back
 
 
 def _seldom(time: Tensor, who: People, shortest_s: float) -> Tensor:
@@ -34,7 +34,7 @@ def swing_fist(time: Tensor, who: People) -> Act:
         since = time - start
         since = torch.where(since < 0, since, torch.remainder(since, torch.where(both, 2 * every, every)))
         out, back = 0.16 * every, 0.26 * every
-        return segment(since, 0 * out, out) - segment(since, out + 0.1 * every, out + 0.1 * every + back)
+        return there_and_back(since, out, 0.1 * every, back)
 
     right = fist(0 * every)
     left = torch.where(both, fist(every), 0 * right)
@@ -71,7 +71,7 @@ def punch_once(time: Tensor, who: People) -> Act:
     stay = 0.6 * share_of(who, 7.0)
     load = load.clamp(max=0.45)
     ready = segment(since, -load, 0 * load) - segment(since, out + stay, out + stay + back)
-    shot = segment(since, 0 * out, out) - segment(since, out + stay, out + stay + back)
+    shot = there_and_back(since, out, stay, back)
     # On guard all the time, or only for the blow.
     guard = torch.where(share_of(who, 13.0) < 0.5, torch.ones_like(ready), ready)
     bent = REST_KNEE + v(14.0) * guard + v(12.0) * shot

@@ -20,7 +20,7 @@ from tensorsim.motion.act import (
 )
 from tensorsim.motion.feet import tread
 from tensorsim.motion.people import People
-from tensorsim.motion.timing import bell, minimum_jerk, segment, toppling_angles, travel
+from tensorsim.motion.timing import bell, minimum_jerk, segment, there_and_back, toppling_angles, travel
 
 
 def _repeated(time: Tensor, start: Tensor, period: Tensor) -> Tensor:
@@ -43,8 +43,7 @@ def punch(time: Tensor, who: People) -> Act:
 
     def fist(start: Tensor) -> Tensor:
         since = _repeated(time, start, 2 * every)
-        zero = torch.zeros_like(extend)
-        return segment(since, zero, extend) - segment(since, extend + 0.02, extend + 0.02 + back)
+        return there_and_back(since, extend, 0.02, back)
 
     right, left = fist(first), fist(first + every)
     twist = turn * (right - left)

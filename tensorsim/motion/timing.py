@@ -19,6 +19,11 @@ def segment(time: Tensor, start: Tensor, end: Tensor) -> Tensor:
     return minimum_jerk(((time - start) / (end - start)).clamp(0.0, 1.0))
 
 
+def there_and_back(time: Tensor, out: Tensor, hold: Tensor | float, back: Tensor) -> Tensor:
+    """From 0 to 1 in ``out`` seconds from time 0, held for ``hold``, and back to 0 in ``back``; see :func:`segment`."""
+    return segment(time, torch.zeros_like(out), out) - segment(time, out + hold, out + hold + back)
+
+
 def bell(time: Tensor, start: Tensor, end: Tensor) -> Tensor:
     """``sin^2`` that is 0 at ``start``, 1 in the middle and 0 at ``end``; 0 outside."""
     share = ((time - start) / (end - start)).clamp(0.0, 1.0)
