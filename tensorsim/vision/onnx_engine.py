@@ -7,6 +7,7 @@ crops of rendered people, or, in OpenVINO, in bfloat16.
 
 import hashlib
 import io
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -41,6 +42,9 @@ Run = Callable[[Images], list[Images]]
 
 def import_failure(package: str) -> str | None:
     """Why a package cannot be imported, in one line; None if it can."""
+    if package == "openvino":
+        # It would report every import to Google Analytics, in a thread that the process waits for at its end.
+        sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # None: no such module
     try:
         import_module(package)
     except Exception as error:  # a broken installation may raise anything

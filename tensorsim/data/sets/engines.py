@@ -129,6 +129,8 @@ class RayCluster:
             return
         started = not ray.is_initialized()
         if started:
+            # Unless the user wants it, a cluster of ours does not report its use to the makers of Ray.
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             ray.init(
                 address=self.address,
                 num_cpus=self.workers if self.address is None else None,

@@ -608,9 +608,15 @@ def test_three_kills_at_random_moments_leave_no_trace(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Ray
-def test_ray_makes_the_same_bytes(built: Path, recipe: DatasetRecipe, tmp_path: Path) -> None:
+def test_ray_makes_the_same_bytes_and_reports_nothing(
+    built: Path, recipe: DatasetRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
     build_dataset(recipe, tmp_path / "set", RayCluster(workers=1), quiet=True)
+    from ray._common.usage.usage_lib import usage_stats_enabled
+
+    assert not usage_stats_enabled()
     assert contents(tmp_path / "set") == contents(built)
 
 
