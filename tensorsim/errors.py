@@ -17,7 +17,9 @@ from tensorsim.exceptions import check_choice as check_choice
 from tensorsim.exceptions import check_count as check_count
 from tensorsim.exceptions import check_distinct as check_distinct
 from tensorsim.exceptions import check_not_negative as check_not_negative
+from tensorsim.exceptions import check_per_person as check_per_person
 from tensorsim.exceptions import check_positive as check_positive
+from tensorsim.exceptions import check_score as check_score
 from tensorsim.exceptions import check_seed as check_seed
 from tensorsim.exceptions import collected_warnings as collected_warnings
 from tensorsim.exceptions import first_line as first_line
@@ -281,19 +283,3 @@ def check_interval(value: object, least: float, most: float, name: str) -> None:
     if len(numbers) != 2 or not least <= numbers[0] <= numbers[1] <= most:
         within = f"within {least} to {most}" if math.isfinite(most) else f"from {least} or more"
         raise TensorsimError(f"{name}: got {value!r}, expected an ascending range {within}")
-
-
-def check_score(value: object, name: str) -> None:
-    """Refuse anything but a number between 0 and 1: any other threshold would pass all scores or none."""
-    if not isinstance(value, Real) or not 0 < float(value) < 1:
-        raise TensorsimError(f"{name}: got {value!r}, expected a score in (0, 1)")
-
-
-def check_per_person(values: object, name: str) -> None:
-    """Refuse anything but a tuple or list of positive finite numbers, one per person."""
-    if not isinstance(values, tuple | list):
-        raise TensorsimError(f"{name}: got {values!r}, expected a tuple of one number per person")
-    if len(values) == 0:
-        raise TensorsimError(f"{name}: got no values, expected one per person")
-    for person, value in enumerate(values):
-        check_positive(value, f"{name}[{person}]")

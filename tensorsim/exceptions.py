@@ -5,7 +5,7 @@ import sys
 import warnings
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 
@@ -62,6 +62,22 @@ def check_choice(value: object, choices: Collection[str], name: str) -> None:
     """Refuse anything but one of these names."""
     if not isinstance(value, str) or value not in choices:
         raise TensorsimError(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
+
+
+def check_score(value: object, name: str) -> None:
+    """Refuse anything but a number between 0 and 1: any other threshold would pass all scores or none."""
+    if not isinstance(value, Real) or not 0 < float(value) < 1:
+        raise TensorsimError(f"{name}: got {value!r}, expected a score in (0, 1)")
+
+
+def check_per_person(values: object, name: str) -> None:
+    """Refuse anything but a tuple or list of positive finite numbers, one per person."""
+    if not isinstance(values, tuple | list):
+        raise TensorsimError(f"{name}: got {values!r}, expected a tuple of one number per person")
+    if len(values) == 0:
+        raise TensorsimError(f"{name}: got no values, expected one per person")
+    for person, value in enumerate(values):
+        check_positive(value, f"{name}[{person}]")
 
 
 def check_distinct(values: Iterable[object], name: str) -> None:

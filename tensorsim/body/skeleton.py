@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tensorsim.body.proportions import NOSE_FORWARD, NOSE_UP
 from tensorsim.config import COCO_KEYPOINTS, JOINTS
+from tensorsim.config.names import LIMBS
 from tensorsim.errors import (
     check_finite,
     check_points,
@@ -18,8 +19,6 @@ from tensorsim.errors import (
     check_tensor,
 )
 
-#: Arms and legs by the indices of their joints, upper segment first.
-LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
 #: Segments of constant length by their ends; 14 is the middle of the hips. The neck, joint 1, is that of the shoulders.
 BONES = ((0, 1), (2, 5), *LIMBS[:4], (8, 11), *LIMBS[4:], (1, 14))
 

@@ -11,7 +11,7 @@ from tensorsim.config.checks import (
     require_positive,
     require_vector,
 )
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import math
 from numbers import Real
 from typing import Any, get_args
 
-from tensorsim.errors import TensorsimError, check_count
+from tensorsim.exceptions import TensorsimError, check_count
 from tensorsim.limits import check_range
 
 Vector = tuple[float, float, float]

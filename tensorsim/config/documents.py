@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 T = TypeVar("T")
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 #: Limits on the characters of a document and of a value, and on nesting; apart from long file paths, configurations
 #: need a tenth of each.

@@ -18,6 +18,9 @@ JOINTS = (
     "left_ankle",
 )
 
+#: Arms and legs by the indices of their joints, upper segment first.
+LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (8, 9), (9, 10), (11, 12), (12, 13))
+
 #: Radar cross section of each joint in m^2 (illegible in the panel for the legs: hip 0.1, knee 0.4, ankle 0.3).
 JOINT_RCS_M2 = (0.5, 1.0, 0.1, 0.3, 0.2, 0.1, 0.3, 0.2, 0.1, 0.4, 0.3, 0.1, 0.4, 0.3)
 

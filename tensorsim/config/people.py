@@ -5,7 +5,7 @@ from typing import Literal
 
 from tensorsim.config.camera import CameraConfig
 from tensorsim.config.checks import require_choices, require_counts, require_positive, require_ranges
-from tensorsim.errors import TensorsimError, check_per_person, check_score
+from tensorsim.exceptions import TensorsimError, check_per_person, check_score
 
 Position = Literal["camera", "paper"]
 Lifting = Literal["temporal", "nearest"]

@@ -11,7 +11,7 @@ from tensorsim.config.checks import (
     require_positive,
     require_ranges,
 )
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 RangeWindow = Literal["hamming", "hann", "blackman"]
 Mti = Literal["two-pulse", "n-pulse", "mean", "high-pass"]

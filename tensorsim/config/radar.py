@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from tensorsim.config.checks import Vector, listed, make_plain, require_position, require_ranges
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 from tensorsim.limits import check_range
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0

@@ -13,7 +13,7 @@ from tensorsim.config.checks import (
     require_positive,
     require_ranges,
 )
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from tensorsim.config.checks import (
 from tensorsim.config.radar import RadarConfig
 from tensorsim.config.receiver import ClutterConfig, InterferenceConfig, ReceiverConfig
 from tensorsim.config.surroundings import FloorConfig, WallConfig
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 WallPaths = Literal["series", "paper"]
 Incidence = Literal["normal", "oblique", "airy"]

@@ -13,7 +13,7 @@ from tensorsim.config.radar import RadarConfig
 from tensorsim.config.receiver import ReceiverConfig
 from tensorsim.config.scene import SceneConfig
 from tensorsim.config.surroundings import WallConfig
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 from tensorsim.files import write_text
 
 

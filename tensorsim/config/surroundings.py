@@ -10,7 +10,7 @@ from tensorsim.config.checks import (
     require_ranges,
     require_vector,
 )
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 from tensorsim.limits import check_range
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tensorsim.config.limited_yaml import load_limited_yaml
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 
 
 def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:

@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 from tensorsim.files import complete_file
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from tensorsim.errors import TensorsimError, TensorsimWarning, check_positive
+from tensorsim.exceptions import TensorsimError, TensorsimWarning, check_positive
 from tensorsim.plot.figure import new_figure
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tensorsim.errors import TensorsimError
+from tensorsim.exceptions import TensorsimError
 from tensorsim.files import complete_file
 from tensorsim.plot.figure import new_figure
 from tensorsim.plot.maps import MapStyle, colormap, decibels, doppler_span, thin_columns

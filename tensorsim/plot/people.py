@@ -6,10 +6,9 @@ from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from tensorsim.body.skeleton import LIMBS, mid_hips
 from tensorsim.config import Vector
+from tensorsim.config.names import LIMBS
 from tensorsim.plot.figure import new_figure
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ COCO_BONES = (
     (5, 11), (6, 12), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16),
 )
 # fmt: on
+_HIPS = [8, 11]
 #: One colour per person, RGB.
 PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (23, 190, 207))
 
@@ -68,8 +68,8 @@ def skeleton_figure(
         _draw_person(axes, person, joints_m[person], frames, chosen, fps)
     axes.scatter(*([value] for value in radar_m), color="black", marker="^", s=50, label="radar")
     bodies = np.concatenate([*shown, np.zeros((0, 14, 3))])
-    hips = mid_hips(torch.from_numpy(bodies)).numpy()
-    attached = np.linalg.norm(bodies - hips[:, None], axis=-1) <= _LIMB_REACH_M
+    hips = bodies[:, _HIPS].mean(axis=1, keepdims=True)
+    attached = np.linalg.norm(bodies - hips, axis=-1) <= _LIMB_REACH_M
     points = np.concatenate([bodies[attached], [[-0.75, 0.0, 0.0], [0.75, 1.0, 2.0], radar_m]])
     low, high = points.min(axis=0), points.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -123,7 +123,7 @@ def _draw_person(
             outline = [withStroke(linewidth=2.0, foreground="white")]
             axes.text(*top, f"{frame / fps:.1f} s", color=colour, fontsize=7, zorder=10, path_effects=outline)
             labelled = np.concatenate([labelled, top[None]])
-    track = mid_hips(torch.from_numpy(joints[frames])).numpy()
+    track = joints[frames][:, _HIPS].mean(axis=1)
     label = f"person {person + 1}, {frames[0] / fps:.1f} to {frames[-1] / fps:.1f} s"
     axes.plot(track[:, 0], track[:, 1], 0 * track[:, 2], color=colour, linestyle=":", label=label)
 
