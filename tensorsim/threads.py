@@ -85,7 +85,7 @@ def spread(work: Callable[[Item], Result], items: Iterable[Item], device: torch.
         try:
             for item in items:
                 waiting.append(pool.submit(copy_context().run, in_mode, item))
-                if len(waiting) == count:
+                if len(waiting) > count:  # one waits, so that no thread does
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
