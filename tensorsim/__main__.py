@@ -1,6 +1,6 @@
 """``python -m tensorsim`` is the command ``tensorsim``."""
 
-from tensorsim.cli import main
+from tensorsim.cli import command
 
 if __name__ == "__main__":
-    main()
+    command()

@@ -12,6 +12,7 @@ from tensorsim import __version__, process
 from tensorsim.commands.app import App
 from tensorsim.commands.arguments import describe_options, paragraphs
 from tensorsim.commands.check import Check
+from tensorsim.commands.clip_options import ClipOptions
 from tensorsim.commands.dataset import DatasetBuild, DatasetExample, DatasetSample, DatasetVerify
 from tensorsim.commands.demo import Demo
 from tensorsim.commands.evaluate_camera import EvaluateCamera
@@ -192,8 +193,14 @@ def parse(arguments: list[str] | None = None) -> Any:
     )
 
 
+def command() -> None:
+    """The ``tensorsim`` command: :func:`main` in a process of its own."""
+    main()
+    process.leave()
+
+
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the ``tensorsim`` command.
+    """Run the command that the arguments (default: the command line's) name.
 
     Exit status: 0 done, 2 bad input or a file that cannot be read or written, 129 and 143 ended by SIGHUP and SIGTERM,
     130 interrupted, 141 output pipe closed.
@@ -203,5 +210,6 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"tensorsim {__version__}")
             return
         command = parse(arguments)
-        process.load_torch()
+        if not isinstance(command, ClipOptions):  # these check their options first
+            process.load_torch()
         command.run()

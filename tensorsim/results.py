@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from tensorsim.data.video_writer import VideoWriter
 from tensorsim.device import one_thread
 from tensorsim.errors import TensorsimError, TensorsimWarning
 from tensorsim.pipeline import PoseToDoppler, warn_of_empty_clips
+from tensorsim.plot.apart import Drawing
 from tensorsim.progress import picture, progress_bar
 from tensorsim.report.film import FilmStrip
 from tensorsim.streaming import Found, maps_of_pose, within_reach
@@ -115,15 +117,17 @@ def draw_maps(
     folder: Path,
     maps: RadarMaps,
     axes: Axes,
+    drawing: Drawing,
     truth: RadarMaps | None = None,
     pictures: Pictures = Pictures(),  # immutable
 ) -> None:
-    """Write a picture per map.
+    """Draw a picture per map.
 
     Args:
         folder: where to write them.
         maps: on the CPU, without batch dimensions.
         axes: of the maps.
+        drawing: draws them.
         truth: maps of the true motion, of the same shapes, drawn beside the others.
         pictures: how they are drawn.
     """
@@ -136,8 +140,9 @@ def draw_maps(
         offset = (maps.range_time.shape[1] - magnitude.shape[1]) / 2
         time_s = axes.range_time_s(magnitude.shape[1]) + offset / axes.range_time_rate_hz
         reference = None if truth is None else getattr(truth, name).numpy()
-        plot.save_figure(
-            plot.map_figure(
+        drawing.draw(
+            partial(
+                plot.map_figure,
                 magnitude,
                 time_s,
                 axes.range_m,
@@ -148,16 +153,17 @@ def draw_maps(
             ),
             folder / f"{name}.{pictures.suffix}",
         )
-    plot.save_figure(doppler_figure(maps, axes, pictures, truth), folder / f"doppler_time.{pictures.suffix}")
+    drawing.draw(doppler_figure(maps, axes, pictures, truth), folder / f"doppler_time.{pictures.suffix}")
 
 
 def doppler_figure(
     maps: RadarMaps, axes: Axes, pictures: Pictures, truth: RadarMaps | None = None
-) -> "Figure":
-    """The picture of a Doppler-time map with its ridges; beside it that of the true motion, if given."""
+) -> "partial[Figure]":
+    """Call it to draw a Doppler-time map with its ridges; beside it that of the true motion, if given."""
     both = [maps] if truth is None else [maps, truth]
     range_db = pictures.style.dynamic_range_db
-    return plot.map_figure(
+    return partial(
+        plot.map_figure,
         maps.doppler_time.numpy(),
         axes.time_s,
         axes.doppler_hz,
@@ -229,11 +235,19 @@ def save_pose(folder: Path, pose: Pose, fps: float, formats: Sequence[str] = ("n
     save_arrays(folder / "pose", arrays, formats)
 
 
-def draw_pose(folder: Path, pose: Pose, fps: float, pictures: Pictures, radar: RadarConfig) -> None:
-    """Write a picture of the skeletons in the world, with the radar."""
-    joints, valid = pose.joints[0].numpy(), pose.valid[0].numpy()
-    figure = plot.skeleton_figure(joints, valid, fps, subtitle=pictures.subtitle, radar_m=radar.middle_m)
-    plot.save_figure(figure, folder / f"skeleton.{pictures.suffix}")
+def draw_pose(
+    folder: Path, pose: Pose, fps: float, drawing: Drawing, pictures: Pictures, radar: RadarConfig
+) -> None:
+    """Draw a picture of the skeletons in the world, with the radar."""
+    figure = partial(
+        plot.skeleton_figure,
+        pose.joints[0].numpy(),
+        pose.valid[0].numpy(),
+        fps,
+        subtitle=pictures.subtitle,
+        radar_m=radar.middle_m,
+    )
+    drawing.draw(figure, folder / f"skeleton.{pictures.suffix}")
 
 
 def write_overlay(

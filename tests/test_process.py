@@ -195,3 +195,30 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         except subprocess.TimeoutExpired:
             os.kill(worker, signal.SIGKILL)
             raise
+
+
+#: Leaves the command, with something that still runs in its process; an exit handler tells if Python took its time.
+LEAVE = """
+import atexit, multiprocessing, threading, time
+from tensorsim import process
+atexit.register(print, "taken apart")
+{running}
+process.leave()
+"""
+
+
+@pytest.mark.parametrize(
+    ("running", "said"),
+    [
+        ("", ""),
+        ("threading.Thread(target=time.sleep, args=(9,), daemon=True).start()", ""),
+        ("threading.Thread(target=lambda: (time.sleep(0.5), print('done'))).start()", "done\ntaken apart\n"),
+        (
+            "multiprocessing.get_context('fork').Process(target=time.sleep, args=(1,)).start()",
+            "taken apart\n",
+        ),
+    ],
+)
+def test_the_command_ends_at_once_unless_something_still_runs(running: str, said: str) -> None:
+    done = run_python(LEAVE.format(running=running))
+    assert (done.returncode, done.stdout) == (0, said), done.stderr

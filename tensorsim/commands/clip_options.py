@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from tensorsim.config import SimulationConfig
     from tensorsim.pipeline import PoseToDoppler
+    from tensorsim.plot.apart import Drawing
     from tensorsim.recognition import ActivityRecognizer
     from tensorsim.report import FilmStrip
     from tensorsim.results import Pictures
@@ -130,8 +131,8 @@ class ClipOptions(RadarOptions):
 
         with ThreadPoolExecutor(1) as pool:
             saved = pool.submit(save)
-            results.draw_maps(folder, maps, axes, truth, pictures)
-            results.draw_pose(folder, pose, run.fps, pictures, run.config.scene.radar)
+            results.draw_maps(folder, maps, axes, run.drawing, truth, pictures)
+            results.draw_pose(folder, pose, run.fps, run.drawing, pictures, run.config.scene.radar)
             saved.result()
         if self.sound:
             results.write_doppler_sound(folder, stage, pose, run.fps, run.device)
@@ -168,6 +169,7 @@ class Run(NamedTuple):
         film: what the people come from, for the titles.
         somebody: whether a person is in the scene.
         device: that ``stage`` is on.
+        drawing: draws the pictures.
     """
 
     config: "SimulationConfig"
@@ -179,3 +181,4 @@ class Run(NamedTuple):
     film: str
     somebody: bool
     device: "torch.device"
+    drawing: "Drawing"

@@ -17,12 +17,14 @@ from tensorsim.commands.options import (
     number_of_people,
 )
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.process import load_torch
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from tensorsim.config import CameraConfig, SimulationConfig
     from tensorsim.motion.activities import GeneratedMotion
+    from tensorsim.plot.apart import Drawing
     from tensorsim.render.renderer import RenderedVideo
     from tensorsim.types import Pose, RadarMaps
 
@@ -56,10 +58,17 @@ class Demo(NetworkOptions, ClipOptions):
 
     def run(self) -> None:
         """Run the command."""
+        self.check(self.out)
+        from tensorsim.plot.apart import drawing_apart
+
+        with drawing_apart() as drawing:
+            load_torch()
+            self._demonstrate(drawing)
+
+    def _demonstrate(self, drawing: "Drawing") -> None:
         # Long because it lists all the steps; each is a call.
         from tensorsim.motion.activities import activity_index
 
-        self.check(self.out)
         activity = activity_index(self.activity)
         if not 0.5 <= self.duration <= LONGEST_S:
             raise TensorsimError(
@@ -104,7 +113,7 @@ class Demo(NetworkOptions, ClipOptions):
                 pose__initial_distance_m=(start_m,) if config.pose.position == "paper" else None,
             )
             people = VideoToPose.from_config(config, *networks).to(device)
-            with complete_or_nothing(self.out) as folder:
+            with complete_or_nothing(self.out) as folder, drawing.complete():
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4", kept_mb=KEPT_MB), people, device)
                 simulated = results.simulated(source, maps_stage, folder, config, device, self.quiet)
@@ -116,7 +125,9 @@ class Demo(NetworkOptions, ClipOptions):
                     true_maps = maps_of_pose(true_stage, joints, rate_hz, device, self.quiet)
                     somebody = bool(truth.valid.any() | pose.valid.any())
                     name = f"demo: {ACTIVITIES[activity]}"
-                    done = Run(config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device)
+                    done = Run(
+                        config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device, drawing
+                    )
                     label = self.write_results(folder, done, true_maps)
                 write_pose_truth(folder, film, truth.valid, array_formats(self.save))
                 likeness, empty_likeness = likeness_to_truth(maps, true_maps)

@@ -36,7 +36,7 @@ def write_each_person(folder: Path, run: "Run", options: "ClipOptions") -> list[
     """
     import torch
 
-    from tensorsim import plot, results
+    from tensorsim import results
     from tensorsim.report.page import map_contents
     from tensorsim.streaming import maps_of_pose
     from tensorsim.summary import label_of
@@ -58,7 +58,7 @@ def write_each_person(folder: Path, run: "Run", options: "ClipOptions") -> list[
         pictures = options.pictures(run.stage, label["label"], f"{run.film}, person {number}", True)
         results.save_maps(folder / f"maps_person_{number}", maps, axes, array_formats(options.save))
         name = f"doppler_time_person_{number}"
-        plot.save_figure(results.doppler_figure(maps, axes, pictures), folder / f"{name}.{pictures.suffix}")
+        run.drawing.draw(results.doppler_figure(maps, axes, pictures), folder / f"{name}.{pictures.suffix}")
         shown = map_contents(maps, axes, pictures, f" of person {number}")[0] | {"name": name}
         written.append(Alone(number, label, shown))
     return written

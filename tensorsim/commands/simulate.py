@@ -20,12 +20,13 @@ from tensorsim.commands.options import (
 )
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 from tensorsim.limits import check_range
-from tensorsim.process import is_command, keep_freed_memory
+from tensorsim.process import is_command, keep_freed_memory, load_torch
 
 if TYPE_CHECKING:
     import torch
 
     from tensorsim.config import SimulationConfig
+    from tensorsim.plot.apart import Drawing
     from tensorsim.sources import Source
 
 #: Options that apply only to some kinds of source.
@@ -116,7 +117,13 @@ class Simulate(NetworkOptions, ClipOptions):
         self.check(self.out)
         if is_command():  # it affects the whole process, which may otherwise be somebody else's
             keep_freed_memory()
+        from tensorsim.plot.apart import drawing_apart
 
+        with drawing_apart() as drawing:
+            load_torch()
+            self._simulate(drawing)
+
+    def _simulate(self, drawing: "Drawing") -> None:
         import torch
 
         from tensorsim import results
@@ -144,14 +151,13 @@ class Simulate(NetworkOptions, ClipOptions):
             check_drawable(stage)
             if source.frame_count is not None:  # files may state a frame or two too few
                 results.check_length(source.frame_count, source.fps, stage, uncertain=2)
-            with complete_or_nothing(self.out, self.source) as folder:
+            with complete_or_nothing(self.out, self.source) as folder, drawing.complete():
                 simulated = results.simulated(source, stage, folder, config, device, self.quiet)
                 with simulated as (found, maps, strip):
                     pose = found.pose
                     somebody = bool(pose.valid.any())
-                    done = Run(
-                        config, stage, recognizer, pose, maps, source.fps, self.source.name, somebody, device
-                    )
+                    name, fps = self.source.name, source.fps
+                    done = Run(config, stage, recognizer, pose, maps, fps, name, somebody, device, drawing)
                     label = self.write_results(folder, done)
                     alone = write_each_person(folder, done, self) if self.per_person else []
                 summary = label | summary_of(source, config, found, maps)

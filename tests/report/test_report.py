@@ -120,7 +120,7 @@ def test_ridges_are_those_of_the_picture(run: tuple[Pose, RadarMaps, Axes, dict[
             "range_time_mti": 1.0,
         }
         pictures = Pictures(peaks=peaks)
-        picture = [line.get_ydata() for line in doppler_figure(maps, axes, pictures).axes[0].lines]
+        picture = [line.get_ydata() for line in doppler_figure(maps, axes, pictures)().axes[0].lines]
         ridges = np.array(map_contents(maps, axes, pictures)[0]["ridges"], dtype=float)
         assert np.allclose(ridges, picture, atol=0.1, equal_nan=True)
         assert np.isfinite(ridges).any() == some
