@@ -6,9 +6,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
@@ -23,71 +22,70 @@ from tensorsim.process import cpu_quota
 FIGURE = partial(plot.confusion_figure, np.eye(2), ["a", "b"], "counts")
 
 
-def end_process() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
+@pytest.fixture
+def apart(monkeypatch: pytest.MonkeyPatch) -> Iterator[Drawing]:
+    monkeypatch.setattr("tensorsim.plot.apart.cpu_quota", lambda: 2)
+    monkeypatch.setattr("tensorsim.plot.apart.is_command", lambda: True)
+    with drawing_apart() as drawing:
+        yield drawing
+    assert active_children() == []
 
 
-@pytest.fixture(scope="module")
-def pool() -> Iterator[Executor]:
-    with ProcessPoolExecutor(1, get_context("spawn")) as one:
-        yield one
-
-
-def test_another_process_draws_the_same_figure(pool: Executor, tmp_path: Path) -> None:
-    here, there = Drawing(), Drawing(pool)
-    with here.complete(), there.complete():
+def test_another_process_draws_the_same_figure(apart: Drawing, tmp_path: Path) -> None:
+    here = Drawing()
+    with here.complete(), apart.complete():
         here.draw(FIGURE, tmp_path / "here.png")
-        there.draw(FIGURE, tmp_path / "there.png")
+        apart.draw(FIGURE, tmp_path / "there.png")
+    assert type(apart) is not Drawing
     assert (tmp_path / "here.png").read_bytes() == (tmp_path / "there.png").read_bytes()
 
 
-def test_errors_of_the_other_process_are_raised_here(pool: Executor, tmp_path: Path) -> None:
+def test_errors_of_the_other_process_are_raised_here(apart: Drawing, tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
-    drawing = Drawing(pool)
-    with pytest.raises(NotWrittenError, match=r"a\.png: could not be written"), drawing.complete():
-        drawing.draw(FIGURE, tmp_path / "a.png")
+    with pytest.raises(NotWrittenError, match=r"a\.png: could not be written"), apart.complete():
+        apart.draw(FIGURE, tmp_path / "a.png")
 
 
-def test_nothing_is_drawn_any_more_after_a_failure(pool: Executor, tmp_path: Path) -> None:
-    def interrupted(drawing: Drawing) -> None:
-        with drawing.complete():
+def test_nothing_is_drawn_any_more_after_a_failure(apart: Drawing, tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with apart.complete():
             for index in range(20):
-                drawing.draw(FIGURE, tmp_path / f"{index}.png")
+                apart.draw(FIGURE, tmp_path / f"{index}.png")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted(Drawing(pool))
+        interrupted()
     written = set(tmp_path.iterdir())
     assert len(written) < 20
-    later = Drawing(pool)
-    with later.complete():
-        later.draw(FIGURE, tmp_path / "later.png")
+    apart.draw(FIGURE, tmp_path / "later.png")
+    apart._pool.shutdown()  # type: ignore[attr-defined]  # waits
     assert set(tmp_path.iterdir()) == {*written, tmp_path / "later.png"}
 
 
-def test_a_process_that_was_killed_is_said(tmp_path: Path) -> None:
-    def killed(pool: Executor) -> None:
-        drawing = Drawing(pool)
-        with drawing.complete():
-            pool.submit(end_process)
-            drawing.draw(FIGURE, tmp_path / "a.png")
+@pytest.mark.parametrize("when", ["idle", "busy"])
+def test_a_process_that_was_killed_is_said(apart: Drawing, tmp_path: Path, when: str) -> None:
+    def killed() -> None:
+        with apart.complete():
+            if when == "busy":
+                apart.draw(partial(os.kill, active_children()[0].pid, signal.SIGKILL), tmp_path / "b.png")
+            else:
+                active_children()[0].kill()
+                active_children()[0].join()
+            apart.draw(FIGURE, tmp_path / "a.png")
 
-    with (
-        ProcessPoolExecutor(1, get_context("spawn")) as one,
-        pytest.raises(TensorsimError, match="process that draws them was killed"),
-    ):
-        killed(one)
+    with pytest.raises(TensorsimError, match=r"\.png: the process that draws figures has ended"):
+        killed()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_only_the_command_starts_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pools(cores: int, command: bool) -> bool:
-        monkeypatch.setattr("tensorsim.plot.apart.cpu_quota", lambda: cores)
-        monkeypatch.setattr("tensorsim.plot.apart.is_command", lambda: command)
-        with drawing_apart() as drawing:
-            return drawing._pool is not None
-
-    assert [pools(2, True), pools(1, True), pools(2, False)] == [True, False, False]
+@pytest.mark.parametrize(("cores", "command"), [(1, True), (2, False)])
+def test_only_the_command_starts_a_process(
+    monkeypatch: pytest.MonkeyPatch, cores: int, command: bool
+) -> None:
+    monkeypatch.setattr("tensorsim.plot.apart.cpu_quota", lambda: cores)
+    monkeypatch.setattr("tensorsim.plot.apart.is_command", lambda: command)
+    with drawing_apart() as drawing:
+        assert (type(drawing), active_children()) == (Drawing, [])
 
 
 @pytest.mark.skipif(cpu_quota() < 2, reason="the command draws in its own process on one processor")
