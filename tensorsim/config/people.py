@@ -57,15 +57,9 @@ class TrackerConfig:
     measurement_noise: float = 4e-4
 
     def __post_init__(self) -> None:
-        require_counts(
-            self,
-            "detection_interval",
-            "max_tracks",
-            "confirm_hits",
-            "confirm_window",
-            "delete_misses",
-            "delete_window",
-        )
+        require_counts(self, "max_tracks", most=256)
+        frames = ("confirm_hits", "confirm_window", "delete_misses", "delete_window")
+        require_counts(self, "detection_interval", *frames, most=10_000)
         require_positive(
             "TrackerConfig",
             assignment_threshold=self.assignment_threshold,

@@ -67,7 +67,7 @@ class ProcessingConfig:
         if self.range_window is not None:
             require_choices(self, range_window=RangeWindow)
         require_counts(self, "ridge_count", most=6)
-        require_counts(self, "pulse_chunk", "energy_stride")
+        require_counts(self, "pulse_chunk", "energy_stride", most=1_000_000)
         require_ranges(self, window_s="length of a window")
         if not (is_finite(self.overlap) and 0 <= self.overlap < 1):
             raise TensorsimError(f"overlap: got {self.overlap!r}, expected a number in [0, 1)")

@@ -98,7 +98,7 @@ class ClutterConfig:
 
     def __post_init__(self) -> None:
         make_plain(self)
-        require_counts(self, "reflectors")
+        require_counts(self, "reflectors", most=10_000)
         if not (is_finite(self.jitter_m) and self.jitter_m >= 0):
             raise TensorsimError(
                 f"ClutterConfig.jitter_m: got {self.jitter_m!r}, expected a finite number >= 0"

@@ -108,7 +108,7 @@ class SceneConfig:
             raise TensorsimError(
                 f"SceneConfig.paths: got names of paths and {', '.join(switched)}, expected one or the other"
             )
-        require_counts(self, "bounces")
+        require_counts(self, "bounces", most=50)
         require_ranges(self, noise_figure_db="ratio of powers")
         if self.snr_db is not None:
             require_ranges(self, snr_db="ratio of powers")

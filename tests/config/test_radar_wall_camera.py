@@ -101,7 +101,21 @@ def test_names() -> None:
         (lambda: ts.WallConfig(center_m=3.0), "center_m: got 3.0"),  # type: ignore[arg-type]
         (lambda: ts.WallConfig(loss_tangent="no"), "loss_tangent: got 'no', expected loss tangent"),  # type: ignore[arg-type]
         (lambda: FloorConfig(reflection="no"), "reflection: got no"),  # type: ignore[arg-type]
-        (lambda: ts.SceneConfig(bounces=0), "SceneConfig.bounces: got 0, expected an integer of at least 1"),
+        (lambda: ts.SceneConfig(bounces=0), "SceneConfig.bounces: got 0, expected an integer from 1 to 50"),
+        (lambda: ts.SceneConfig(bounces=51), "SceneConfig.bounces: got 51, expected an integer from 1 to 50"),
+        (lambda: ts.TrackerConfig(max_tracks=257), "max_tracks: got 257, expected an integer from 1 to 256"),
+        (
+            lambda: ts.TrackerConfig(delete_window=10_001),
+            "delete_window: got 10001, expected an integer from",
+        ),
+        (
+            lambda: ts.ProcessingConfig(pulse_chunk=10**7),
+            "pulse_chunk: got 10000000, expected an integer from",
+        ),
+        (
+            lambda: ts.ClutterConfig(reflectors=10_001),
+            "reflectors: got 10001, expected an integer from 1 to 10000",
+        ),
         (lambda: ts.SceneConfig(bounces=1.5), "bounces: got 1.5"),  # type: ignore[arg-type]
         (lambda: ts.SceneConfig(bounces=True), "bounces: got True"),
         (lambda: ts.SceneConfig(noise_figure_db=math.nan), "noise_figure_db: got nan"),
