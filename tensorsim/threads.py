@@ -58,7 +58,7 @@ def ahead(items: Generator[Item, None, None], count: int = 2) -> Iterator[Item]:
             pool.submit(items.close)
 
 
-#: Most items in progress at a time: for a video, each needs memory for its frames.
+#: Most items at work at a time; one more waits. For a video, each needs memory for its frames.
 MOST_AT_A_TIME = 4
 
 
