@@ -222,3 +222,15 @@ process.leave()
 def test_the_command_ends_at_once_unless_something_still_runs(running: str, said: str) -> None:
     done = run_python(LEAVE.format(running=running))
     assert (done.returncode, done.stdout) == (0, said), done.stderr
+
+
+def test_a_missing_film_is_said_before_torch_is_imported() -> None:
+    done = run_python(
+        AT_IMPORT.format(
+            action="os._exit(9)", argv=["/usr/bin/tensorsim", "simulate", "nothing.mp4", "--out", "out"]
+        )
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        "tensorsim: error: nothing.mp4: no such file, expected a video, motion capture or keypoints\n"
+    )

@@ -19,6 +19,7 @@ from tensorsim.commands.options import (
     number_of_people,
 )
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
+from tensorsim.files import check_name
 from tensorsim.limits import check_range
 from tensorsim.process import is_command, keep_freed_memory, load_torch
 
@@ -210,6 +211,11 @@ class Simulate(NetworkOptions, ClipOptions):
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
         super().check(out)
+        check_name(self.source, "source")
+        if not self.source.exists():
+            raise TensorsimError(
+                f"{self.source}: no such file, expected a video, motion capture or keypoints"
+            )
         for name, quantity in (
             ("person_height", "body height"),
             ("initial_distance", "distance"),

@@ -195,6 +195,7 @@ def test_bad_options_are_refused_before_work_starts(
 ) -> None:
     np.savez(tmp_path / "walk.npz", joints=walk[:30], fps=FPS)
     (tmp_path / "walk.json").write_text("no JSON")
+    (tmp_path / "walk.mp4").touch()
     (tmp_path / "one_bin.yaml").write_text("processing: {range_gate_m: [2.99, 3.0]}")
     options = [str(tmp_path / option) if option.endswith(".yaml") else option for option in options]
     with pytest.raises(SystemExit) as exit_:
