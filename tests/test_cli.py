@@ -202,8 +202,10 @@ def test_switches_count_beside_a_configuration(tmp_path: Path) -> None:
 def test_a_camera_that_is_told_is_not_estimated(
     told: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    film = tmp_path / "clip.mp4"
+    film.touch()
     with pytest.raises(SystemExit):
-        cli.main(["simulate", "clip.mp4", "--out", str(tmp_path / "out"), "--calibrate", *told])
+        cli.main(["simulate", str(film), "--out", str(tmp_path / "out"), "--calibrate", *told])
     assert "--calibrate cannot be combined with " in capsys.readouterr().err
 
 

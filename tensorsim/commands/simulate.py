@@ -239,6 +239,11 @@ class Simulate(NetworkOptions, ClipOptions):
                 )
         if self.position == "paper" and self.initial_distance is None and self.config is None:
             raise TensorsimError("--position paper needs --initial-distance")
+        check_name(self.source, "source")
+        if not self.source.exists():
+            raise TensorsimError(
+                f"{self.source}: no such file, expected a video, motion capture or keypoints"
+            )
 
     def _source(
         self, kind: str, config: "SimulationConfig", device: "torch.device"
