@@ -159,7 +159,7 @@ def draw_maps(
 def doppler_figure(
     maps: RadarMaps, axes: Axes, pictures: Pictures, truth: RadarMaps | None = None
 ) -> "partial[Figure]":
-    """Call it to draw a Doppler-time map with its ridges; beside it that of the true motion, if given."""
+    """A function that draws a Doppler-time map with its ridges, and beside it that of the true motion, if given."""
     both = [maps] if truth is None else [maps, truth]
     range_db = pictures.style.dynamic_range_db
     return partial(

@@ -53,7 +53,7 @@ class Drawing:
 class _DrawingApart(Drawing):
     """Draws in the process at the other end of ``there``, one figure after another."""
 
-    def __init__(self, there: "Connection", pool: ThreadPoolExecutor) -> None:
+    def __init__(self, there: Connection, pool: ThreadPoolExecutor) -> None:
         self._there, self._pool = there, pool
         self._begun: list[Future[None]] = []
 
@@ -105,7 +105,7 @@ def drawing_apart() -> Iterator[Drawing]:
         process.join()
 
 
-def _serve(jobs: "Connection") -> None:
+def _serve(jobs: Connection) -> None:
     """Draw figures until there are no more; interrupts are left to the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _load()

@@ -22,6 +22,7 @@ COCO_BONES = (
     (5, 11), (6, 12), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16),
 )
 # fmt: on
+#: Indices of the hips among the 14 joints.
 _HIPS = [8, 11]
 #: One colour per person, RGB.
 PERSON_COLOURS = ((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (23, 190, 207))

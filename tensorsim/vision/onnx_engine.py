@@ -30,6 +30,10 @@ from tensorsim.geometry.boxes import LETTERBOX_GREY, letterbox_size
 from tensorsim.types import Detections
 from tensorsim.vision.detection.rtmdet import RTMDet
 
+# OpenVINO would report every import to Google Analytics, in a thread that the process waits for at its end. This is set
+# here because a process that loads a pickled engine imports this module only.
+sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # None: no such module
+
 #: Held while a network is opened: parts of a film are processed in several threads, and the exporter allows only one.
 _OPENING = Lock()
 
@@ -42,9 +46,6 @@ Run = Callable[[Images], list[Images]]
 
 def import_failure(package: str) -> str | None:
     """Why a package cannot be imported, in one line; None if it can."""
-    if package == "openvino":
-        # It would report every import to Google Analytics, in a thread that the process waits for at its end.
-        sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # None: no such module
     try:
         import_module(package)
     except Exception as error:  # a broken installation may raise anything
