@@ -23,6 +23,9 @@ SPIN_ROUNDS = 100
 #: megabyte to the kernel, and the next one would cost a page fault for every 4 KB: a twentieth of the time of a film.
 #: Live simulation gains nothing from it and would need 200 MB more.
 KEPT_BLOCK_BYTES = 64_000_000
+#: Environment variables with the numbers of threads of NumPy and OpenCV. Their work here is short and runs beside other
+#: work, and their threads spin for a while after it: on one thread each, a film takes a twentieth less processor time.
+_LIBRARIES = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 #: Options of the GNU C library's ``mallopt``.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
@@ -35,10 +38,12 @@ def is_command() -> bool:
 
 
 def prepare() -> None:
-    """Do the setup needed before torch is imported; environment variables set by the user are kept."""
+    """Do the setup needed before torch, NumPy and OpenCV are imported; variables set by the user are kept."""
     signal.signal(signal.SIGINT, _quit)
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
         os.environ["GOMP_SPINCOUNT"] = str(SPIN_ROUNDS)
+    for name in _LIBRARIES:
+        os.environ.setdefault(name, "1")
     quota = cpu_quota()
     if "OMP_NUM_THREADS" not in os.environ and quota < (os.cpu_count() or 1):
         os.environ["OMP_NUM_THREADS"] = str(quota)

@@ -42,8 +42,12 @@ def test_an_interrupt_while_torch_is_imported_is_one_line() -> None:
 
 
 def test_threads_are_settled_before_torch_is_imported_and_for_the_command_only() -> None:
-    show = "print(os.environ.get('GOMP_SPINCOUNT')); os._exit(0)"
-    for argv, expected in ((["/usr/bin/tensorsim", "check"], "100"), (["my_program.py", "check"], "None")):
+    names = ("GOMP_SPINCOUNT", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    show = f"print(*[os.environ.get(name) for name in {names}]); os._exit(0)"
+    for argv, expected in (
+        (["/usr/bin/tensorsim", "check"], "100 1 1"),
+        (["my_program.py", "check"], "None None None"),
+    ):
         done = run_python(AT_IMPORT.format(action=show, argv=argv))
         assert done.stdout.strip() == expected, done.stderr
 

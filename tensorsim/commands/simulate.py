@@ -211,11 +211,6 @@ class Simulate(NetworkOptions, ClipOptions):
     def check(self, out: Path) -> None:
         """Refuse options that cannot work, before anything heavy is imported."""
         super().check(out)
-        check_name(self.source, "source")
-        if not self.source.exists():
-            raise TensorsimError(
-                f"{self.source}: no such file, expected a video, motion capture or keypoints"
-            )
         for name, quantity in (
             ("person_height", "body height"),
             ("initial_distance", "distance"),

@@ -7,6 +7,7 @@ from tensorsim.device import multiplies_bfloat16
 from tensorsim.errors import TensorsimError
 from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.onnx_engine import OnnxDetector, OnnxPose, Runtime, import_failure
+from tensorsim.vision.pose2d.crops import OpenCVBoxCrop
 from tensorsim.vision.pose2d.onnx_file import OnnxFile
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
@@ -57,4 +58,7 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
         holder = pose.network if isinstance(pose.network, FlipTest) else pose
         if not isinstance(holder.network, OnnxFile | OnnxPose):
             holder.network = OnnxPose(holder.network, of_pose).eval()
+        pose.crop, pose.wide_crop = (
+            OpenCVBoxCrop((crop.height, crop.width), crop.padding) for crop in (pose.crop, pose.wide_crop)
+        )
     return detector, pose

@@ -12,6 +12,7 @@ from tensorsim.errors import TensorsimError
 from tensorsim.vision import engines
 from tensorsim.vision.engines import ENGINES, chosen_engine, run_by
 from tensorsim.vision.onnx_engine import OnnxPose
+from tensorsim.vision.pose2d.crops import OpenCVBoxCrop
 from tensorsim.vision.pose2d.topdown import FlipTest, TopDownPose
 
 
@@ -36,6 +37,9 @@ def test_only_networks_of_this_package_are_replaced(
     inside = pose.network.network
     assert isinstance(inside, OnnxPose)
     assert inside.engine.runtime == runtime
+    assert isinstance(pose.crop, OpenCVBoxCrop)
+    assert isinstance(pose.wide_crop, OpenCVBoxCrop)
+    assert (pose.wide_crop.height, pose.wide_crop.width) == (pose.crop.width, pose.crop.height)
     run_by(engine, other, pose)
     assert pose.network.network is inside, "it is run by the engine already"
 

@@ -75,7 +75,8 @@ class BackgroundMotion:
         self._scale = min(1.0, _WIDTH / self.width)
         size = (round(frame.shape[2] * self._scale), round(frame.shape[1] * self._scale))
         # The green channel is most of the brightness.
-        picture = cv2.resize(np.ascontiguousarray(frame[1].numpy()), size, interpolation=cv2.INTER_AREA)
+        green = cv2.extractChannel(frame.permute(1, 2, 0).numpy(), 1)
+        picture = cv2.resize(green, size, interpolation=cv2.INTER_AREA)
         background = np.full(picture.shape, 255, np.uint8)
         for x1, y1, x2, y2 in boxes * self._scale:
             margin = 0.1 * max(x2 - x1, y2 - y1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tensorsim.errors import TensorsimError
-from tensorsim.vision.pose2d.crops import BoxCrop, crop_to_image, crop_transform
+from tensorsim.vision.pose2d.crops import BoxCrop, OpenCVBoxCrop, crop_to_image, crop_transform
 from tests.stage import StageTester
 
 
@@ -50,6 +50,36 @@ class TestBoxCrop(StageTester):
             ((images, boxes * float("nan"), index), "finite"),
             ((images, boxes[:, [2, 3, 0, 1]], index), "without area"),
         ]
+
+
+class TestOpenCVBoxCrop(TestBoxCrop):
+    gradient_arguments = ()  # 8-bit images
+    scripts = exports = False  # it calls OpenCV
+
+    def make(self) -> nn.Module:
+        return OpenCVBoxCrop((16, 12))
+
+    def inputs(self, batch: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, ...]:
+        images, boxes, index = super().inputs(batch, dtype)
+        return (255 * images / images.amax()).to(torch.uint8), boxes, index
+
+
+@pytest.mark.parametrize("size", [(256, 192), (192, 256), (9, 31)])
+def test_opencv_makes_the_same_crops(size: tuple[int, int]) -> None:
+    """Of boxes inside of the picture, beyond its border, outside of it, smaller and larger than the crop."""
+    rng = np.random.default_rng(0)
+    images = torch.from_numpy(rng.integers(0, 256, (3, 120, 160, 3), dtype=np.uint8)).permute(0, 3, 1, 2)
+    generator = torch.Generator().manual_seed(0)
+    middle = torch.rand(200, 2, generator=generator) * torch.tensor([320.0, 240.0]) - torch.tensor(
+        [80.0, 60.0]
+    )
+    half = 0.5 + 60 * torch.rand(200, 2, generator=generator).square()
+    boxes, index = torch.cat([middle - half, middle + half], dim=-1), torch.arange(200) % 3
+    expected, crops = (crop(size)(images, boxes, index) for crop in (BoxCrop, OpenCVBoxCrop))
+    assert crops.stride() == expected.stride()
+    torch.testing.assert_close(crops, expected, rtol=0, atol=0.02 / 255)
+    floats = images / 255
+    assert torch.equal(OpenCVBoxCrop(size)(floats, boxes, index), BoxCrop(size)(floats, boxes, index))
 
 
 def reference_crop(image: np.ndarray, box: np.ndarray, size: tuple[int, int], padding: float) -> np.ndarray:
