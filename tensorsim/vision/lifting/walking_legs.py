@@ -28,14 +28,14 @@ class WalkingLegs(nn.Module):
     Where the hips of an upright body move along, thighs and shanks swing in the direction of travel as in the gait of
     Boulic, Magnenat-Thalmann and Thalmann (1990, :func:`tensorsim.body.gait.boulic_gait`), whose cadence follows from
     the speed. Seen legs give the phase, in four coordinates of the right knee and ankle relative to the left ones,
-    which change as Re(g exp(2 pi i p)) in the first harmonic of the gait, p in cycles. They are projected onto
-    conj(g): z(t). With n(t) the cycles at the cadence of the speed, the mean of z^2 exp(-4 pi i n) over about a second
-    has the phase 4 pi (p - n). It does not depend on which leg is called right; that is then chosen once for all
-    frames. Legs that are seen follow the gait where they swing at least a little, but less than 0.6 to 0.8 times as far
-    as in the gait: legs that swing as far are left as they are, and so are those of people who run, or go sideways or
-    backwards. Hidden legs follow it wherever the body moves: which way a body faces is poorly known where no ankle is
-    seen, so it matters there only if the person clearly walks backwards. Bones keep their lengths except for half a
-    second at both ends, where old and new legs are blended.
+    which change as Re(g exp(2 pi i p)) in the first harmonic of the gait, p in cycles. They are projected onto conj(g):
+    z(t). With n(t) the cycles at the cadence of the speed, the mean of z^2 exp(-4 pi i n) over about a second has the
+    phase 4 pi (p - n). It does not depend on which leg is called right; that is then chosen once for all frames. Legs
+    that are seen follow the gait where they swing at least a little, but less than 0.6 to 0.8 times as far as in the
+    gait: legs that swing as far are left as they are, also at another cadence (a kick, a film in slow motion), and so
+    are those of people who run, or go sideways or backwards. Hidden legs follow it wherever the body moves: which way a
+    body faces is poorly known where no ankle is seen, so it matters there only if the person clearly walks backwards.
+    Bones keep their lengths except for half a second at both ends, where old and new legs are blended.
 
     Args:
         slow_m_s, walking_m_s: speeds of the hips below which nothing changes, and from which legs follow the gait only.
@@ -176,7 +176,8 @@ class WalkingLegs(nn.Module):
 
         Returns:
             Cycles (..., T); from 0 to 1, whether legs swing at all (0.1 to 0.2 times as far as in the gait), whichever
-            is called right, and whether they swing as far as in the gait (0.6 to 0.8 times).
+            is called right, and whether they swing as far as in the gait (0.6 to 0.8 times), in phase with it or at
+            another cadence: less than 0.2 to 0.3 of the power of their swing is at that of the gait.
         """
         sigma = self.mean_s * fps
         gait = self._between(self.swing, relative_speed)
@@ -196,12 +197,18 @@ class WalkingLegs(nn.Module):
         turns = 2 * math.pi * cycles
         same = z[..., 0] * torch.cos(turns) + z[..., 1] * torch.sin(turns)
         other = (same.sum(dim=-1, keepdim=True) < 0).to(same.dtype)  # half a cycle: the other leg
-        some = (squared / (gaussian_mean(far.square(), sigma) + 1e-6)).sqrt()
+        far_squared = gaussian_mean(far.square(), sigma) + 1e-6
+        some = (squared / far_squared).sqrt()
         enough = gaussian_mean(same, sigma) * (1.0 - 2.0 * other) / gaussian_mean(far, sigma).clamp(min=1e-6)
+        # Confused legs keep the cadence; those of somebody who kicks, or walks in slow motion, do not.
+        power = gaussian_mean(z.square().sum(dim=-1), sigma)
+        far_anyhow = (((power + 1e-18) / far_squared).sqrt() - 0.6) / 0.2
+        steady = squared / (power + 1e-6)
+        otherwise = far_anyhow.clamp(0.0, 1.0) * ((0.3 - steady) / 0.1).clamp(0.0, 1.0)
         return (
             cycles + other / 2,
             ((some - 0.1) / 0.1).clamp(0.0, 1.0),
-            ((enough - 0.6) / 0.2).clamp(0.0, 1.0),
+            torch.maximum(((enough - 0.6) / 0.2).clamp(0.0, 1.0), otherwise),
         )
 
     def _velocity(self, position: Tensor, valid: Tensor, fps: float) -> Tensor:

@@ -5,11 +5,12 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tensorsim.body.gait import boulic_gait
 from tensorsim.body.kinematics import rotation
-from tensorsim.body.skeleton import MIRRORED_JOINTS
+from tensorsim.body.skeleton import MIRRORED_JOINTS, mid_hips
 from tensorsim.errors import TensorsimError
 from tensorsim.motion.activities import ActivityGenerator
 from tensorsim.vision.lifting.walking_legs import WalkingLegs
@@ -178,6 +179,19 @@ def test_legs_seen_of_who_goes_sideways_or_backwards_are_left(turned_deg: float)
     seen, valid = masks(walk, hidden=False)
     assert not torch.equal(WalkingLegs()(walk, seen, valid, FPS), walk)
     torch.testing.assert_close(WalkingLegs()(turned, seen, valid, FPS), turned)
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_legs_at_another_cadence_are_left(seed: int) -> None:
+    """Steps at a third of the cadence that belongs to the speed, as of a run in slow motion."""
+    walk = generated("walking", seed=seed)
+    hips = mid_hips(walk)[:, None]
+    rows = (walk - hips)[: len(walk) // 3 + 1].flatten(1).T[None]
+    slow = F.interpolate(rows, len(walk), mode="linear", align_corners=True)[0].T.unflatten(1, (14, 3)) + hips
+    seen, valid = masks(slow, hidden=False)
+    found = WalkingLegs()(slow, seen, valid, FPS)
+    torch.testing.assert_close(found[20:-20], slow[20:-20])  # at both ends a second is too short to tell
+    assert (found - slow).norm(dim=-1).mean() < 0.01
 
 
 def test_runners_are_left() -> None:
