@@ -1,8 +1,9 @@
 """Options of commands that simulate a whole clip: those that look ahead, and those of the output."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -13,6 +14,7 @@ from tensorsim.array_files import array_formats
 from tensorsim.commands.arguments import Option
 from tensorsim.commands.options import RadarOptions, warn_of_label
 from tensorsim.files import check_name
+from tensorsim.process import is_command, keep_freed_memory, load_torch
 
 if TYPE_CHECKING:
     import torch
@@ -61,6 +63,18 @@ class ClipOptions(RadarOptions):
         super().check(out)
         check_name(out, "--out")
         array_formats(self.save)
+
+    @contextmanager
+    def ready(self, out: Path) -> "Iterator[Drawing]":
+        """Check the options, then load torch here and, for drawing during the block, matplotlib in another process."""
+        self.check(out)
+        if is_command():  # it affects the whole process, which may otherwise be somebody else's
+            keep_freed_memory()
+        from tensorsim.plot.apart import drawing_apart
+
+        with drawing_apart() as drawing:
+            load_torch()
+            yield drawing
 
     def _begun(self) -> "SimulationConfig":
         config = super()._begun()

@@ -17,7 +17,6 @@ from tensorsim.commands.options import (
     number_of_people,
 )
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
-from tensorsim.process import load_torch
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -58,11 +57,7 @@ class Demo(NetworkOptions, ClipOptions):
 
     def run(self) -> None:
         """Run the command."""
-        self.check(self.out)
-        from tensorsim.plot.apart import drawing_apart
-
-        with drawing_apart() as drawing:
-            load_torch()
+        with self.ready(self.out) as drawing:
             self._demonstrate(drawing)
 
     def _demonstrate(self, drawing: "Drawing") -> None:

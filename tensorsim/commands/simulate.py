@@ -21,7 +21,6 @@ from tensorsim.commands.options import (
 from tensorsim.exceptions import TensorsimError, collected_warnings, print_warnings
 from tensorsim.files import check_name
 from tensorsim.limits import check_range
-from tensorsim.process import is_command, keep_freed_memory, load_torch
 
 if TYPE_CHECKING:
     import torch
@@ -115,13 +114,7 @@ class Simulate(NetworkOptions, ClipOptions):
 
     def run(self) -> None:
         """Run the command."""
-        self.check(self.out)
-        if is_command():  # it affects the whole process, which may otherwise be somebody else's
-            keep_freed_memory()
-        from tensorsim.plot.apart import drawing_apart
-
-        with drawing_apart() as drawing:
-            load_torch()
+        with self.ready(self.out) as drawing:
             self._simulate(drawing)
 
     def _simulate(self, drawing: "Drawing") -> None:
