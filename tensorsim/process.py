@@ -25,7 +25,7 @@ SPIN_ROUNDS = 100
 KEPT_BLOCK_BYTES = 64_000_000
 #: Environment variables with the numbers of threads of NumPy and OpenCV. Their work here is short and runs beside other
 #: work, and their threads spin for a while after it: on one thread each, a film takes a twentieth less processor time.
-_LIBRARIES = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 #: Options of the GNU C library's ``mallopt``.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
@@ -42,7 +42,7 @@ def prepare() -> None:
     signal.signal(signal.SIGINT, _quit)
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
         os.environ["GOMP_SPINCOUNT"] = str(SPIN_ROUNDS)
-    for name in _LIBRARIES:
+    for name in _THREAD_COUNTS:
         os.environ.setdefault(name, "1")
     quota = cpu_quota()
     if "OMP_NUM_THREADS" not in os.environ and quota < (os.cpu_count() or 1):

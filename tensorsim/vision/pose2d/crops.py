@@ -24,6 +24,9 @@ from tensorsim.errors import (
     is_exporting,
 )
 
+#: Of boxes with larger scales (pixels of the image per pixel of the crop) OpenCV would read many rows for nothing.
+LARGEST_SCALE = 6.0
+
 
 def crop_transform(boxes: Tensor, height: int, width: int, padding: float) -> tuple[Tensor, Tensor]:
     """Scale and offset of the crops of boxes: image point = scale * crop point + offset.
@@ -161,8 +164,8 @@ class BoxCrop(nn.Module):
 class OpenCVBoxCrop(BoxCrop):
     """:class:`BoxCrop` by OpenCV for 8-bit images on the CPU, equal to a hundredth of a grey level, in half the time.
 
-    Other images, boxes in float64 or with gradients, and OpenCV before 5.0, which rounds positions to 1/32 pixel, are
-    left to :class:`BoxCrop`. It cannot be scripted.
+    Other images, boxes in float64, with gradients, or more than :data:`LARGEST_SCALE` times as large as the crop, and
+    OpenCV before 5.0, which rounds positions to 1/32 pixel, are left to :class:`BoxCrop`. It cannot be scripted.
     """
 
     def sample(self, images: Tensor, index: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
@@ -171,29 +174,23 @@ class OpenCVBoxCrop(BoxCrop):
 
         suits = images.dtype == torch.uint8 and images.device.type == "cpu" and images.shape[1] == 3
         exact = scale.dtype == torch.float32 and int(cv2.__version__.split(".")[0]) >= 5
-        if not (suits and exact) or offset.requires_grad:
+        if not (suits and exact) or offset.requires_grad or bool((scale > LARGEST_SCALE).any()):
             return super().sample(images, index, scale, offset)
         crops = scale.new_zeros(len(index), self.height, self.width, 3)
-        corner = torch.tensor([self.width - 1, self.height - 1])
+        # The part of the picture that holds both neighbours of every sample.
         size = torch.tensor([images.shape[3], images.shape[2]])
+        corner = offset + scale * torch.tensor([self.width - 1, self.height - 1])
         first = offset.floor().clamp(min=0).minimum(size)
-        last = (scale * corner + offset).floor().clamp(min=-2).minimum(
-            size
-        ) + 2  # right of and below both neighbours
-        for n, (image, x, y, x_end, y_end) in enumerate(
-            torch.cat([index[:, None], first, last], dim=1).int().tolist()
-        ):
+        last = corner.floor().clamp(min=-2).minimum(size) + 2
+        parts = torch.cat([index[:, None], first, last], dim=1).int().tolist()
+        for n, (image, x, y, x_end, y_end) in enumerate(parts):
             part = images[image, :, y:y_end, x:x_end].permute(1, 2, 0).numpy()
             if part.size:
                 step, (right, down) = float(scale[n]), (offset[n] - first[n]).tolist()
-                crops[n] = torch.from_numpy(
-                    cv2.warpAffine(
-                        part.astype(np.float32),
-                        np.array([[step, 0.0, right], [0.0, step, down]]),
-                        (self.width, self.height),
-                        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                    )
-                )
+                to_part = np.array([[step, 0.0, right], [0.0, step, down]])
+                how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+                crop = cv2.warpAffine(part.astype(np.float32), to_part, (self.width, self.height), flags=how)
+                crops[n] = torch.from_numpy(crop)
         return crops.permute(0, 3, 1, 2)
 
 

@@ -78,6 +78,8 @@ def test_opencv_makes_the_same_crops(size: tuple[int, int]) -> None:
     expected, crops = (crop(size)(images, boxes, index) for crop in (BoxCrop, OpenCVBoxCrop))
     assert crops.stride() == expected.stride()
     torch.testing.assert_close(crops, expected, rtol=0, atol=0.02 / 255)
+    large = torch.tensor([[-1e4, -1e4, 1e4, 1e4]])
+    assert torch.equal(*(crop(size)(images, large, index[:1]) for crop in (BoxCrop, OpenCVBoxCrop)))
     floats = images / 255
     assert torch.equal(OpenCVBoxCrop(size)(floats, boxes, index), BoxCrop(size)(floats, boxes, index))
 
