@@ -14,7 +14,8 @@ from tensorsim import process
 
 
 def run_python(code: str, **options: object) -> subprocess.CompletedProcess[str]:
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))}
+    threads = ("OMP_", "GOMP_", "OPENBLAS_", "OPENCV_FOR_THREADS_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(threads)}
     environment["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
     return subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment, **options
