@@ -24,7 +24,7 @@ SPIN_ROUNDS = 100
 #: Live simulation gains nothing from it and would need 200 MB more.
 KEPT_BLOCK_BYTES = 64_000_000
 #: Environment variables with the numbers of threads of NumPy and OpenCV. Their work here is short and runs beside other
-#: work, and their threads spin for a while after it: on one thread each, a film takes a twentieth less processor time.
+#: work, and their threads spin for a while after it: on one thread each, a film takes 3 % less processor time.
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 #: Options of the GNU C library's ``mallopt``.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
