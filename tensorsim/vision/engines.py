@@ -41,7 +41,7 @@ def run_by(engine: str, detector: nn.Module, pose: nn.Module) -> tuple[nn.Module
         engine: ``"onnxruntime"`` runs both in float32; ``"int8"`` the pose network in 8-bit integers; ``"openvino"``
             the pose network in bfloat16 on processors with instructions for it; ``"torch"`` changes nothing;
             ``"auto"`` is the one of :func:`chosen_engine`.
-        detector, pose: the stages; networks inside of ``pose`` are replaced.
+        detector, pose: the stages; network and crops inside of ``pose`` are replaced.
 
     Raises:
         TensorsimError: no such engine.

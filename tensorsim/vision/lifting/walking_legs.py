@@ -200,11 +200,11 @@ class WalkingLegs(nn.Module):
         far_squared = gaussian_mean(far.square(), sigma) + 1e-6
         some = (squared / far_squared).sqrt()
         enough = gaussian_mean(same, sigma) * (1.0 - 2.0 * other) / gaussian_mean(far, sigma).clamp(min=1e-6)
-        # Confused legs keep the cadence; those of somebody who kicks, or walks in slow motion, do not.
+        # Where right and left are confused, the cadence stays; legs that kick or walk in slow motion have another one.
         power = gaussian_mean(z.square().sum(dim=-1), sigma)
-        far_anyhow = (((power + 1e-18) / far_squared).sqrt() - 0.6) / 0.2
-        steady = squared / (power + 1e-6)
-        otherwise = far_anyhow.clamp(0.0, 1.0) * ((0.3 - steady) / 0.1).clamp(0.0, 1.0)
+        swings = ((power + 1e-18) / far_squared).sqrt()
+        at_cadence = squared / (power + 1e-6)
+        otherwise = ((swings - 0.6) / 0.2).clamp(0.0, 1.0) * ((0.3 - at_cadence) / 0.1).clamp(0.0, 1.0)
         return (
             cycles + other / 2,
             ((some - 0.1) / 0.1).clamp(0.0, 1.0),
