@@ -339,12 +339,14 @@ def simulated(
     folder: Path,
     config: SimulationConfig,
     device: torch.device,
+    drawing: Drawing,
+    pictures: Pictures,
     quiet: bool = False,
 ) -> Iterator[tuple[Found, RadarMaps, Future[FilmStrip]]]:
     """Find the people of a source, select among them, and simulate their maps.
 
-    The overlay video is written in another thread meanwhile and during the block, and is complete at its end. Until
-    then torch runs on one thread.
+    Meanwhile and during the block, the picture of the skeletons is drawn, and the overlay video is written in another
+    thread; the video is complete at the end of the block. Until then torch runs on one thread.
 
     Raises:
         TensorsimError: see :func:`check_length`, and :func:`~tensorsim.vision.tracking.selection.select_people`.
@@ -365,6 +367,7 @@ def simulated(
             )
         ),
     )
+    draw_pose(folder, pose, source.fps, drawing, pictures, config.scene.radar)
     torch.manual_seed(config.seed)
     camera = None if found.camera is None else camera_config(found.camera, found.radar_ahead_m)
 

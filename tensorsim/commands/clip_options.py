@@ -95,13 +95,13 @@ class ClipOptions(RadarOptions):
         }
 
     def pictures(
-        self, stage: "PoseToDoppler", label: str | None, film: str | None, somebody: bool
+        self, stage: "PoseToDoppler", label: str | None, film: str | None, somebody: bool = True
     ) -> "Pictures":
-        """How the maps of this run are drawn.
+        """How the maps and the people of this run are drawn.
 
         Args:
             stage: the stage that made the maps.
-            label: the activity, if there is a classifier.
+            label: the activity, if it is known.
             film: the source of the people.
             somebody: whether a person is in the scene; maps of an empty scene are scaled by the echo of a person.
         """
@@ -117,7 +117,7 @@ class ClipOptions(RadarOptions):
         )
 
     def write_results(self, folder: Path, run: "Run", truth: "RadarMaps | None" = None) -> dict[str, Any]:
-        """Label the maps of a run and write them, the poses, their pictures and the sound.
+        """Label the maps of a run and write them, their pictures, the poses and the sound.
 
         Args:
             folder: output folder.
@@ -146,7 +146,6 @@ class ClipOptions(RadarOptions):
         with ThreadPoolExecutor(1) as pool:
             saved = pool.submit(save)
             results.draw_maps(folder, maps, axes, run.drawing, truth, pictures)
-            results.draw_pose(folder, pose, run.fps, run.drawing, pictures, run.config.scene.radar)
             saved.result()
         if self.sound:
             results.write_doppler_sound(folder, stage, pose, run.fps, run.device)

@@ -111,7 +111,11 @@ class Demo(NetworkOptions, ClipOptions):
             with complete_or_nothing(self.out) as folder, drawing.complete():
                 write_video(folder / "film.mp4", film.frames.permute(0, 2, 3, 1).numpy(), FILM_FPS)
                 source = film_source(VideoReader(folder / "film.mp4", kept_mb=KEPT_MB), people, device)
-                simulated = results.simulated(source, maps_stage, folder, config, device, self.quiet)
+                name = f"demo: {ACTIVITIES[activity]}"
+                pictures = self.pictures(maps_stage, None, name)
+                simulated = results.simulated(
+                    source, maps_stage, folder, config, device, drawing, pictures, self.quiet
+                )
                 with simulated as (seen, maps, strip):
                     pose = seen.pose
                     torch.manual_seed(config.seed)
@@ -119,7 +123,6 @@ class Demo(NetworkOptions, ClipOptions):
                     joints = true_pose(truth.joints, truth.valid)
                     true_maps = maps_of_pose(true_stage, joints, rate_hz, device, self.quiet)
                     somebody = bool(truth.valid.any() | pose.valid.any())
-                    name = f"demo: {ACTIVITIES[activity]}"
                     done = Run(
                         config, maps_stage, recognizer, pose, maps, FILM_FPS, name, somebody, device, drawing
                     )

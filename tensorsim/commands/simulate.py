@@ -146,11 +146,14 @@ class Simulate(NetworkOptions, ClipOptions):
             if source.frame_count is not None:  # files may state a frame or two too few
                 results.check_length(source.frame_count, source.fps, stage, uncertain=2)
             with complete_or_nothing(self.out, self.source) as folder, drawing.complete():
-                simulated = results.simulated(source, stage, folder, config, device, self.quiet)
+                name, fps = self.source.name, source.fps
+                pictures = self.pictures(stage, None, name)
+                simulated = results.simulated(
+                    source, stage, folder, config, device, drawing, pictures, self.quiet
+                )
                 with simulated as (found, maps, strip):
                     pose = found.pose
                     somebody = bool(pose.valid.any())
-                    name, fps = self.source.name, source.fps
                     done = Run(config, stage, recognizer, pose, maps, fps, name, somebody, device, drawing)
                     label = self.write_results(folder, done)
                     alone = write_each_person(folder, done, self) if self.per_person else []

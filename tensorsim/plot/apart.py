@@ -15,7 +15,7 @@ import numpy as np
 from tensorsim.exceptions import TensorsimError
 from tensorsim.plot.figure import save_figure
 from tensorsim.plot.maps import map_figure
-from tensorsim.process import cpu_quota, is_command
+from tensorsim.process import cpu_quota, is_command, leave
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -118,6 +118,7 @@ def _serve(jobs: Connection) -> None:
             except Exception as failure:
                 error = failure
             jobs.send(error)
+    leave()
 
 
 def _load() -> None:

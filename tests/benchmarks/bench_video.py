@@ -4,8 +4,10 @@
 
 Without a film, a generated person is rendered at half the size and enlarged. The time of the whole command is that of
 a new process, from its start to its end. Times of stages are those of the processor, in this process, with libraries
-loaded and figures drawn here; a busy machine changes them little. Set OMP_NUM_THREADS=1 for them, because threads of
-libraries count for no stage. A stage does not count what another stage in it takes. Other options go to ``simulate``.
+loaded and figures drawn here; a busy machine changes them little. Networks run in threads of their runtimes: while a
+stage waits for them, its wall time counts. Other threads of libraries, such as those that decode, count as "the rest";
+so set OMP_NUM_THREADS=1 to compare stages. A stage does not count what another stage in it takes. Other options go to
+``simulate``.
 
 The peer is ONNX Runtime running the same networks on every frame, one by one, with as many threads: detection, then
 keypoints with the mirror test in the boxes that were tracked. Its wall time is compared with that of finding people in
@@ -47,6 +49,7 @@ from tensorsim.data.video_writer import write_video
 from tensorsim.pipeline import VideoToPose
 from tensorsim.streaming import Found
 from tensorsim.types import Detections
+from tensorsim.vision.onnx_engine import OnnxEngine
 
 #: What is timed, as object, attribute and name of the stage.
 STAGES: tuple[tuple[Any, str, str], ...] = (
@@ -91,6 +94,20 @@ class Clock(threading.local):
 
         return wrapper
 
+    def waiting(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Count the wall time of a function whose work other threads do."""
+
+        @functools.wraps(function)
+        def wrapper(*arguments: Any) -> Any:
+            start, before = time.perf_counter(), time.thread_time()
+            try:
+                return function(*arguments)
+            finally:
+                idle = time.perf_counter() - start - (time.thread_time() - before)
+                self.seconds[self.stack[-1]] += idle
+
+        return wrapper
+
     def timed_chunks(
         self, function: Callable[..., Iterator[Any]]
     ) -> Callable[..., Generator[Any, None, None]]:
@@ -125,6 +142,7 @@ def simulate(film: Path, options: list[str]) -> Run:
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for owner, name, stage in STAGES:
             stack.enter_context(mock.patch.object(owner, name, clock.timed(getattr(owner, name), stage)))
+        stack.enter_context(mock.patch.object(OnnxEngine, "forward", clock.waiting(OnnxEngine.forward)))
         chunks = clock.timed_chunks(video.VideoReader._chunks)
         stack.enter_context(mock.patch.object(video.VideoReader, "_chunks", chunks))
         stack.enter_context(mock.patch.object(sources, "people_of_film", timed_find))
