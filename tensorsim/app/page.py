@@ -32,6 +32,8 @@ CSS = """
 .result a { margin-right: 0.8rem; }
 .failed { color: #c0261d; font-weight: 600; }
 """
+#: Scrolls to the progress, if it is out of sight.
+_SHOW_STATUS = "() => document.querySelector('#status').scrollIntoView({behavior: 'smooth', block: 'center'})"
 
 
 def build(runs: Runs, longest_s: float) -> gr.Blocks:
@@ -48,7 +50,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
         with gr.Row():
             with gr.Column(scale=1, min_width=300):
                 film = gr.File(
-                    label=f"Film, motion capture or keypoints, up to {longest_s:g} s", file_types=FILE_TYPES
+                    label=f"Film, motion or keypoints, up to {longest_s:g} s", file_types=FILE_TYPES
                 )
                 activity = gr.Dropdown(
                     _activities(), value="walking", label="Or the activity of a generated person"
@@ -62,6 +64,12 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                 scene = gr.Radio(_SCENES, value="free-space", label="Scene")
                 radar = gr.Dropdown(["", *PRESETS], value="", label="Radar preset")
                 paper = gr.Checkbox(label="Use the paper's formulas as printed")
+                with gr.Row():
+                    start = gr.Button("Simulate", variant="primary", elem_id="simulate")
+                    compare = gr.Button("Compare", elem_id="compare")
+                    cancel = gr.Button("Cancel", elem_id="cancel")
+                gr.Markdown("Compare runs the current settings and shows the result beside the previous one.")
+                _examples(activity, scene, duration)
                 inputs = {film, activity, duration, scene, radar, paper}
                 components = {}
                 for group in GROUPS:
@@ -69,12 +77,6 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
                         for control in (c for c in made if c.group == group):
                             components[control.option] = component = _component(control)
                             inputs.add(component)
-                with gr.Row():
-                    start = gr.Button("Simulate", variant="primary", elem_id="simulate")
-                    compare = gr.Button("Compare", elem_id="compare")
-                    cancel = gr.Button("Cancel", elem_id="cancel")
-                gr.Markdown("Compare runs the current settings and shows the result beside the previous one.")
-                _examples(activity, scene, duration)
             with gr.Column(scale=3, min_width=360):
                 status = gr.HTML("Ready.", elem_id="status")
                 with gr.Row(visible=False) as working:
@@ -104,6 +106,7 @@ def build(runs: Runs, longest_s: float) -> gr.Blocks:
             return simulate
 
         for button, keep in ((start, False), (compare, True)):
+            button.click(None, js=_SHOW_STATUS)
             button.click(
                 simulation(keep),
                 inputs | {shown},

@@ -323,6 +323,8 @@ def status_of(address: str) -> int:
 @pytest.mark.slow
 def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
     """Opens; runs the example; changes a wall and compares; downloads a .mat; a broken film is one sentence."""
+    from playwright.sync_api import expect
+
     shots = Path(os.environ.get("TENSORSIM_SCREENSHOTS", tmp_path))
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(2000))
@@ -376,6 +378,7 @@ def test_five_tasks_in_a_browser(server: str, tmp_path: Path) -> None:
         sentence = page.locator("#status .failed")
         sentence.wait_for()
         assert re.fullmatch(r"broken\.mp4: OpenCV cannot read this, expected a video", sentence.inner_text())
+        expect(page.locator("#status")).to_be_in_viewport()
         assert elsewhere == [], "nothing is asked of the network"
 
     for path in ("/etc/passwd", str(ROOT / "README.md"), str(broken)):
