@@ -174,6 +174,7 @@ class MetricPose(nn.Module):
         self.poor_fit = (
             0.25  # squared error of the lifted pose over the spread of the joints; good ones have 0.01
         )
+        self.least_outlier_m = 0.03  # errors of range and height that even a good frame has
         self.least_size = 0.65  # of the size in reliable frames: below, a part was taken for a whole body
         check_score(keypoint_threshold, "MetricPose.keypoint_threshold")
         check_positive(range_smoothing_s, "MetricPose.range_smoothing_s")
@@ -284,7 +285,9 @@ class MetricPose(nn.Module):
             hips_range, image, depth, focal, center, pose, height, inside, whole, fps
         )
         whole = where_any(whole & ~beyond, whole)
-        hips_range = robust_smooth(hips_range, whole, self.range_smoothing_s * fps, precision=precision)
+        hips_range = robust_smooth(
+            hips_range, whole, self.range_smoothing_s * fps, self.least_outlier_m, precision=precision
+        )
         body_px = standing_px(focal, height, hips_range, offset)
         tells = whole.to(precision.dtype) * precision + 1e-4
         hips_range = range_over_feet(hips_range, image, depth, inside & ~beside, body_px, tells, fps)
@@ -348,7 +351,7 @@ class MetricPose(nn.Module):
         """
         bent = looks_bent(image, seen)
         straight = where_any(whole & ~bent, whole)
-        smooth = robust_smooth(by_size, straight, self.range_smoothing_s * fps)
+        smooth = robust_smooth(by_size, straight, self.range_smoothing_s * fps, self.least_outlier_m)
         smooth = torch.where(straight, smooth, by_size)
         joints = back_project(image, smooth[..., None] + depth, focal, center, pose)
         upright = upright_share(joints, height.expand_as(by_size)) * (~bent).to(joints.dtype)
@@ -357,7 +360,7 @@ class MetricPose(nn.Module):
         # The floor is where this person stood last, or will stand next.
         stands = whole & (upright >= 0.9)
         rests = stands & feet
-        ankle = robust_smooth(lowest_ankle(joints), rests, self.floor_window_s * fps)
+        ankle = robust_smooth(lowest_ankle(joints), rests, self.floor_window_s * fps, self.least_outlier_m)
         floor = fill_gaps(ankle, rests)
         ahead = torch.cat(
             [(image - center) / focal[..., None, None], torch.ones_like(image[..., :1])], dim=-1

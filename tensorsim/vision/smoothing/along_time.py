@@ -182,14 +182,23 @@ def masked_median(x: Tensor, valid: Tensor) -> Tensor:
 
 
 def robust_smooth(
-    x: Tensor, valid: Tensor, sigma: float, rounds: int = 3, precision: Tensor | None = None
+    x: Tensor,
+    valid: Tensor,
+    sigma: float,
+    least: float,
+    rounds: int = 3,
+    precision: Tensor | None = None,
 ) -> Tensor:
-    """Local linear smoothing, robust against outliers (lowess: Cleveland, 1979, with bisquare weights).
+    """Local linear smoothing, robust against outliers (lowess: Cleveland, 1979, with Cauchy weights).
+
+    Lowess has bisquare weights, which are 0 from some residual on: then several results are consistent, each with
+    other values left out, and the smallest change of one value decides between them.
 
     Args:
         x: (..., T) values; those of invalid frames do not matter but must be finite.
         valid: (..., T) bool.
         sigma: standard deviation of the kernel in frames.
+        least: residuals well below this one count fully, even if most are much smaller; positive, in the unit of x.
         rounds: number of reweightings by the residuals.
         precision: (..., T) positive, inverse variances in any unit; None: all values are equally good.
 
@@ -206,10 +215,10 @@ def robust_smooth(
     ridge = ridge_in_gaps(base, sigma)
     smooth = local_linear(x, base, sigma, ridge)
     for _ in range(rounds):
-        residual = unit * (x - smooth).abs()
-        spread = 6.0 * masked_median(residual, valid)
-        bisquare = (1.0 - (residual / spread.clamp(min=1e-9)).clamp(max=1.0).square()).square()
-        smooth = local_linear(x, base * (bisquare + 1e-4), sigma, ridge)
+        residual = unit * (x - smooth)
+        # The usual 2.385 standard deviations, which the median of the absolute values of a Gaussian tells.
+        limit = (2.385 / 0.6745 * masked_median(residual.abs(), valid)).clamp(min=least)
+        smooth = local_linear(x, base / (1.0 + (residual / limit).square()), sigma, ridge)
     return smooth
 
 
