@@ -55,7 +55,7 @@ def write_each_person(folder: Path, run: "Run", options: "ClipOptions") -> list[
         maps = maps_of_pose(run.stage, pose, run.fps, run.device, options.quiet)
         axes = results.axes_of(run.stage, maps)
         label = label_of(run.recognizer, maps, duration_s, options.least_probability)
-        pictures = options.pictures(run.stage, label["label"], f"{run.film}, person {number}", True)
+        pictures = options.pictures(run.stage, label["label"], f"{run.film}, person {number}")
         results.save_maps(folder / f"maps_person_{number}", maps, axes, array_formats(options.save))
         name = f"doppler_time_person_{number}"
         run.drawing.draw(results.doppler_figure(maps, axes, pictures), folder / f"{name}.{pictures.suffix}")

@@ -5,9 +5,9 @@
 Without a film, a generated person is rendered at half the size and enlarged. The time of the whole command is that of
 a new process, from its start to its end. Times of stages are those of the processor, in this process, with libraries
 loaded and figures drawn here; a busy machine changes them little. Networks run in threads of their runtimes: while a
-stage waits for them, its wall time counts. Other threads of libraries, such as those that decode, count as "the rest";
-so set OMP_NUM_THREADS=1 to compare stages. A stage does not count what another stage in it takes. Other options go to
-``simulate``.
+stage waits for them, its wall time counts. Other threads of libraries, such as those that decode, count as "the rest".
+Set OMP_NUM_THREADS=1 so that torch has none. A stage does not count what another stage in it takes. Other options go
+to ``simulate``.
 
 The peer is ONNX Runtime running the same networks on every frame, one by one, with as many threads: detection, then
 keypoints with the mirror test in the boxes that were tracked. Its wall time is compared with that of finding people in

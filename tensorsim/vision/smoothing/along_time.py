@@ -191,8 +191,8 @@ def robust_smooth(
 ) -> Tensor:
     """Local linear smoothing, robust against outliers (lowess: Cleveland, 1979, with Cauchy weights).
 
-    Lowess has bisquare weights, which are 0 from some residual on: then several results are consistent, each with
-    other values left out, and the smallest change of one value decides between them.
+    The bisquare weights of lowess are 0 beyond some residual. Several results can then be stable, each leaving out
+    other values, and a tiny change of one value decides between them.
 
     Args:
         x: (..., T) values; those of invalid frames do not matter but must be finite.
@@ -216,7 +216,7 @@ def robust_smooth(
     smooth = local_linear(x, base, sigma, ridge)
     for _ in range(rounds):
         residual = unit * (x - smooth)
-        # The usual 2.385 standard deviations, which the median of the absolute values of a Gaussian tells.
+        # The usual 2.385 standard deviations; the median absolute value of a Gaussian is 0.6745 of one.
         limit = (2.385 / 0.6745 * masked_median(residual.abs(), valid)).clamp(min=least)
         smooth = local_linear(x, base / (1.0 + (residual / limit).square()), sigma, ridge)
     return smooth

@@ -94,7 +94,7 @@ def test_outliers_do_not_bend_it() -> None:
 
 
 def test_one_value_moves_the_result_by_less_than_itself() -> None:
-    """Someone bends down, where ranges are poor, and stands still for long: of the bend most values are outliers."""
+    """Somebody bends down, with poor ranges, and then stands still for so long that the bend seems to be outliers."""
     generator = torch.Generator().manual_seed(0)
     frame = torch.arange(132, dtype=torch.float64)
     bends = (frame - 22).abs() < 10
