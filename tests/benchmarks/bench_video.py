@@ -4,10 +4,10 @@
 
 Without a film, a generated person is rendered at half the size and enlarged. The time of the whole command is that of
 a new process, from its start to its end. Times of stages are those of the processor, in this process, with libraries
-loaded and figures drawn here; a busy machine changes them little. Networks run in threads of their runtimes: while a
-stage waits for them, its wall time counts. Other threads of libraries, such as those that decode, count as "the rest".
-Set OMP_NUM_THREADS=1 so that torch has none. A stage does not count what another stage in it takes. Other options go
-to ``simulate``.
+loaded and figures drawn here; a busy machine changes them little. Networks and decoders run in threads of their
+libraries: while a stage waits for them, its wall time counts. Other threads of libraries do not count; set
+OMP_NUM_THREADS=1 so that torch has none. A stage does not count what another stage in it takes, and "the rest" is
+outside all stages. Other options go to ``simulate``.
 
 The peer is ONNX Runtime running the same networks on every frame, one by one, with as many threads: detection, then
 keypoints with the mirror test in the boxes that were tracked. Its wall time is compared with that of finding people in
@@ -69,14 +69,15 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
 
 
 class Clock(threading.local):
-    """Processor time of each thread by stage; what is inside of another stage counts for the inner one only."""
+    """Seconds of each thread by stage; what is inside of another stage counts for the inner one only."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
         self.seconds = seconds
         self.stack: list[str] = ["the rest"]
         self.since = time.thread_time()
 
-    def _turn(self) -> None:
+    def turn(self) -> None:
+        """Count the time since the last turn for the present stage."""
         now = time.thread_time()
         self.seconds[self.stack[-1]] += now - self.since
         self.since = now
@@ -84,12 +85,12 @@ class Clock(threading.local):
     def timed(self, function: Callable[..., Any], stage: str) -> Callable[..., Any]:
         @functools.wraps(function)
         def wrapper(*arguments: Any, **options: Any) -> Any:
-            self._turn()
+            self.turn()
             self.stack.append(stage)
             try:
                 return function(*arguments, **options)
             finally:
-                self._turn()
+                self.turn()
                 self.stack.pop()
 
         return wrapper
@@ -113,7 +114,7 @@ class Clock(threading.local):
     ) -> Callable[..., Generator[Any, None, None]]:
         def wrapper(*arguments: Any) -> Generator[Any, None, None]:
             chunks = function(*arguments)
-            step = self.timed(lambda: next(chunks, None), "decoding")
+            step = self.timed(self.waiting(lambda: next(chunks, None)), "decoding")
             while (chunk := step()) is not None:
                 yield chunk
 
@@ -121,7 +122,7 @@ class Clock(threading.local):
 
 
 class Run(NamedTuple):
-    """Processor seconds by stage, wall seconds, and wall seconds of finding people, of one run."""
+    """Seconds by stage, wall seconds, and wall seconds of finding people, of one run."""
 
     stages: dict[str, float]
     wall: float
@@ -146,11 +147,10 @@ def simulate(film: Path, options: list[str]) -> Run:
         chunks = clock.timed_chunks(video.VideoReader._chunks)
         stack.enter_context(mock.patch.object(video.VideoReader, "_chunks", chunks))
         stack.enter_context(mock.patch.object(sources, "people_of_film", timed_find))
-        start, before = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
         cli.main(["simulate", str(film), "--out", f"{folder}/out", "--quiet", *options])
         wall = time.perf_counter() - start
-        seconds["the rest"] = 0.0
-        seconds["the rest"] = time.process_time() - before - sum(seconds.values())
+        clock.turn()
         return Run(dict(seconds), wall, finding[0])
 
 
@@ -222,7 +222,7 @@ def main() -> None:
         print(f"{stage:30} {seconds:7.2f} s {100 * seconds / total:5.1f} %")
     wall = statistics.median(run.wall for run in runs)
     print(
-        f"whole command {statistics.median(commands):.2f} s; with libraries loaded {wall:.2f} s, of the processor "
+        f"whole command {statistics.median(commands):.2f} s; with libraries loaded {wall:.2f} s, sum of stages "
         f"{total:.2f} s (medians of {len(runs)})"
     )
     if others:
