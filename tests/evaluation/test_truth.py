@@ -125,7 +125,7 @@ def test_true_lifting_places_joints_exactly() -> None:
     joints, _ = stage(keypoints, scores, lifted, observed.valid[None], HEIGHT, WIDTH, FPS)
     error = joints[0, 0].double() - clip.joints(FPS)
     # The floor is taken from the lower ankle; along the line of sight little is left to guess: feet that stand roll.
-    assert float(error[..., 1].abs().max()) < 5e-3
+    assert float(error[..., 1].abs().max()) < 8e-3
 
 
 @pytest.mark.parametrize("near", [0.06, 1e-4])

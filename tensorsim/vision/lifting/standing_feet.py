@@ -33,13 +33,14 @@ def range_over_feet(
     """Correct how ranges change while a foot stands on the floor or the whole body is at rest.
 
     While a foot at depth d relative to the hips stands, ``y(t + 1) - y(t) = d(t) - d(t + 1)``. A foot counts as
-    standing if it is slow in the picture (0.15 standing heights per second) and also along the line of sight, where its
-    speed is that of the given range and d together (0.4 m/s, more where the range is less precise): both feet of
-    somebody who walks straight towards the camera are slow in the picture. While only one foot stands, half of its
-    change and half of the given one are used, because the near and the far leg are easily confused during a step. A
-    body is at rest, and y does not change, if all joints but two are slow (0.08 heights per second) and so is the given
-    range (0.2 m/s). All these limits are standard deviations of Gaussian weights. The sum of the changes drifts away
-    from the given ranges; their mean difference over 1.5 s is added, so that slow changes of the given ranges remain.
+    standing if it is slow in the picture (0.3 standing heights per second) and also along the line of sight, where its
+    speed is that of the range and d together (0.4 m/s, more where the range is less precise): both feet of somebody who
+    walks straight towards the camera are slow in the picture. While only one foot stands, seven tenths of its change
+    and three tenths of the given one are used, because the near and the far leg are easily confused during a step. A
+    body is at rest, and y does not change, if all joints but two are slow (0.08 heights per second) and so is the range
+    (0.2 m/s). All these limits are standard deviations of Gaussian weights. The sum of the changes drifts away from the
+    given ranges; their mean difference over 2.5 s is added, so that slow changes of the given ranges remain. This is
+    done twice: which foot stands is seen better in the ranges of the first round than in the given ones.
 
     Args:
         hips_range: (..., T) m, from size and floor, smoothed.
@@ -63,23 +64,29 @@ def range_over_feet(
     ankles = depth[..., 10:14:3].transpose(-2, -1)  # joints 10 and 13
     ankles = local_linear(ankles, torch.ones_like(ankles), 0.06 * fps)
     about = ankles[..., :-1] - ankles[..., 1:]
-    slides = (steps.unsqueeze(-2) - about) * fps
-    slides = local_linear(slides, torch.ones_like(slides), 0.12 * fps)
     across = squared_speed(image[..., 10:14:3, :], seen[..., 10:14:3], fps, 0.06) / unit
-    stands = torch.exp(-0.5 * (across / 0.15**2 + weight.unsqueeze(-2) * (slides / 0.4).square()))
-    stands = stands * both_seen[..., 10:14:3, :].all(dim=-2, keepdim=True)
-    change = (stands * about).sum(dim=-2) / stands.sum(dim=-2).clamp(min=1e-6)
-    believed = torch.maximum(stands.amin(dim=-2), 0.5 * stands.amax(dim=-2))
-
+    slow = torch.exp(-0.5 * across / 0.3**2) * both_seen[..., 10:14:3, :].all(dim=-2, keepdim=True)
     across = torch.where(both_seen, squared_speed(image, seen, fps, 0.2) / unit, 0.0)
     third = across.topk(3, dim=-2)[0][..., 2, :]
-    drifts = local_linear(steps * fps, torch.ones_like(steps), 0.12 * fps)
-    rests = torch.exp(-0.5 * (third / 0.08**2 + weight * (drifts / 0.2).square()))
-    rests = rests * (both_seen.sum(dim=-2) >= 6)
-    change = change * believed / (believed + rests).clamp(min=1e-6)
-    believed = torch.maximum(believed, rests)
+    still = torch.exp(-0.5 * third / 0.08**2) * (both_seen.sum(dim=-2) >= 6)
 
-    way = F.pad((steps + believed * (change - steps)).cumsum(dim=-1), [1, 0])
-    # The ridge makes this a mean without slope: a steady drift of a standing person is an error of the size as well.
-    level = torch.full_like(way, 30.0)
-    return way + local_linear(hips_range - way, precision, 1.5 * fps, ridge=level)
+    found = hips_range
+    for _ in range(2):
+        speeds = (found[..., 1:] - found[..., :-1]) * fps
+        slides = speeds.unsqueeze(-2) - about * fps
+        slides = local_linear(slides, torch.ones_like(slides), 0.12 * fps)
+        stands = slow * torch.exp(-0.5 * weight.unsqueeze(-2) * (slides / 0.4).square())
+        change = (stands * about).sum(dim=-2) / stands.sum(dim=-2).clamp(min=1e-6)
+        believed = torch.maximum(stands.amin(dim=-2), 0.7 * stands.amax(dim=-2))
+
+        drifts = local_linear(speeds, torch.ones_like(speeds), 0.12 * fps)
+        rests = still * torch.exp(-0.5 * weight * (drifts / 0.2).square())
+        change = change * believed / (believed + rests).clamp(min=1e-6)
+        believed = torch.maximum(believed, rests)
+
+        way = F.pad((steps + believed * (change - steps)).cumsum(dim=-1), [1, 0])
+        # The ridge makes this a mean without slope: a steady drift of a standing person is an error of the size as
+        # well.
+        level = torch.full_like(way, 30.0)
+        found = way + local_linear(hips_range - way, precision, 2.5 * fps, ridge=level)
+    return found

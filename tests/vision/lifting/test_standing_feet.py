@@ -48,6 +48,12 @@ def test_who_stands_does_not_come_and_go_with_an_error_of_the_size() -> None:
     assert float((there - 4.0).abs().max()) < 0.03
 
 
+def test_which_foot_stands_is_seen_though_the_range_is_wrong_by_more_than_the_limit() -> None:
+    """An error of 0.57 m/s, more than the 0.4 m/s of feet that stand: the second round sees that they do."""
+    there = found(4.0 + 3 * WRONG_M)
+    assert float(there.diff().square().mean().sqrt()) * FPS < 0.1
+
+
 def test_a_steady_drift_of_who_stands_becomes_less() -> None:
     drift = 4.0 + 0.1 * TIME
     there = found(drift)
@@ -65,20 +71,20 @@ def test_the_hips_move_about_the_feet_as_the_pose_tells() -> None:
     assert float(rate) < 0.25 * float((before - true).diff()[INSIDE].square().mean().sqrt() * FPS)
 
 
-def test_one_foot_that_stands_is_believed_by_half() -> None:
-    """Half of a wave in the given range remains; it is too fast for the mean over seconds to keep any of it."""
+def test_one_foot_that_stands_is_believed_by_seven_tenths() -> None:
+    """Three tenths of a wave in the given range remain; it is too fast for the mean over seconds to keep any of it."""
     swings = torch.zeros(FRAMES, 2, 2, dtype=torch.float64)
-    swings[:, 1, 0] = BODY_PX * 1.5 * TIME
+    swings[:, 1, 0] = BODY_PX * 2.5 * TIME
     wave = 0.03 * torch.sin(4 * math.pi * TIME)
     there = found(4.0 + wave, swings)
     share = (there.diff() * wave.diff())[INSIDE].sum() / wave.diff()[INSIDE].square().sum()
-    assert float(share) == pytest.approx(0.5, abs=0.05)
+    assert float(share) == pytest.approx(0.3, abs=0.05)
 
 
 @pytest.mark.parametrize("direction", [0, 1])
 def test_ranges_stay_where_the_feet_move_in_the_picture(direction: int) -> None:
     pixels = torch.zeros(FRAMES, 2, 2, dtype=torch.float64)
-    pixels[..., direction] = (BODY_PX * TIME)[:, None]
+    pixels[..., direction] = (2 * BODY_PX * TIME)[:, None]
     given = 4.0 - 1.2 * TIME / 3 + WRONG_M
     torch.testing.assert_close(found(given, pixels), given, atol=1e-6, rtol=0)
 
