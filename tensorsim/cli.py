@@ -36,6 +36,7 @@ from tensorsim.commands.train_detector import TrainDetector
 from tensorsim.commands.train_everyday import TrainEveryday
 from tensorsim.commands.train_lifter import TrainLifter
 from tensorsim.commands.train_pose import TrainPose
+from tensorsim.commands.train_range_rate import TrainRangeRate
 from tensorsim.exceptions import TensorsimError
 
 EXAMPLES = """
@@ -85,6 +86,7 @@ COMMANDS: dict[str, Any] = {
             "detector": TrainDetector,
             "pose": TrainPose,
             "lifter": TrainLifter,
+            "range-rate": TrainRangeRate,
             "denoiser": TrainDenoiser,
             "classifier": TrainClassifier,
             "everyday": TrainEveryday,

@@ -3,7 +3,7 @@
 from typing import Any, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tensorsim.body.kinematics import BodyPose, forward_kinematics
 from tensorsim.body.skeleton import body_to_coco
@@ -40,12 +40,23 @@ def terms_of_training(recipe: Recipe, batch: Batch, steps: int, term: str = "los
     return values
 
 
-def keypoints_to_lift(frames: int) -> tuple[Any, ...]:
-    """Arguments of a temporal lifter: a person 4 m in front of a level camera who raises the arms."""
+def _raising_the_arms(frames: int) -> Tensor:
+    """Joints (T, 14, 3) of a person who stands at the origin."""
     pose = BodyPose.standing((frames,), torch.float32)
     raised = torch.linspace(0.0, 2.0, frames)[:, None, None] * torch.tensor([1.0, 0.0, 0.0])
-    joints = forward_kinematics(pose._replace(shoulder=raised.expand(-1, 2, -1)), 1.75)
-    points = body_to_coco(joints)
+    return forward_kinematics(pose._replace(shoulder=raised.expand(-1, 2, -1)), 1.75)
+
+
+def people_to_move(frames: int) -> tuple[Any, ...]:
+    """Arguments of a range rate: a person 4 m in front of the camera who raises the arms."""
+    joints = _raising_the_arms(frames) + torch.tensor([0.0, 4.0, 0.0])
+    there = torch.ones(frames, dtype=torch.bool)
+    return joints, there[:, None].expand(-1, 14), there, torch.tensor([0.0, 0.0, 1.2]), 30.0
+
+
+def keypoints_to_lift(frames: int) -> tuple[Any, ...]:
+    """Arguments of a temporal lifter: a person 4 m in front of a level camera who raises the arms."""
+    points = body_to_coco(_raising_the_arms(frames))
     pixels = 500 * torch.stack([points[..., 0], -points[..., 2]], dim=-1) / (4.0 + points[..., 1:2])
     pixels = (pixels + torch.tensor([320.0, 180.0]))[None]
     boxes = torch.cat([pixels.amin(dim=-2) - 8, pixels.amax(dim=-2) + 8], dim=-1)

@@ -384,6 +384,12 @@ def test_a_metric_pose_of_ones_own_replaces_the_default() -> None:
     assert_same(torch.jit.script(stage)(clip, FPS).joints, found.joints)
 
 
+def test_a_corrected_range_rate_scripts() -> None:
+    clip = two_clips()[:1]
+    stage = VideoToPose(RectangleDetector(), StandingPose(), range_rate=True).eval()
+    assert_same(torch.jit.script(stage)(clip, FPS).joints, stage(clip, FPS).joints, atol=1e-6)
+
+
 def test_padded_frames_do_not_count() -> None:
     stage, clips = VideoToPose(RectangleDetector(), StandingPose()).eval(), two_clips()
     graph = VideoToDoppler(video_to_pose=stage, radar=RADAR, snr_db=None)

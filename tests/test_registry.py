@@ -19,7 +19,7 @@ from tensorsim.model_files import manifest
 from tensorsim.registry import PUBLISHED, ModelEntry
 from tensorsim.vision import HRNet, RTMDet
 from tensorsim.weights import save_weights
-from tests.networks import keypoints_to_lift
+from tests.networks import keypoints_to_lift, people_to_move
 from tests.stage import assert_same
 
 CONTENT = bytes(range(256)) * 16384
@@ -213,6 +213,8 @@ def test_shipped_networks_load_run_and_script(entry: ModelEntry) -> None:
         assert all(torch.equal(value, default[key]) for key, value in network.state_dict().items())
     if entry.network == "TemporalLifter":
         arguments = keypoints_to_lift(12)
+    elif entry.network == "RangeRate":
+        arguments = people_to_move(12)
     else:
         shape = SHOWN[entry.network]
         arguments = (torch.rand(shape, generator=torch.Generator().manual_seed(0)),)

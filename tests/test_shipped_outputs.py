@@ -44,6 +44,7 @@ LOOK: dict[str, Callable[[torch.nn.Module], Tensor]] = {
     "AcfDetector": tree_sums,  # type: ignore[dict-item]
     "VideoPose3D": lambda network: network(2 * wave(9, 17, 2) - 1).flatten()[::19],
     "CPM": lambda network: network(wave(1, 3, 64, 64)).flatten()[::43],
+    "RangeRate": lambda stage: stage.network(4 * wave(1, 40, 102) - 2).flatten()[::7],  # type: ignore[operator, union-attr]
     "TemporalLifter": lambda lifter: lifter(*keypoints_to_lift(20)).joints.flatten()[::41],
 }
 
@@ -63,6 +64,10 @@ EXPECTED: dict[str, tuple[list[float], float]] = {
         [7.42362e-05, -0.888501, 0.0310593, -0.106276, -0.44495, 0.0878863],
         0.38585,
     ),  # TemporalLifter
+    "e7324e970727521c": (
+        [-1.4883, -1.50713, 1.26521, -0.705567, 1.9214, -0.542786],
+        1.3274,
+    ),  # RangeRate
     "5f5f7cebae014e45": (
         [0.00710835, -0.888452, 0.0814337, 0.185155, 0.0518079, -0.359967],
         0.49223,

@@ -35,6 +35,7 @@ _MORE = {
         "stride",
         "flip_test",
         "walking_legs",
+        "range_rate",
         "image_size",
     ],
     "MOTION CAPTURE": ["clip", "heading"],
@@ -52,6 +53,7 @@ _OTHERWISE: dict[str, dict[str, Any]] = {
     "calibrate": _ON,
     "flip_test": _ON,
     "walking_legs": _ON,
+    "range_rate": _OFF,
     # The command also takes weight files; users of the app must not read files on the machine that runs it.
     "denoiser": {
         "label": "Denoiser",

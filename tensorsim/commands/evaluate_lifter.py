@@ -11,6 +11,9 @@ from tensorsim.exceptions import TensorsimError, check_seed
 class EvaluateLifter:
     """Print the errors of the three lifters, from keypoints to smoothed joints, with known camera and body height.
 
+    The temporal lifter is tested without and with corrected speeds along the line of sight (``--range-rate`` of
+    ``simulate``).
+
     Generated people use seeds that were not trained on; of motion capture, only the sequences held out in training are
     used, every second one.
     """
@@ -43,10 +46,13 @@ class EvaluateLifter:
         from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
         from tensorsim.vision.lifting.videopose3d import VideoPose3D
 
+        temporal = scores.temporal(TemporalLifter.from_pretrained(self.weights))
+        # How each lifts, and whether speeds along the line of sight are corrected.
         lifters = {
-            "temporal": scores.temporal(TemporalLifter.from_pretrained(self.weights)),
-            "nearest": scores.nearest,
-            "videopose3d": scores.video_pose(VideoPose3D.from_pretrained()),
+            "temporal": (temporal, False),
+            "temporal, range rate": (temporal, True),
+            "nearest": (scores.nearest, False),
+            "videopose3d": (scores.video_pose(VideoPose3D.from_pretrained()), False),
         }
         pool = build_pool(None, self.motions, self.motion, self.seed, held_out=True, quiet=self.quiet)
         rows = {
@@ -62,16 +68,16 @@ class EvaluateLifter:
         header = "| people | lifter | " + " | ".join(scores.LiftErrors._fields) + " |"
         print(header.replace("_", " ") + "\n| --- | --- |" + " ---: |" * len(scores.LiftErrors._fields))
         for name, (kinds, errors) in rows.items():
-            for lifter, make in lifters.items():
+            for lifter, (make, corrected) in lifters.items():
                 views = scores.views(pool, kinds, errors, self.seed)
                 bar = tqdm(
                     views, lifter, total=len(scores.CAMERAS), unit="camera", leave=False, disable=self.quiet
                 )
-                self._print(name, lifter, scores.judge(make, bar))
+                self._print(name, lifter, scores.judge(make, bar, corrected))
         if self.films is not None:
-            for lifter, make in lifters.items():
+            for lifter, (make, corrected) in lifters.items():
                 bar = tqdm(scores.watched(self.films), lifter, unit="film", leave=False, disable=self.quiet)
-                self._print("rendered films", lifter, scores.judge(make, bar))
+                self._print("rendered films", lifter, scores.judge(make, bar, corrected))
 
     @staticmethod
     def _print(people: str, lifter: str, errors: tuple[float, ...]) -> None:

@@ -53,6 +53,7 @@ _MEANT_FOR = {
     "lifter": ("video", "keypoints"),
     "library": ("video", "keypoints"),
     "walking_legs": ("video", "keypoints"),
+    "range_rate": ("video", "keypoints"),
     "image_size": ("keypoints",),
     "clip": ("motion",),
     "heading": ("motion",),
@@ -94,6 +95,9 @@ class Simulate(NetworkOptions, ClipOptions):
     walking_legs: Option[bool] = None
     """Give the legs of people who walk the steps of a gait model where the film shows too little of them (temporal
     lifter only). Default: on."""
+    range_rate: Option[bool] = None
+    """Correct how fast people come closer or move away by how they move (temporal lifter only). Default: off, because
+    the shipped classifiers have not learnt from such maps."""
     per_person: bool = False
     """With several people in the scene, also simulate and label each one alone: maps_person_N.npz and
     doppler_time_person_N.png, with N as in the overlay."""
@@ -191,6 +195,7 @@ class Simulate(NetworkOptions, ClipOptions):
             ("pose__lifter", self.lifter if self.library is None or self.lifter is not None else "nearest"),
             ("pose__library", None if self.library is None else str(self.library)),
             ("pose__walking_legs", self.walking_legs),
+            ("pose__range_rate", self.range_rate),
         ):
             if value is not None:
                 config = config.replace(**{field: value})

@@ -95,6 +95,8 @@ class PoseConfig:
         fewest_joints: how many of the 14 joints must be seen for a frame to be used.
         walking_legs: temporal lifter only: give the legs of people who walk the steps of a gait model where the film
             shows too little of them; see :class:`tensorsim.vision.WalkingLegs`.
+        range_rate: temporal lifter only: correct how fast people come closer or move away by how they move; see
+            :class:`tensorsim.vision.RangeRate`.
         people: who is simulated: ``"all"``, ``"moving"``, ``"nearest"`` or a person's number from 1.
 
     Raises:
@@ -117,6 +119,7 @@ class PoseConfig:
     temporal: float = 1.0
     fewest_joints: int = 5
     walking_legs: bool = True
+    range_rate: bool = False
     people: str = "all"
 
     def __post_init__(self) -> None:

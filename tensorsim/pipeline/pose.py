@@ -25,6 +25,7 @@ from tensorsim.protocols import check_detections, check_instance, check_part
 from tensorsim.types import Detections, Pose, Tracks
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose, cut_off_beside
+from tensorsim.vision.lifting.range_rate import RangeRate
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.walking_legs import WalkingLegs
 from tensorsim.vision.smoothing.along_time import brief_gaps, crossed_within, gaps_with, where_any
@@ -63,6 +64,9 @@ class VideoToPose(nn.Module):
             exact keypoints; None leaves it out.
         walking_legs: with a :class:`~tensorsim.vision.TemporalLifter`, give the legs of people who walk the steps of a
             gait model where they are seen too little; see :class:`~tensorsim.vision.WalkingLegs`.
+        range_rate: with a :class:`~tensorsim.vision.TemporalLifter`, a :class:`~tensorsim.vision.MetricPose` in its
+            camera mode and no ``bone_fit``, correct how fast people come closer or move away by how they move; see
+            :class:`~tensorsim.vision.RangeRate`.
 
     Raises:
         TensorsimError: numbers out of range; a ``metric_pose`` together with heights, distances or a camera; parts that
@@ -89,6 +93,7 @@ class VideoToPose(nn.Module):
         smoother: nn.Module | None = None,
         bone_fit: nn.Module | None = None,
         walking_legs: bool = True,
+        range_rate: bool = False,
     ) -> None:
         super().__init__()
         self.detection_interval = check_count(detection_interval, "detection_interval")
@@ -126,6 +131,10 @@ class VideoToPose(nn.Module):
         self.smoother = check_part(KalmanSmoother() if smoother is None else smoother, "smoother")
         # A matched pose brings its own legs.
         self.walking_legs = WalkingLegs() if walking_legs and self.temporal is not None else None
+        # Made for the errors of ranges from sizes, as the temporal lifter finds them.
+        by_size = isinstance(metric_pose, MetricPose) and metric_pose.mode == "camera"
+        corrected = range_rate and by_size and self.temporal is not None and bone_fit is None
+        self.range_rate = RangeRate.from_pretrained().requires_grad_(False) if corrected else None
         self.keypoint_threshold = keypoint_threshold
         self.brief_gap_s = brief_gap_s
         #: People hidden for longer are absent until they are seen again.
@@ -168,6 +177,7 @@ class VideoToPose(nn.Module):
             detection_interval=tracking.detection_interval,
             fewest_joints=people.fewest_joints,
             walking_legs=people.walking_legs,
+            range_rate=people.range_rate,
             brief_gap_s=smoothing.brief_gap_s,
             tracker=GNNTracker(
                 max_tracks=tracking.max_tracks,
@@ -441,6 +451,8 @@ class VideoToPose(nn.Module):
         predicted = brief_gaps(seen.transpose(-1, -2), int(self.brief_gap_s * fps)).transpose(-1, -2)
         measured = without_jumps(joints, in_scene & ~predicted, fps, self.top_speed_m_s)
         joints = self.smoother(joints, measured, fps, noise)
+        if self.range_rate is not None:
+            joints = self.range_rate(joints, reliable, there, torch.tensor(self.camera_m).to(joints), fps)
         if self.walking_legs is not None:
             joints = self.walking_legs(joints, reliable, there, fps)
         joints = limit_speed(joints, fps, self.top_speed_m_s)

@@ -130,14 +130,18 @@ def video_pose(network: VideoPose3D) -> MakeLifter:
 
 
 @torch.inference_mode()
-def lifted(make: MakeLifter, seen: Seen) -> tuple[Tensor, Tensor]:
-    """Joints (P, T, 14, 3) that the pipeline makes of keypoints, and the frames (P, T) where they are valid."""
+def lifted(make: MakeLifter, seen: Seen, range_rate: bool = False) -> tuple[Tensor, Tensor]:
+    """Joints (P, T, 14, 3) that the pipeline makes of keypoints, and the frames (P, T) where they are valid.
+
+    With ``range_rate``, speeds along the line of sight are corrected by :class:`~tensorsim.vision.RangeRate`.
+    """
     nothing = nn.Identity()
     stage = VideoToPose(
         nothing,
         nothing,
         lifter=make(seen),
         metric_pose=MetricPose(seen.camera, seen.heights),
+        range_rate=range_rate,
     ).eval()
     tracks = Tracks(seen.boxes[None], seen.valid[None], seen.valid[None])
     pose = stage.lift(tracks, seen.keypoints[None], seen.scores[None], seen.extent[1], seen.extent[0], FPS)
@@ -150,12 +154,12 @@ def _peaks(joints: Tensor, valid: Tensor) -> Tensor:
     return speed[valid[1:] & valid[:-1]].quantile(_PEAK, dim=0)
 
 
-def judge(make: MakeLifter, people: Iterator[Seen]) -> LiftErrors:
-    """Mean errors over people; frames in which a person is not tracked do not count."""
+def judge(make: MakeLifter, people: Iterator[Seen], range_rate: bool = False) -> LiftErrors:
+    """Mean errors over people, see :func:`lifted`; frames in which a person is not tracked do not count."""
     sums, radial = torch.zeros(5, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     ratios = []
     for seen in people:
-        found, valid = lifted(make, seen)
+        found, valid = lifted(make, seen, range_rate)
         found, true = found.double(), seen.joints.double()
         place = true.new_tensor(seen.camera.position_m)
         sight = nn.functional.normalize((mid_hips(true) - place) * true.new_tensor([1.0, 1.0, 0.0]), dim=-1)

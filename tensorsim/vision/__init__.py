@@ -7,6 +7,7 @@ from tensorsim.vision.detection.rtmdet import RTMDet
 from tensorsim.vision.lifting.bone_fit import BoneFit
 from tensorsim.vision.lifting.lifter import NearestPoseLifter
 from tensorsim.vision.lifting.metric_pose import MetricPose
+from tensorsim.vision.lifting.range_rate import RangeRate
 from tensorsim.vision.lifting.temporal_lifter import TemporalLifter
 from tensorsim.vision.lifting.videopose3d import VideoPose3D, VideoPoseLifter
 from tensorsim.vision.lifting.walking_legs import WalkingLegs
@@ -33,6 +34,7 @@ __all__ = [
     "NearestPoseLifter",
     "OnnxHeatmaps",
     "RTMDet",
+    "RangeRate",
     "RtmPose",
     "TemporalLifter",
     "TopDownPose",

@@ -30,7 +30,7 @@ class Located(NamedTuple):
     log_range_spread: Tensor
 
 
-class _Block(nn.Module):
+class TimeBlock(nn.Module):
     """A convolution over three frames, ``dilation`` apart, and a linear layer per frame, with a shortcut."""
 
     def __init__(self, channels: int, dilation: int) -> None:
@@ -41,6 +41,7 @@ class _Block(nn.Module):
         self.out = nn.Linear(channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(S, T, channels) -> (S, T, channels)."""
         d, frames = self.dilation, x.shape[1]
         y = F.pad(self.norm(x), [0, 0, d, d])
         y = torch.cat([y[:, :frames], y[:, d : d + frames], y[:, 2 * d :]], dim=-1)
@@ -65,7 +66,7 @@ class TemporalNet(nn.Module):
         super().__init__()
         self.reach = sum(dilations)
         self.enter = nn.Linear(FEATURES, channels)
-        self.blocks = nn.ModuleList([_Block(channels, dilation) for dilation in dilations])
+        self.blocks = nn.ModuleList([TimeBlock(channels, dilation) for dilation in dilations])
         self.norm = nn.LayerNorm(channels)
         self.leave = nn.Linear(channels, 28 + 14 + 1 + 28 + 1)
         self.log_mean_size = math.log(_MEAN_SIZE)
