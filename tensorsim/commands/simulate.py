@@ -97,7 +97,7 @@ class Simulate(NetworkOptions, ClipOptions):
     lifter only). Default: on."""
     range_rate: Option[bool] = None
     """Correct how fast people come closer or move away by how they move (temporal lifter only). Default: off, because
-    the shipped classifiers have not learnt from such maps."""
+    fewer real films are then labelled rightly."""
     per_person: bool = False
     """With several people in the scene, also simulate and label each one alone: maps_person_N.npz and
     doppler_time_person_N.png, with N as in the overlay."""
