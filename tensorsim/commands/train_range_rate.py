@@ -51,13 +51,16 @@ class TrainRangeRate(TrainOptions):
         torch.manual_seed(self.seed)
         net = RangeRateNet(self.channels)
         self.begin(net)
-        clips, judged = (
-            build_clips(self.out / f"{name}.safetensors", groups, self.motion, seed, held_out, self.quiet)
-            for name, groups, seed, held_out in (
-                ("clips", self.groups, self.clips_seed, False),
-                ("held_out", max(self.groups // 20, 1), self.clips_seed + 1, True),
-            )
+        clips = build_clips(
+            self.out / "clips.safetensors", self.groups, self.motion, self.clips_seed, quiet=self.quiet
         )
-        self.train(
-            RangeRateRecipe(net, clips, judged, self.learning_rate, self.seed, self.init is None), loop
+        judged = build_clips(
+            self.out / "held_out.safetensors",
+            max(self.groups // 20, 1),
+            self.motion,
+            self.clips_seed + 1,
+            True,
+            self.quiet,
         )
+        recipe = RangeRateRecipe(net, clips, judged, self.learning_rate, self.seed, self.init is None)
+        self.train(recipe, loop)

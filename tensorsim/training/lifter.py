@@ -11,7 +11,7 @@ from tensorsim.body.skeleton import BONES, bone_lengths, coco_to_body, mid_hips
 from tensorsim.training.lifter_motion import MotionPool
 from tensorsim.training.lifter_views import THRESHOLD, Windows, film
 from tensorsim.training.loop import Batch, Recipe, decay_groups
-from tensorsim.vision.lifting.sight import Sight
+from tensorsim.vision.lifting.sight import Sight, turned
 from tensorsim.vision.lifting.temporal_net import Located, TemporalNet
 from tensorsim.vision.lifting.videopose3d import body_to_h36m, h36m_to_body
 from tensorsim.vision.smoothing.along_time import nearest_valid
@@ -26,9 +26,7 @@ _JOINTS = (1.0, 0.8, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3, 0.8, 1.0, 1.3)
 
 def target(window: Windows, sight: Sight) -> Tensor:
     """True joints (B, T, 14, 3) in the frame that faces the person, in body heights."""
-    cos, sin = sight.azimuth[..., None, 0], sight.azimuth[..., None, 1]
-    x, y, z = window.joints.unbind(-1)
-    return torch.stack([x * cos - y * sin, x * sin + y * cos, z], dim=-1)
+    return turned(window.joints, sight.azimuth[..., None, :])
 
 
 def laplace(error: Tensor, log_spread: Tensor) -> Tensor:

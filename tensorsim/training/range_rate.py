@@ -23,10 +23,9 @@ from tensorsim.vision.lifting.range_rate import (
     FEATURES,
     RATE_HZ,
     RangeRateNet,
-    at_times,
     mirrored,
     movement,
-    sample_count,
+    sampled,
 )
 
 #: People of one activity before one camera, seconds of each clip, and frame rates of films.
@@ -88,8 +87,7 @@ def missing_speed(
     ratio = torch.where(valid, distances[1] / distances[0].clamp(min=0.1), torch.nan).nanmedian(dim=1)[0]
     ratio = ratio.nan_to_num(1.0).clamp(0.5, 2.0)
     missing = ratio[:, None] * distances[0] - distances[1]
-    position = torch.arange(sample_count(true.shape[1], fps), dtype=torch.float64) * (fps / RATE_HZ)
-    return at_times(missing, position).diff(dim=1) * RATE_HZ
+    return sampled(missing, fps).diff(dim=1) * RATE_HZ
 
 
 def filmed(true: Tensor, heights_m: Tensor, fps: float, draw: Draw, films: FilmedMotion) -> Clips:

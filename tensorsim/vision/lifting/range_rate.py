@@ -16,6 +16,7 @@ from tensorsim.errors import (
     check_positive,
     check_shape,
 )
+from tensorsim.vision.lifting.sight import turned
 from tensorsim.vision.lifting.temporal_net import DILATIONS, TimeBlock
 from tensorsim.vision.smoothing.along_time import local_linear
 
@@ -38,6 +39,12 @@ def sample_count(frames: int, fps: float, rate_hz: float = RATE_HZ) -> int:
     return int((frames - 1) / fps * rate_hz + 1e-6) + 1
 
 
+def sampled(x: Tensor, fps: float, rate_hz: float = RATE_HZ) -> Tensor:
+    """Values (S, T, ...) of frames at the K times of ``rate_hz`` within them: (S, K, ...)."""
+    count = sample_count(x.shape[1], fps, rate_hz)
+    return at_times(x, torch.arange(count, dtype=torch.float64, device=x.device) * (fps / rate_hz))
+
+
 def movement(
     joints: Tensor, seen: Tensor, valid: Tensor, camera_m: Tensor, fps: float, rate_hz: float = RATE_HZ
 ) -> Tensor:
@@ -55,19 +62,17 @@ def movement(
         (S, K, FEATURES): joints about the hips (m) and their speeds (m/s), speed of the hips, in axes to the right,
         away from the camera, and up; which joints are seen, and whether the person is there, from 0 to 1.
     """
-    count = sample_count(joints.shape[1], fps, rate_hz)
-    position = torch.arange(count, dtype=torch.float64, device=joints.device) * (fps / rate_hz)
-    points = at_times(joints, position)
-    shown = at_times(seen.to(joints.dtype), position)
-    there = at_times(valid.to(joints.dtype), position)[..., None]
+    points = sampled(joints, fps, rate_hz)
+    shown = sampled(seen.to(joints.dtype), fps, rate_hz)
+    there = sampled(valid.to(joints.dtype), fps, rate_hz)[..., None]
     hips = mid_hips(points)
     ahead = F.normalize(hips[..., :2] - camera_m[:2], dim=-1, eps=1e-6)
-    about = _turned(points - hips[..., None, :], ahead[..., None, :])
+    about = turned(points - hips[..., None, :], ahead.flip(-1)[..., None, :])
     between = F.normalize(ahead[:, 1:] + ahead[:, :-1], dim=-1, eps=1e-6)
     parts = [
         ((about[:, 1:] + about[:, :-1]) / 2).flatten(-2),
         ((about[:, 1:] - about[:, :-1]) * rate_hz).flatten(-2),
-        _turned((hips[:, 1:] - hips[:, :-1]) * rate_hz, between),
+        turned((hips[:, 1:] - hips[:, :-1]) * rate_hz, between.flip(-1)),
         torch.minimum(shown[:, 1:], shown[:, :-1]),
         torch.minimum(there[:, 1:], there[:, :-1]),
     ]
@@ -81,14 +86,6 @@ def mirrored(features: Tensor, other_joint: Tensor) -> Tensor:
     about = (about.unflatten(-1, [14, 3]).index_select(-2, other_joint) * right).flatten(-2)
     rates = (rates.unflatten(-1, [14, 3]).index_select(-2, other_joint) * right).flatten(-2)
     return torch.cat([about, rates, hips * right, seen.index_select(-1, other_joint), there], dim=-1)
-
-
-def _turned(vectors: Tensor, ahead: Tensor) -> Tensor:
-    """World vectors (..., 3) along axes to the right of ``ahead`` (..., 2), along it, and up."""
-    x, y = vectors[..., 0], vectors[..., 1]
-    right = x * ahead[..., 1] - y * ahead[..., 0]
-    away = x * ahead[..., 0] + y * ahead[..., 1]
-    return torch.stack([right, away, vectors[..., 2]], dim=-1)
 
 
 class RangeRateNet(nn.Module):

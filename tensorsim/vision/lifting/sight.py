@@ -91,6 +91,18 @@ def plane(rays: Tensor, azimuth: Tensor) -> Tensor:
     return torch.stack([a, rays[..., 2] / away], dim=-1).clamp(-4.0, 4.0)
 
 
+def turned(vectors: Tensor, azimuth: Tensor) -> Tensor:
+    """World vectors (..., 3) along axes to the right of a horizontal direction, along it, and up.
+
+    Args:
+        vectors: (..., 3).
+        azimuth: (..., 2) cosine and sine of the angle of the direction from +y towards +x.
+    """
+    cos, sin = azimuth[..., 0], azimuth[..., 1]
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return torch.stack([x * cos - y * sin, x * sin + y * cos, z], dim=-1)
+
+
 def turned_back(points: Tensor, azimuth: Tensor) -> Tensor:
     """Points (S, T, N, 3) from the frame that faces the person to world axes."""
     cos, sin = azimuth[..., None, 0], azimuth[..., None, 1]
